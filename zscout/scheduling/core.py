@@ -1,0 +1,312 @@
+"""The core of the RCM: events in, effects out, time given.
+
+Every decision of the RCM is made here and nowhere else; there is no clock, thread, socket or log inside.
+The RCM service, `zscout replay`, the study and the fault simulator drive this one class:
+
+    effects = core.handle(now, Asked(request), ...)
+
+A batch of events is one instant: holds whose time is over end first, then the events are applied in the
+order given, then one pass runs. The caller carries the effects out in their order and comes back with what
+follows from them: votes, and a `Tick` at the latest when `WakeAt` says.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import replace
+
+from zscout.scheduling.effects import (
+    Dropped,
+    Effect,
+    Granted,
+    Outcome,
+    Propose,
+    Queued,
+    Revoked,
+    WakeAt,
+)
+from zscout.scheduling.events import (
+    Asked,
+    Cancelled,
+    ClientLost,
+    Event,
+    HandedOver,
+    LeadTaken,
+    RcJoined,
+    RcLost,
+    RcReported,
+    Released,
+    Standing,
+    Tick,
+    Vote,
+    VoteOverdue,
+)
+from zscout.scheduling.floor import Floor, check
+from zscout.scheduling.model import (
+    NO_TERM,
+    QUANTUM,
+    Arc,
+    ArcId,
+    Grant,
+    Hold,
+    Ns,
+    Place,
+    Rc,
+    Request,
+    Term,
+)
+from zscout.scheduling.priority import run_pass
+from zscout.scheduling.votes import HolderSet, Votes
+
+
+class Core:
+    """All scheduling state of one fleet, and the rules by which it changes."""
+
+    def __init__(self) -> None:
+        self.floor = Floor()
+        self.votes = Votes()
+        self.term: Term = NO_TERM
+        self.seq = 0
+        self._arrivals = 0
+        self._now: Ns = 0
+        self._cause = 0
+        self._effects: list[Effect] = []
+        self._ends: list[tuple[Ns, ArcId, int]] = []
+        """When holds are over, soonest first; entries of holds that ended otherwise are skipped."""
+        self._wake: Ns | None = None
+
+    @property
+    def batches(self) -> int:
+        """How many batches of events were handled; effects name theirs in `cause`."""
+        return self._cause
+
+    def handle(self, now: Ns, *events: Event) -> list[Effect]:
+        """Applies one instant's events and runs a pass. `now` must not go backwards."""
+        if now < self._now:
+            raise ValueError(f"time went backwards: {now} after {self._now}")
+        self._now = now
+        self._cause += 1
+        self._effects = []
+        self._expire()
+        for event in events:
+            self._apply(event)
+        if self.floor.queued:
+            run_pass(self.floor, self.votes, now, self)
+        self._set_wake()
+        return self._effects
+
+    # Events
+
+    def _apply(self, event: Event) -> None:
+        match event:
+            case Asked(request, place):
+                self._ask(request, place)
+            case Cancelled(arc, by):
+                self._give_up(arc, Outcome.CANCELLED, f"cancelled by {by}")
+            case Released(arc, by):
+                self._give_up(arc, Outcome.RELEASED, f"released by {by}")
+            case Vote(proposal, accept, reason):
+                self.votes.answer(proposal, accept=accept, reason=reason)
+            case VoteOverdue(proposal):
+                self.votes.overdue(proposal, self._now)
+            case RcJoined(rc, sharable):
+                if self.floor.rc(rc).present:
+                    self._lose(rc, "it started anew")
+                self.floor.join(rc, sharable=sharable)
+            case RcReported(rc, ended, rules_changed):
+                for arc in ended:
+                    if arc in self.floor.rc(rc).holders:
+                        self._end(self.floor.running[arc], Outcome.LOST, f"{rc} ended the hold")
+                if rules_changed:
+                    self.votes.forget_rc(rc)
+            case RcLost(rc, reason):
+                self._lose(rc, reason)
+            case ClientLost(client, reason):
+                for arc in self.arcs_of(client):
+                    self._give_up(arc.id, Outcome.CLIENT_LOST, reason)
+            case HandedOver(arc, to):
+                self._hand_over(arc, to)
+            case LeadTaken(term, standing, waiting):
+                self._lead(term, standing, waiting)
+            case Tick():
+                pass
+
+    def arcs_of(self, client: str) -> list[Arc]:
+        """The ARCs of one client, those that wait first: so none of them profits from the others' end."""
+        arcs = (*self.floor.queued.values(), *self.floor.running.values())
+        return [arc for arc in arcs if arc.request.client == client]
+
+    def _ask(self, request: Request, place: Place | None) -> None:
+        if self.floor.arc(request.arc) is not None:
+            return
+        self.floor.enqueue(self._new_arc(request, place), self._now)
+
+    def _new_arc(self, request: Request, place: Place | None) -> Arc:
+        if place is None:
+            self._arrivals += 1
+            place = Place(self.term, self._arrivals)
+        elif place.term == self.term:
+            self._arrivals = max(self._arrivals, place.arrival)
+        return Arc(request, place, self.floor.mask(iter(request.needs)))
+
+    def _give_up(self, arc_id: ArcId, outcome: Outcome, reason: str) -> None:
+        arc = self.floor.arc(arc_id)
+        if arc is None:
+            return
+        if arc.hold is not None:
+            self._end(arc, outcome, reason, requeue=False)
+            return
+        del self.floor.queued[arc_id]
+        self._forget(arc)
+        self._effects.append(Dropped(self._cause, arc.id, arc.request.client, outcome, reason))
+
+    def _lose(self, name: str, reason: str) -> None:
+        """An RC is gone: each gang it was part of ends as a whole and is queued with its place."""
+        rc = self.floor.rc(name)
+        for arc in list(rc.holders.values()):
+            self._end(arc, Outcome.LOST, f"{name} was lost: {reason}")
+        self.floor.leave(name)
+        self.votes.forget_rc(name)
+
+    def _hand_over(self, arc_id: ArcId, to: str) -> None:
+        arc = self.floor.running.get(arc_id)
+        if arc is None or arc.hold is None or arc.request.client == to:
+            return
+        old = self._revocation(arc, arc.hold, Outcome.HANDED_OVER, f"handed over to {to}", requeued=False)
+        self._effects.append(old)
+        arc.request = replace(arc.request, client=to)
+        arc.hold = replace(arc.hold, grant=self._next_grant())
+        self._effects.append(self._granted(arc, arc.hold))
+
+    def _lead(
+        self, term: Term, standing: tuple[Standing, ...], waiting: tuple[tuple[Request, Place], ...]
+    ) -> None:
+        if term <= self.term:
+            raise ValueError(f"the new term {term} is not above {self.term}")
+        self.term, self.seq, self._arrivals = term, 0, 0
+        # The newest grant is the truth where two claim one exclusive RC.
+        for held in sorted(standing, key=lambda held: held.grant, reverse=True):
+            if self.floor.arc(held.request.arc) is not None:
+                continue
+            arc = self._new_arc(held.request, held.place)
+            self.floor.enqueue(arc, self._now)
+            hold = Hold(held.grant, held.start, held.end)
+            absent = [rc.name for rc in self.floor.of(arc.mask & ~self.floor.present)]
+            taken = [rc.name for rc in self.floor.of(arc.mask & self.floor.busy)]
+            if absent or taken:
+                reason = f"{absent[0]} was lost" if absent else f"{taken[0]} has a newer holder"
+                self._effects.append(self._revocation(arc, hold, Outcome.LOST, reason, requeued=True))
+            else:
+                self._take(arc, hold)
+        for request, place in waiting:
+            self._ask(request, place)
+
+    def _expire(self) -> None:
+        while self._ends and self._ends[0][0] <= self._now:
+            _, arc_id, seq = heapq.heappop(self._ends)
+            arc = self.floor.running.get(arc_id)
+            if arc is None or arc.hold is None or arc.hold.end > self._now:
+                continue
+            if not arc.request.keep:
+                self._end(arc, Outcome.COMPLETED, "its minimum runtime is over", requeue=False)
+
+    # What a strategy may do (priority.Actions)
+
+    def start(self, arc: Arc) -> None:
+        grant = self._next_grant()
+        hold = Hold(grant, self._now, self._now + arc.request.min_runtime)
+        self._take(arc, hold)
+        self._effects.append(self._granted(arc, hold))
+
+    def displace(self, arc: Arc, by: Arc) -> bool:
+        done = arc.overstays(self._now)
+        outcome = Outcome.COMPLETED if done else Outcome.PREEMPTED
+        reason = f"preempted by {by.name}, priority {by.request.priority}"
+        if done:
+            reason = f"its minimum runtime is over and {by.name}, priority {by.request.priority}, needs what it kept"
+        self._end(arc, outcome, reason, by=by.id)
+        return arc.id in self.floor.queued
+
+    def wait(self, arc: Arc, reason: str, *, settled: bool = True) -> None:
+        # A reason given before stands while votes are out: it would change back and forth otherwise.
+        if reason == arc.reason or (not settled and arc.reason):
+            return
+        arc.reason = reason
+        self._effects.append(Queued(self._cause, arc.id, arc.request.client, reason, settled))
+
+    def propose(self, rc: Rc, holders: HolderSet) -> None:
+        number = self.votes.open_question(rc.name, holders, self._now)
+        if number is None:
+            return
+        arcs = (self.floor.arc(holder) for holder in sorted(holders))
+        params = {arc.id: arc.request.needs[rc.name] for arc in arcs if arc is not None}
+        self._effects.append(Propose(self._cause, number, rc.name, params))
+
+    # Holds
+
+    def _take(self, arc: Arc, hold: Hold) -> None:
+        self.floor.start(arc, hold, self._now)
+        heapq.heappush(self._ends, (hold.end, arc.id, hold.grant.seq))
+
+    def _end(
+        self, arc: Arc, outcome: Outcome, reason: str, *, by: ArcId | None = None, requeue: bool = True
+    ) -> None:
+        """Ends a hold. What has had its minimum runtime is owed nothing and is not queued again."""
+        requeue = requeue and not arc.overstays(self._now)
+        hold = self.floor.stop(arc)
+        self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue, by=by))
+        if requeue:
+            arc.preemptions += outcome is Outcome.PREEMPTED
+            self.floor.enqueue(arc, self._now)
+        else:
+            self._forget(arc)
+
+    def _forget(self, arc: Arc) -> None:
+        for rc in self.floor.of(arc.mask & self.floor.sharable):
+            self.votes.forget_arc(rc.name, arc.id)
+
+    def _next_grant(self) -> Grant:
+        self.seq += 1
+        return Grant(self.term, self.seq)
+
+    def _granted(self, arc: Arc, hold: Hold) -> Granted:
+        end = None if arc.request.keep else hold.end
+        rcs = tuple(sorted(arc.request.needs))
+        return Granted(self._cause, arc.id, arc.request.client, hold.grant, rcs, hold.start, end)
+
+    def _revocation(
+        self, arc: Arc, hold: Hold, outcome: Outcome, reason: str, *, requeued: bool, by: ArcId | None = None
+    ) -> Revoked:
+        rcs = tuple(sorted(arc.request.needs))
+        client = arc.request.client
+        return Revoked(self._cause, arc.id, client, hold.grant, rcs, outcome, reason, requeued, by)
+
+    def _set_wake(self) -> None:
+        while self._ends and not self._in_force(self._ends[0]):
+            heapq.heappop(self._ends)
+        at = self._ends[0][0] if self._ends else None
+        if self.floor.queued:
+            at = min(self._now + QUANTUM, at) if at is not None else self._now + QUANTUM
+        if at != self._wake:
+            self._wake = at
+            self._effects.append(WakeAt(self._cause, at))
+
+    def _in_force(self, end: tuple[Ns, ArcId, int]) -> bool:
+        at, arc_id, _ = end
+        arc = self.floor.running.get(arc_id)
+        return arc is not None and arc.hold is not None and arc.hold.end == at
+
+    def validate(self) -> None:
+        """Checks all invariants; for tests and simulators, after every event."""
+        self.floor.validate()
+        for arc in self.floor.running.values():
+            check(
+                (arc.hold is not None and arc.hold.end - self._now >= 0) or arc.request.keep,
+                f"{arc.id} overran",
+            )
+            check(not arc.reason, f"{arc.id} runs and has a reason to wait")
+        for arc in self.floor.queued.values():
+            check(bool(arc.reason), f"{arc.id} waits without a reason")
+        for _, rc, holders in self.votes.out():
+            check(self.floor.rc(rc).present, f"a proposal is out at {rc}, which is absent")
+            check(all(self.floor.arc(arc) for arc in holders), f"a proposal at {rc} names an ARC that ended")

@@ -1,0 +1,130 @@
+"""What may happen to the RCM: the inputs of the core. Each carries everything the core may know about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from zscout.scheduling.model import ArcId, ClientId, Grant, Ns, Place, RcName, Request, Term
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A program asks for an ARC. `place` is set when it had one under an earlier RCM."""
+
+    request: Request
+    place: Place | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cancelled:
+    """The ARC is not wanted any more, whether it waits or runs."""
+
+    arc: ArcId
+    by: str = "its client"
+
+
+@dataclass(frozen=True, slots=True)
+class Released:
+    """A running ARC gives back what it holds; a waiting one leaves the queue."""
+
+    arc: ArcId
+    by: str = "its client"
+
+
+@dataclass(frozen=True, slots=True)
+class Vote:
+    """A sharable RC's answer to a proposal."""
+
+    proposal: int
+    accept: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class VoteOverdue:
+    """No answer to a proposal in time, or the question could not be delivered."""
+
+    proposal: int
+
+
+@dataclass(frozen=True, slots=True)
+class RcJoined:
+    """An RC is there and can be granted."""
+
+    rc: RcName
+    sharable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class RcReported:
+    """An RC tells of itself: holds that ended there, or that what it votes by has changed."""
+
+    rc: RcName
+    ended: tuple[ArcId, ...] = ()
+    rules_changed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RcLost:
+    """An RC is gone, or can't carry its holders any longer."""
+
+    rc: RcName
+    reason: str = "it left the mesh"
+
+
+@dataclass(frozen=True, slots=True)
+class ClientLost:
+    """A program is gone: what it holds is free and what it asked for is forgotten."""
+
+    client: ClientId
+    reason: str = "its client left the mesh"
+
+
+@dataclass(frozen=True, slots=True)
+class HandedOver:
+    """A running ARC goes on in another client (migration): same RCs, same end, new grant."""
+
+    arc: ArcId
+    to: ClientId
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A hold that stood when an RCM took the lead: its grant is kept, `end` is on the core's clock."""
+
+    request: Request
+    place: Place
+    grant: Grant
+    start: Ns
+    end: Ns
+
+
+@dataclass(frozen=True, slots=True)
+class LeadTaken:
+    """This RCM leads from now on, in `term`, over the holds and the queue that stood."""
+
+    term: Term
+    standing: tuple[Standing, ...] = ()
+    waiting: tuple[tuple[Request, Place], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time has passed: holds may be over, the quantum may be."""
+
+
+Event: TypeAlias = (
+    Asked
+    | Cancelled
+    | Released
+    | Vote
+    | VoteOverdue
+    | RcJoined
+    | RcReported
+    | RcLost
+    | ClientLost
+    | HandedOver
+    | LeadTaken
+    | Tick
+)

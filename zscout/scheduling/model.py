@@ -1,0 +1,135 @@
+"""What the scheduling core knows: requests, resource controllers (RCs) and what stands between them.
+
+Times are whole nanoseconds on one clock of the caller's choice; nothing here reads a clock. Bandwidth
+parameters are `Fraction`, so that sums are exact (0.1 + 0.2 is 0.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import NamedTuple, TypeAlias
+
+ArcId: TypeAlias = str
+"""Names one request for as long as it lives; chosen by whoever feeds the core."""
+ClientId: TypeAlias = str
+"""Names the program behind requests: `<host>/<client>` on the mesh."""
+RcName: TypeAlias = str
+"""`kind/name` of a resource controller."""
+Ns: TypeAlias = int
+"""Whole nanoseconds."""
+Params: TypeAlias = Mapping[str, Fraction]
+"""Bandwidth parameters of one ARC at one RC; only the RC knows what they mean."""
+
+SECOND: Ns = 1_000_000_000
+QUANTUM: Ns = SECOND
+"""The paper's quantum: while anything waits, a pass runs at least this often."""
+
+
+class Term(NamedTuple):
+    """The reign of one RCM: compared by counter, then by the RCM's instance (design, section 5)."""
+
+    counter: int
+    rcm: str
+
+
+NO_TERM = Term(0, "")
+
+
+class Grant(NamedTuple):
+    """Identity of one hold: the term it was given in and its number there. A later grant compares greater."""
+
+    term: Term
+    seq: int
+
+
+class Place(NamedTuple):
+    """Place in the queue: term and arrival number of the first request; the smaller goes first."""
+
+    term: Term
+    arrival: int
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0)."""
+
+    arc: ArcId
+    client: ClientId
+    needs: Mapping[RcName, Params]
+    priority: int
+    min_runtime: Ns
+    keep: bool = False
+    label: str = ""
+    """What people call it; the core only prints it."""
+
+    def __post_init__(self) -> None:
+        if not self.needs:
+            raise ValueError(f"ARC {self.arc} needs nothing; name at least one RC")
+        if self.min_runtime <= 0:
+            raise ValueError(f"ARC {self.arc}: the minimum runtime must be positive")
+        if any(value < 0 for params in self.needs.values() for value in params.values()):
+            raise ValueError(f"ARC {self.arc}: bandwidth parameters must not be negative")
+
+    @property
+    def name(self) -> str:
+        return self.label or self.arc
+
+
+@dataclass(slots=True)
+class Hold:
+    """A grant in force. `end` is when the minimum runtime is over; with `keep` the hold goes on past it."""
+
+    grant: Grant
+    start: Ns
+    end: Ns
+
+
+@dataclass(slots=True, eq=False)
+class Arc:
+    """A request the core follows, queued (`hold is None`) or running."""
+
+    request: Request
+    place: Place
+    mask: int
+    """Bits of the needed RCs, sharable or not (see `Fleet.bit`)."""
+    hold: Hold | None = None
+    reason: str = ""
+    """Why it waits, in words; empty while it runs."""
+    since: Ns = 0
+    """When it was last queued or granted."""
+    preemptions: int = 0
+
+    @property
+    def id(self) -> ArcId:
+        return self.request.arc
+
+    @property
+    def name(self) -> str:
+        return self.request.name
+
+    @property
+    def rank(self) -> tuple[int, Ns, Place]:
+        """Sorts contenders, best first: priority, then shorter minimum runtime, then earlier place."""
+        return (-self.request.priority, self.request.min_runtime, self.place)
+
+    def overstays(self, now: Ns) -> bool:
+        """True when a kept hold has had its minimum runtime: equal priority may displace it then."""
+        return self.hold is not None and self.request.keep and now >= self.hold.end
+
+    def yields_to(self, other: Arc, now: Ns) -> bool:
+        """Whether `other` may take what this running ARC holds."""
+        mine, theirs = self.request.priority, other.request.priority
+        return mine < theirs or (mine == theirs and self.overstays(now))
+
+
+@dataclass(slots=True)
+class Rc:
+    """One resource controller. `bit` is its bit in every mask, kept for as long as the core lives."""
+
+    name: RcName
+    bit: int
+    present: bool = False
+    sharable: bool = False
+    holders: dict[ArcId, Arc] = field(default_factory=dict)

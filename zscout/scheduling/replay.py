@@ -1,0 +1,90 @@
+"""Plays a workload through the core under virtual time, and keeps what came of it."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
+from zscout.scheduling.events import Asked, Event, RcJoined, Tick, Vote
+from zscout.scheduling.model import ArcId, Ns, RcName
+from zscout.scheduling.workload import Workload, excess
+
+
+@dataclass(frozen=True, slots=True)
+class HoldRecord:
+    """One hold from its grant to its end, in ns."""
+
+    arc: ArcId
+    start: Ns
+    end: Ns
+    outcome: Outcome
+    rcs: tuple[RcName, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What came of a workload: holds by start, ARC, end; and the ARCs that never completed, by name."""
+
+    holds: tuple[HoldRecord, ...]
+    unserved: tuple[ArcId, ...]
+
+
+Watcher = Callable[[Ns, Core, list[Effect]], None]
+
+
+def replay(workload: Workload, watch: Watcher | None = None) -> Replay:
+    """Runs the workload to its end. `watch` sees the core after each batch, for tests and recorders."""
+    return _Player(workload, watch).play()
+
+
+class _Player:
+    def __init__(self, workload: Workload, watch: Watcher | None) -> None:
+        self.workload, self.watch = workload, watch
+        self.core = Core()
+        self.capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
+        self.open: dict[ArcId, Granted] = {}
+        self.holds: list[HoldRecord] = []
+
+    def play(self) -> Replay:
+        self._step(0, [RcJoined(rc.name, rc.sharable) for rc in self.workload.rcs])
+        arrivals = [
+            (arrival.at, number, arrival.request) for number, arrival in enumerate(self.workload.arrivals)
+        ]
+        heapq.heapify(arrivals)
+        while arrivals or self.open:
+            # Only an arrival or the end of a hold changes anything here; the quantum's ticks would not.
+            ends = [hold.end for hold in self.open.values() if hold.end is not None]
+            now = min(ends + [at for at, _, _ in arrivals[:1]])
+            events: list[Event] = []
+            while arrivals and arrivals[0][0] == now:
+                events.append(Asked(heapq.heappop(arrivals)[2]))
+            self._step(now, events or [Tick()])
+        asked = {arrival.request.arc for arrival in self.workload.arrivals}
+        served = {hold.arc for hold in self.holds if hold.outcome is Outcome.COMPLETED}
+        holds = sorted(self.holds, key=lambda hold: (hold.start, hold.arc, hold.end))
+        return Replay(tuple(holds), tuple(sorted(asked - served)))
+
+    def _step(self, now: Ns, events: list[Event]) -> None:
+        """One instant, with every vote that it takes."""
+        batch: list[Event] = events
+        while batch:
+            effects = self.core.handle(now, *batch)
+            if self.watch is not None:
+                self.watch(now, self.core, effects)
+            votes: list[Event] = []
+            for effect in effects:
+                match effect:
+                    case Granted(arc=arc):
+                        self.open[arc] = effect
+                    case Revoked(arc=arc, outcome=outcome, rcs=rcs):
+                        start = self.open.pop(arc).start
+                        self.holds.append(HoldRecord(arc, start, now, outcome, rcs))
+                    case Propose(proposal=proposal, rc=rc, holders=holders):
+                        reason = excess(self.capacity[rc], holders.items())
+                        votes.append(Vote(proposal, accept=not reason, reason=reason))
+                    case _:
+                        pass
+            batch = votes
