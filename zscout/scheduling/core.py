@@ -122,8 +122,8 @@ class Core:
             case RcLost(rc, reason):
                 self._lose(rc, reason)
             case ClientLost(client, reason):
-                for arc in self.arcs_of(client):
-                    self._give_up(arc.id, Outcome.CLIENT_LOST, reason)
+                for lost in self.arcs_of(client):
+                    self._give_up(lost.id, Outcome.CLIENT_LOST, reason)
             case HandedOver(arc, to):
                 self._hand_over(arc, to)
             case LeadTaken(term, standing, waiting):
@@ -203,7 +203,7 @@ class Core:
 
     def _expire(self) -> None:
         while self._ends and self._ends[0][0] <= self._now:
-            _, arc_id, seq = heapq.heappop(self._ends)
+            _, arc_id, _ = heapq.heappop(self._ends)
             arc = self.floor.running.get(arc_id)
             if arc is None or arc.hold is None or arc.hold.end > self._now:
                 continue
@@ -221,9 +221,8 @@ class Core:
     def displace(self, arc: Arc, by: Arc) -> bool:
         done = arc.overstays(self._now)
         outcome = Outcome.COMPLETED if done else Outcome.PREEMPTED
-        reason = f"preempted by {by.name}, priority {by.request.priority}"
-        if done:
-            reason = f"its minimum runtime is over and {by.name}, priority {by.request.priority}, needs what it kept"
+        who = f"{by.name}, priority {by.request.priority}"
+        reason = f"its minimum runtime is over and {who}, needs its RCs" if done else f"preempted by {who}"
         self._end(arc, outcome, reason, by=by.id)
         return arc.id in self.floor.queued
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 from typing import TypeAlias
 
 from zscout.scheduling.model import ArcId, ClientId, Grant, Ns, Params, RcName
 
 
-class Outcome(str, Enum):
+class Outcome(StrEnum):
     """How a hold, or the wait for one, came to its end."""
 
     COMPLETED = "completed"
@@ -43,7 +43,7 @@ class Propose:
 
 @dataclass(frozen=True, slots=True)
 class Granted:
-    """All of `rcs` are the ARC's until `end`; `end` is None where it may keep them past its minimum runtime."""
+    """All of `rcs` are the ARC's until `end`; None where it may keep them past its minimum runtime."""
 
     cause: int
     arc: ArcId

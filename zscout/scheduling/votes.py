@@ -56,7 +56,7 @@ class Ballot:
 
 
 class Votes:
-    """All ballots of a fleet. Proposals are numbered; a number that is not out is an answer nobody asked for."""
+    """All ballots of a fleet. Proposals are numbered; an answer to a number that is not out is ignored."""
 
     def __init__(self) -> None:
         self._ballots: dict[RcName, Ballot] = {}

@@ -1,4 +1,4 @@
-"""A workload: RCs, and the ARCs that come to ask for them. What `zscout replay` and the study feed the core."""
+"""A workload: RCs, and the ARCs that come to ask for them. What replay and study feed the core."""
 
 from __future__ import annotations
 
