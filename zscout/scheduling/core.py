@@ -154,6 +154,8 @@ class Core:
         if arc is None:
             return
         if arc.hold is not None:
+            if outcome is Outcome.RELEASED and arc.overstays(self._now):
+                outcome = Outcome.COMPLETED
             self._end(arc, outcome, reason, requeue=False)
             return
         del self.floor.queued[arc_id]
@@ -189,15 +191,19 @@ class Core:
             if self.floor.arc(held.request.arc) is not None:
                 continue
             arc = self._new_arc(held.request, held.place)
-            self.floor.enqueue(arc, self._now)
             hold = Hold(held.grant, held.start, held.end)
             absent = [rc.name for rc in self.floor.of(arc.mask & ~self.floor.present)]
             taken = [rc.name for rc in self.floor.of(arc.mask & self.floor.busy)]
+            over = held.end <= self._now
+            if not over or not (absent or taken):
+                self.floor.enqueue(arc, self._now)
             if absent or taken:
                 reason = f"{absent[0]} was lost" if absent else f"{taken[0]} has a newer holder"
-                self._effects.append(self._revocation(arc, hold, Outcome.LOST, reason, requeued=True))
+                outcome = Outcome.COMPLETED if over and not arc.request.keep else Outcome.LOST
+                self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=not over))
             else:
                 self._take(arc, hold)
+        self._expire()
         for request, place in waiting:
             self._ask(request, place)
 
@@ -264,9 +270,13 @@ class Core:
         for rc in self.floor.of(arc.mask & self.floor.sharable):
             self.votes.forget_arc(rc.name, arc.id)
 
-    def _next_grant(self) -> Grant:
+    def number(self) -> int:
+        """The next number of this term. Grants take theirs here, and so does all else that is published."""
         self.seq += 1
-        return Grant(self.term, self.seq)
+        return self.seq
+
+    def _next_grant(self) -> Grant:
+        return Grant(self.term, self.number())
 
     def _granted(self, arc: Arc, hold: Hold) -> Granted:
         end = None if arc.request.keep else hold.end
@@ -276,6 +286,7 @@ class Core:
     def _revocation(
         self, arc: Arc, hold: Hold, outcome: Outcome, reason: str, *, requeued: bool, by: ArcId | None = None
     ) -> Revoked:
+        self.number()
         rcs = tuple(sorted(arc.request.needs))
         client = arc.request.client
         return Revoked(self._cause, arc.id, client, hold.grant, rcs, outcome, reason, requeued, by)

@@ -110,9 +110,11 @@ class Arc:
         return self.request.name
 
     @property
-    def rank(self) -> tuple[int, Ns, Place]:
-        """Sorts contenders, best first: priority, then shorter minimum runtime, then earlier place."""
-        return (-self.request.priority, self.request.min_runtime, self.place)
+    def rank(self) -> tuple[int, Ns, Place, ArcId]:
+        """Sorts contenders, best first: priority, then shorter minimum runtime, then earlier place.
+
+        Clients tell their places after a takeover, so two may claim one: the id keeps the order total."""
+        return (-self.request.priority, self.request.min_runtime, self.place, self.id)
 
     def overstays(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may displace it then."""

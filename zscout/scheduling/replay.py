@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
-from zscout.scheduling.events import Asked, Event, RcJoined, Tick, Vote
+from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
 from zscout.scheduling.model import ArcId, Ns, RcName
 from zscout.scheduling.workload import Workload, excess
 
@@ -36,7 +36,9 @@ Watcher = Callable[[Ns, Core, list[Effect]], None]
 
 
 def replay(workload: Workload, watch: Watcher | None = None) -> Replay:
-    """Runs the workload to its end. `watch` sees the core after each batch, for tests and recorders."""
+    """Runs the workload to its end. `watch` sees the core after each batch, for tests and recorders.
+
+    What is kept past its minimum runtime ends when nothing else is left to come."""
     return _Player(workload, watch).play()
 
 
@@ -54,10 +56,17 @@ class _Player:
             (arrival.at, number, arrival.request) for number, arrival in enumerate(self.workload.arrivals)
         ]
         heapq.heapify(arrivals)
+        runtime = {arrival.request.arc: arrival.request.min_runtime for arrival in self.workload.arrivals}
+        now: Ns = 0
         while arrivals or self.open:
-            # Only an arrival or the end of a hold changes anything here; the quantum's ticks would not.
-            ends = [hold.end for hold in self.open.values() if hold.end is not None]
-            now = min(ends + [at for at, _, _ in arrivals[:1]])
+            # Only an arrival or the end of a minimum runtime (a kept hold may be displaced from then on)
+            # changes anything here; the quantum's ticks would not.
+            ends = [hold.start + runtime[arc] for arc, hold in self.open.items()]
+            coming = [end for end in ends if end > now] + [at for at, _, _ in arrivals[:1]]
+            if not coming:
+                self._step(now, [Released(arc) for arc in sorted(self.open)])
+                continue
+            now = min(coming)
             events: list[Event] = []
             while arrivals and arrivals[0][0] == now:
                 events.append(Asked(heapq.heappop(arrivals)[2]))

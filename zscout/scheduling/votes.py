@@ -16,6 +16,8 @@ HolderSet: TypeAlias = frozenset[ArcId]
 
 ANSWERS_PER_RC = 4096
 """Oldest answers beyond this many are forgotten; the RC is then asked again."""
+QUESTIONS_PER_SET = 8
+"""How many proposals of one set may be out: a silent RC is asked anew, and any of its answers will do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +35,10 @@ class Ballot:
 
     accepted: dict[HolderSet, None] = field(default_factory=dict)
     vetoed: dict[HolderSet, str] = field(default_factory=dict)
-    out: dict[HolderSet, int] = field(default_factory=dict)
+    out: dict[HolderSet, list[int]] = field(default_factory=dict)
+    """The proposals of each set that is asked for, newest last."""
+    overdue: set[HolderSet] = field(default_factory=set)
+    """Those whose newest proposal is overdue, and perhaps lost: they may be asked for anew."""
     silent: bool = False
     ask_again: Ns = 0
 
@@ -79,12 +84,15 @@ class Votes:
             if now < ballot.ask_again:
                 return None
             ballot.ask_again = now + QUANTUM
-            self._close(ballot, holders)
-        elif holders in ballot.out:
+        elif holders in ballot.out and holders not in ballot.overdue:
             return None
+        ballot.overdue.discard(holders)
         number = self._next
         self._next += 1
-        ballot.out[holders] = number
+        numbers = ballot.out.setdefault(holders, [])
+        numbers.append(number)
+        if len(numbers) > QUESTIONS_PER_SET:
+            del self._out[numbers.pop(0)]
         self._out[number] = (rc, holders)
         return number
 
@@ -92,9 +100,9 @@ class Votes:
         """Takes an answer, a late one too. False: nobody asked, or its question has become void."""
         if proposal not in self._out:
             return False
-        rc, holders = self._out.pop(proposal)
+        rc, holders = self._out[proposal]
         ballot = self._ballots[rc]
-        del ballot.out[holders]
+        self._close(ballot, holders)
         ballot.silent = False
         if accept:
             ballot.accepted[holders] = None
@@ -107,7 +115,11 @@ class Votes:
         """Marks the RC silent. The question stays out: its answer is welcome whenever it comes."""
         if proposal not in self._out:
             return False
-        ballot = self._ballots[self._out[proposal][0]]
+        rc, holders = self._out[proposal]
+        ballot = self._ballots[rc]
+        if proposal != ballot.out[holders][-1]:
+            return False
+        ballot.overdue.add(holders)
         if not ballot.silent:
             ballot.silent = True
             ballot.ask_again = now + QUANTUM
@@ -117,8 +129,8 @@ class Votes:
         """The RC left, came anew or changed its rules: nothing it said stands, nothing asked is awaited."""
         ballot = self._ballots.pop(rc, None)
         if ballot is not None:
-            for number in ballot.out.values():
-                del self._out[number]
+            for holders in list(ballot.out):
+                self._close(ballot, holders)
 
     def forget_arc(self, rc: RcName, arc: ArcId) -> None:
         """An ARC that needed `rc` has ended: what was accepted with it stands without it."""
@@ -140,6 +152,6 @@ class Votes:
             yield number, rc, holders
 
     def _close(self, ballot: Ballot, holders: HolderSet) -> None:
-        number = ballot.out.pop(holders, None)
-        if number is not None:
+        ballot.overdue.discard(holders)
+        for number in ballot.out.pop(holders, ()):
             del self._out[number]

@@ -1,0 +1,99 @@
+"""What must be true whatever happens, checked from the core's effects alone, as the mesh would see them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
+
+from tests.scheduling.oracle import Contender, Oracle
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Effect, Granted, Outcome, Queued, Revoked
+from zscout.scheduling.model import NO_TERM, ArcId, Grant, Ns, RcName, Request
+from zscout.scheduling.workload import WorkloadRc, excess
+
+
+class Ledger:
+    """Follows grants and revocations and raises `AssertionError` at the first that breaks a promise."""
+
+    def __init__(self, rcs: Iterable[WorkloadRc], requests: Iterable[Request] = ()) -> None:
+        self.capacity: dict[RcName, Mapping[str, Fraction]] = {
+            rc.name: rc.capacity for rc in rcs if rc.sharable
+        }
+        self.requests: dict[ArcId, Request] = {request.arc: request for request in requests}
+        self.open: dict[ArcId, Granted] = {}
+        self.newest = Grant(NO_TERM, 0)
+
+    def take(self, now: Ns, core: Core, effects: list[Effect]) -> None:
+        """Takes the effects of one batch, and compares the outcome with what the core believes."""
+        core.validate()
+        for number, effect in enumerate(effects):
+            match effect:
+                case Granted():
+                    self._granted(effect)
+                case Revoked():
+                    self._revoked(now, effect, effects[number + 1 :])
+                case Queued(arc=arc):
+                    assert arc not in self.open, f"{arc} is told to wait while it holds"
+                case _:
+                    pass
+        held = {arc: (hold.grant, hold.client) for arc, hold in self.open.items()}
+        believed = {
+            arc.id: (arc.hold.grant, arc.request.client)
+            for arc in core.floor.running.values()
+            if arc.hold is not None
+        }
+        assert held == believed, "the effects told do not add up to what the core holds"
+
+    def holders(self, rc: RcName) -> list[ArcId]:
+        return [arc for arc, hold in self.open.items() if rc in hold.rcs]
+
+    def _granted(self, effect: Granted) -> None:
+        request = self.requests[effect.arc]
+        assert effect.arc not in self.open, f"{effect.arc} is granted twice"
+        assert set(effect.rcs) == set(request.needs), f"{effect.arc} is granted a part of its needs"
+        assert effect.grant > self.newest, "grants do not grow"
+        assert (effect.end is None) == request.keep
+        assert effect.end is None or effect.end == effect.start + request.min_runtime
+        self.newest = effect.grant
+        self.open[effect.arc] = effect
+        for rc in effect.rcs:
+            holders = self.holders(rc)
+            if rc in self.capacity:
+                shares = [(arc, self.requests[arc].needs[rc]) for arc in holders]
+                assert not excess(self.capacity[rc], shares), f"{rc} can't carry {holders}"
+            else:
+                assert holders == [effect.arc], f"{rc} has the holders {holders}"
+
+    def _revoked(self, now: Ns, effect: Revoked, later: list[Effect]) -> None:
+        hold = self.open.pop(effect.arc)
+        assert hold.grant == effect.grant, "a hold is revoked under another grant than it was given"
+        assert hold.rcs == effect.rcs, "a part of a gang is revoked"
+        request = self.requests[effect.arc]
+        over = now >= hold.start + request.min_runtime
+        if effect.outcome is Outcome.COMPLETED:
+            assert over, f"{effect.arc} is called completed before its time"
+        if effect.outcome in {Outcome.PREEMPTED, Outcome.COMPLETED, Outcome.LOST}:
+            assert effect.requeued == (effect.outcome is not Outcome.COMPLETED and not over)
+        if effect.by is None:
+            assert effect.outcome is not Outcome.PREEMPTED, "preempted by nobody"
+            return
+        assert any(isinstance(one, Granted) and one.arc == effect.by for one in later), "preempted in vain"
+        taker = self.requests[effect.by]
+        if effect.outcome is Outcome.PREEMPTED:
+            assert taker.priority > request.priority, "equal or lower priority preempts"
+        else:
+            assert request.keep
+            assert taker.priority >= request.priority, "lower priority displaces a kept hold"
+
+
+def check_settled(now: Ns, core: Core, rcs: Iterable[WorkloadRc]) -> None:
+    """After a pass with no vote out: by the letter of steps 1 to 3, nobody who waits could start."""
+    if next(core.votes.out(), None) is not None:
+        return
+    oracle = Oracle(rcs)
+    for arc in (*core.floor.running.values(), *core.floor.queued.values()):
+        start = arc.hold.start if arc.hold is not None else None
+        oracle.contenders.append(Contender(arc.request, arc.place.arrival, start))
+    for one in oracle.contenders:
+        if one.start is None:
+            assert oracle.victims(one, now) is None, f"{one.request.arc} waits with nothing in its way"

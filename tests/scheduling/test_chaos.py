@@ -1,0 +1,198 @@
+"""The core when everything that can go wrong does: only promises hold then, and in the end all is served."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.scheduling.invariants import Ledger
+from tests.scheduling.workloads import capacity, rcs, requests
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Propose, WakeAt
+from zscout.scheduling.events import (
+    Asked,
+    Cancelled,
+    ClientLost,
+    Event,
+    HandedOver,
+    LeadTaken,
+    RcJoined,
+    RcLost,
+    RcReported,
+    Released,
+    Standing,
+    Tick,
+    Vote,
+    VoteOverdue,
+)
+from zscout.scheduling.model import NO_TERM, SECOND, Arc, Ns, RcName, Term
+from zscout.scheduling.workload import WorkloadRc, excess
+
+OPS = (
+    # The first, asked most often, make the core busy; the others disturb it.
+    *["ask", "answer", "overdue", "time"] * 3,
+    "release",
+    "cancel",
+    "rc lost",
+    "rc back",
+    "rules",
+    "rc ends",
+    "client lost",
+    "hand over",
+    "takeover",
+)
+MAX_SETTLING_STEPS = 400
+"""Far more than twelve ARCs of at most five seconds ever need; who is not served by then hangs."""
+
+
+class Chaos:
+    """A fleet whose votes are late or lost, and whose parts come and go."""
+
+    def __init__(self, draw: st.DataObject) -> None:
+        self.fleet = draw.draw(rcs())
+        names = [rc.name for rc in self.fleet]
+        self.to_ask = [
+            draw.draw(requests(f"a{number}", names)) for number in range(draw.draw(st.integers(1, 12)))
+        ]
+        self.capacities = draw.draw(st.lists(capacity, min_size=1, max_size=4))
+        self.sharable = {rc.name: rc.sharable for rc in self.fleet}
+        self.present: list[RcName] = []
+        self.now: Ns = 0
+        self.core = Core()
+        self.ledger = Ledger(self.fleet, self.to_ask)
+        self.waiting: list[Propose] = []
+        """Proposals that may yet be answered or called overdue."""
+        self.late: list[Propose] = []
+        """Overdue ones; their answers may still come, or never."""
+        self.wake: Ns | None = None
+        self.send(*[self.join(rc) for rc in self.fleet])
+
+    def join(self, rc: WorkloadRc) -> Event:
+        self.present.append(rc.name)
+        return RcJoined(rc.name, rc.sharable)
+
+    def send(self, *events: Event) -> None:
+        effects = self.core.handle(self.now, *events)
+        self.ledger.take(self.now, self.core, effects)
+        for effect in effects:
+            match effect:
+                case Propose():
+                    self.waiting.append(effect)
+                case WakeAt(at=at):
+                    self.wake = at
+                case _:
+                    pass
+
+    def vote(self, question: Propose) -> Vote:
+        reason = excess(self.ledger.capacity[question.rc], question.holders.items())
+        return Vote(question.proposal, accept=not reason, reason=reason)
+
+    def change_rules(self, rc: RcName, rules: Mapping[str, Fraction]) -> None:
+        """From now on the RC votes otherwise; questions from before are void, and never answered."""
+        self.ledger.capacity[rc] = rules
+        self.waiting = [one for one in self.waiting if one.rc != rc]
+        self.late = [one for one in self.late if one.rc != rc]
+        self.send(RcReported(rc, rules_changed=True))
+
+    def do(self, op: str, pick: int) -> None:
+        """One operation of `OPS`, on the `pick`-th of what it applies to; nothing if there is none."""
+        running = sorted(self.core.floor.running)
+        arcs = sorted([*running, *self.core.floor.queued])
+        absent = [rc for rc in self.fleet if rc.name not in self.present]
+        voters = [name for name in self.present if self.sharable[name]]
+        answerable = self.waiting + self.late
+        if op == "ask" and self.to_ask:
+            self.send(Asked(self.to_ask.pop()))
+        elif op == "answer" and answerable:
+            question = answerable[pick % len(answerable)]
+            (self.waiting if question in self.waiting else self.late).remove(question)
+            self.send(self.vote(question))
+        elif op == "overdue" and self.waiting:
+            question = self.waiting.pop(pick % len(self.waiting))
+            self.late.append(question)
+            self.send(VoteOverdue(question.proposal))
+        elif op == "time":
+            self.now += (pick % 4 + 1) * SECOND // 2
+            self.send(Tick())
+        elif op == "release" and running:
+            self.send(Released(running[pick % len(running)]))
+        elif op == "cancel" and arcs:
+            self.send(Cancelled(arcs[pick % len(arcs)]))
+        elif op == "rc lost" and self.present:
+            self.send(RcLost(self.present.pop(pick % len(self.present))))
+        elif op == "rc back" and absent:
+            self.send(self.join(absent[pick % len(absent)]))
+        elif op == "rules" and voters:
+            self.change_rules(voters[pick % len(voters)], self.capacities[pick % len(self.capacities)])
+        elif op == "rc ends" and running:
+            arc = running[pick % len(running)]
+            self.send(RcReported(min(self.ledger.requests[arc].needs), ended=(arc,)))
+        elif op == "client lost":
+            self.send(ClientLost(f"host/{pick % 3}"))
+        elif op == "hand over" and running:
+            self.send(HandedOver(running[pick % len(running)], f"host/{(pick + 1) % 3}"))
+        elif op == "takeover":
+            self.take_over()
+
+    def take_over(self) -> None:
+        """The RCM dies with all it knew of votes; the next one hears of every hold and request."""
+        old, before = self.core, dict(self.ledger.open)
+        term = Term(old.term.counter + 1, "rcm/b") if old.term != NO_TERM else Term(1, "rcm/a")
+        self.core, self.waiting, self.late = Core(), [], []
+        standing = tuple(
+            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end)
+            for arc in old.floor.running.values()
+            if arc.hold is not None
+        )
+        queue = tuple((arc.request, arc.place) for arc in old.floor.queued.values())
+        joins = [RcJoined(name, self.sharable[name]) for name in self.present]
+        self.send(*joins, LeadTaken(term, standing, queue))
+        assert self.ledger.open == before, "a change of RCM disturbed somebody"
+
+    def settle(self) -> None:
+        """All is well again: RCs are back, questions are answered (those overdue never), time goes on."""
+        self.send(*[self.join(rc) for rc in self.fleet if rc.name not in self.present])
+        self.late = []
+        while self.to_ask:
+            self.send(Asked(self.to_ask.pop()))
+        for _ in range(MAX_SETTLING_STEPS):
+            if self.waiting:
+                self.send(self.vote(self.waiting.pop()))
+            elif not self.core.floor.queued:
+                return
+            elif any(
+                arc.request.keep and arc.overstays(self.now) for arc in self.core.floor.running.values()
+            ):
+                kept = [arc for arc in self.core.floor.running.values() if arc.overstays(self.now)]
+                self.send(*[Released(arc.id) for arc in kept])
+            elif all(self.unservable(arc) for arc in self.core.floor.queued.values()):
+                return
+            else:
+                assert self.wake is not None, "somebody waits, and nothing is to happen"
+                self.now = max(self.now, self.wake)
+                self.send(Tick())
+        left = [arc.id for arc in self.core.floor.queued.values() if not self.unservable(arc)]
+        raise AssertionError(f"never served: {left}, {[self.core.floor.queued[arc].reason for arc in left]}")
+
+    def unservable(self, arc: Arc) -> bool:
+        """Whether it needs an RC that is not there, or more than an RC can give to it alone."""
+        for rc, share in arc.request.needs.items():
+            if rc not in self.present:
+                return True
+            if self.sharable[rc] and excess(self.ledger.capacity[rc], [(arc.id, share)]):
+                return True
+        return False
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.data(), st.lists(st.tuples(st.sampled_from(OPS), st.integers(0, 11)), max_size=60))
+def test_promises_hold_in_any_chaos_and_in_the_end_all_are_served(
+    draw: st.DataObject, ops: list[tuple[str, int]]
+) -> None:
+    chaos = Chaos(draw)
+    for op, pick in ops:
+        chaos.do(op, pick)
+    chaos.settle()

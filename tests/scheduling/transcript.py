@@ -1,0 +1,217 @@
+"""Plays a text file of commands through the core and prints under each what it led to.
+
+One line is one batch of events; several commands of one instant are joined by `;`. Lines that start with
+`#` are comments, indented lines are the effects, and a blank line separates. Times are seconds.
+
+    at TIME                                    sets the clock for what follows; `at TIME COMMAND` too
+    join RC [sharable]                         leave RC [REASON]            lost CLIENT
+    ask ARC NEED,... [priority=N] [runtime=S] [client=NAME] [keep] [place=TERM.N]
+    cancel ARC          release ARC            handover ARC CLIENT          tick
+    vote N yes|no [REASON]                     overdue N
+    rules RC            ended RC ARC,...
+    standing ARC ... grant=TERM.N start=S      waiting ARC ...              for the `lead` that follows
+    lead TERM
+
+A NEED is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Dropped, Effect, Granted, Propose, Queued, Revoked, WakeAt
+from zscout.scheduling.events import (
+    Asked,
+    Cancelled,
+    ClientLost,
+    Event,
+    HandedOver,
+    LeadTaken,
+    RcJoined,
+    RcLost,
+    RcReported,
+    Released,
+    Standing,
+    Tick,
+    Vote,
+    VoteOverdue,
+)
+from zscout.scheduling.model import SECOND, Grant, Ns, Params, Place, Request, Term
+
+INDENT = "    "
+_NEED = re.compile(r"([\w.-]+/[\w.-]+)(?:\{([^}]*)\})?")
+
+
+def play(text: str, name: str) -> str:
+    """The same transcript with the effects as they are now. `ValueError` names `name`, line and trouble."""
+    player = _Player()
+    lines: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.startswith(INDENT):
+            continue
+        lines.append(line)
+        if line.strip() and not line.startswith("#"):
+            try:
+                lines += [INDENT + effect for effect in player.batch(line)]
+            except (ValueError, KeyError, IndexError) as error:
+                raise ValueError(f"{name}:{number}: {line!r}: {error!r}") from error
+    return "\n".join(lines) + "\n"
+
+
+@dataclass
+class _Player:
+    core: Core = field(default_factory=Core)
+    now: Ns = 0
+    standing: list[Standing] = field(default_factory=list)
+    waiting: list[tuple[Request, Place]] = field(default_factory=list)
+
+    def batch(self, line: str) -> list[str]:
+        events: list[Event] = []
+        for command in line.split(";"):
+            words = command.split(maxsplit=2)
+            if words[0] == "at":
+                self.now = _seconds(words[1])
+                words = words[2].split(maxsplit=2) if len(words) > 2 else []
+            if words and (event := self.event(words[0], " ".join(words[1:]))) is not None:
+                events.append(event)
+        if not events:
+            return []
+        effects = self.core.handle(self.now, *events)
+        self.core.validate()
+        return [_print(effect) for effect in effects] or ["nothing"]
+
+    def event(self, verb: str, rest: str) -> Event | None:
+        first, _, second = rest.partition(" ")
+        match verb:
+            case "ask":
+                request, options = _request(rest)
+                return Asked(request, _place(options["place"]) if "place" in options else None)
+            case "standing":
+                request, options = _request(rest)
+                start = _seconds(options["start"])
+                grant = Grant(*_place(options["grant"]))
+                place = _place(options["place"])
+                self.standing.append(Standing(request, place, grant, start, start + request.min_runtime))
+                return None
+            case "waiting":
+                request, options = _request(rest)
+                self.waiting.append((request, _place(options["place"])))
+                return None
+            case "lead":
+                lead = LeadTaken(_term(first), tuple(self.standing), tuple(self.waiting))
+                self.standing, self.waiting = [], []
+                return lead
+            case "join":
+                return RcJoined(first, sharable=_flag(second, "sharable"))
+            case "leave":
+                return RcLost(first, second) if second else RcLost(first)
+            case "lost":
+                return ClientLost(first)
+            case "cancel":
+                return Cancelled(first)
+            case "release":
+                return Released(first)
+            case "handover":
+                return HandedOver(first, second)
+            case "vote":
+                answer, _, reason = second.partition(" ")
+                return Vote(int(first), accept=_choice(answer, yes="yes", no="no"), reason=reason)
+            case "overdue":
+                return VoteOverdue(int(first))
+            case "rules":
+                return RcReported(first, rules_changed=True)
+            case "ended":
+                return RcReported(first, ended=tuple(second.split(",")))
+            case "tick":
+                return Tick()
+            case _:
+                raise ValueError(f"no such command: {verb}")
+
+
+def _request(text: str) -> tuple[Request, dict[str, str]]:
+    """`ARC NEED,... key=value ... [keep]`."""
+    braces = re.compile(r"\{[^}]*\}")
+    # Parameters hold spaces; take them out of the way of the split.
+    inner = braces.findall(text)
+    arc, needs, *rest = braces.sub("{}", text).split()
+    filled = iter(inner)
+    wanted: dict[str, Params] = {}
+    for need in braces.sub(lambda _: next(filled), needs).split(","):
+        match = _NEED.fullmatch(need)
+        if match is None:
+            raise ValueError(f"not a need: {need}")
+        pairs = (pair.split("=") for pair in (match[2] or "").split())
+        wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
+    options = dict(word.split("=", 1) for word in rest if word != "keep")
+    known = {"priority", "runtime", "client", "place", "grant", "start"}
+    if unknown := options.keys() - known:
+        raise ValueError(f"unknown options {sorted(unknown)}")
+    request = Request(
+        arc=arc,
+        client=options.get("client", "host/" + arc),
+        needs=wanted,
+        priority=int(options.get("priority", "0")),
+        min_runtime=_seconds(options.get("runtime", "10")),
+        keep="keep" in rest,
+    )
+    return request, options
+
+
+def _seconds(text: str) -> Ns:
+    return int(Fraction(text) * SECOND)
+
+
+def _term(text: str) -> Term:
+    counter, _, rcm = text.partition(":")
+    return Term(int(counter), rcm)
+
+
+def _place(text: str) -> Place:
+    term, _, number = text.rpartition(".")
+    return Place(_term(term), int(number))
+
+
+def _flag(word: str, flag: str) -> bool:
+    if word not in {"", flag}:
+        raise ValueError(f"{word!r} is not {flag!r}")
+    return word == flag
+
+
+def _choice(word: str, *, yes: str, no: str) -> bool:
+    if word not in {yes, no}:
+        raise ValueError(f"{word!r} is neither {yes!r} nor {no!r}")
+    return word == yes
+
+
+def _print(effect: Effect) -> str:
+    match effect:
+        case Propose(proposal=number, rc=rc, holders=holders):
+            return f"propose {number} {rc}: " + ", ".join(arc + _share(holders[arc]) for arc in holders)
+        case Granted(arc=arc, client=client, grant=grant, rcs=rcs, start=start, end=end):
+            span = f"from {_time(start)} " + ("on" if end is None else f"to {_time(end)}")
+            return f"grant {arc} to {client} ({_grant(grant)}): {', '.join(rcs)} {span}"
+        case Revoked(arc=arc, grant=grant, outcome=outcome, reason=reason, requeued=requeued, by=by):
+            took = f" by {by}" if by is not None else ""
+            tail = "; queued again" if requeued else ""
+            return f"revoke {arc} ({_grant(grant)}) {outcome.value}{took}: {reason}{tail}"
+        case Queued(arc=arc, reason=reason, settled=settled):
+            return f"queued {arc}: {reason}" + ("" if settled else " (not settled)")
+        case Dropped(arc=arc, outcome=outcome, reason=reason):
+            return f"dropped {arc} {outcome.value}: {reason}"
+        case WakeAt(at=at):
+            return "wake " + ("never" if at is None else f"at {_time(at)}")
+
+
+def _share(params: Params) -> str:
+    return "{" + " ".join(f"{key}={float(value):g}" for key, value in sorted(params.items())) + "}"
+
+
+def _time(at: Ns) -> str:
+    return f"{at / SECOND:g}"
+
+
+def _grant(grant: Grant) -> str:
+    return f"{grant.term.counter}:{grant.term.rcm}.{grant.seq}"

@@ -1,0 +1,63 @@
+"""Random workloads, small and full of ties: many things happen at one instant, sums sit on the boundary."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+from hypothesis import strategies as st
+
+from zscout.scheduling.model import SECOND, Params, RcName, Request
+from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
+
+PARAMETERS = ("rate", "width")
+ABSENT: RcName = "robot/absent"
+"""An RC that no workload has, and some ARCs need all the same."""
+
+_shares = st.sampled_from([Fraction(1, 10), Fraction(2, 10), Fraction(3, 10), Fraction(1, 2)])
+# 0.1 + 0.2 fills 0.3 exactly: with floats it would not.
+_capacities = st.sampled_from([Fraction(2, 10), Fraction(3, 10), Fraction(6, 10), Fraction(1)])
+
+params: st.SearchStrategy[Params] = st.dictionaries(st.sampled_from(PARAMETERS), _shares, max_size=2)
+capacity: st.SearchStrategy[Params] = st.dictionaries(st.sampled_from(PARAMETERS), _capacities, max_size=2)
+
+
+@st.composite
+def rcs(draw: st.DrawFn) -> tuple[WorkloadRc, ...]:
+    """One to six RCs, exclusive and sharable mixed."""
+    kinds = draw(st.lists(st.booleans(), min_size=1, max_size=6))
+    return tuple(
+        WorkloadRc(f"radio/{number}", sharable=True, capacity=draw(capacity))
+        if sharable
+        else WorkloadRc(f"robot/{number}")
+        for number, sharable in enumerate(kinds)
+    )
+
+
+@st.composite
+def requests(draw: st.DrawFn, arc: str, names: list[RcName], *, keep: bool = True) -> Request:
+    """One ARC that needs one to four of `names`, now and then of `ABSENT`; kept sometimes, if `keep`."""
+    needed = draw(st.lists(st.sampled_from(names), min_size=1, max_size=4, unique=True))
+    if draw(st.integers(0, 15)) == 15:
+        needed.append(ABSENT)
+    return Request(
+        arc=arc,
+        client=f"host/{draw(st.integers(0, 2))}",
+        needs={name: draw(params) for name in needed},
+        priority=draw(st.integers(0, 3)),
+        min_runtime=draw(st.sampled_from([1, 2, 3, 5])) * SECOND,
+        keep=keep and draw(st.integers(0, 5)) == 5,
+    )
+
+
+@st.composite
+def workloads(draw: st.DrawFn, *, keep: bool = True) -> Workload:
+    """RCs and one to twelve ARCs that ask within a few seconds."""
+    fleet = draw(rcs())
+    names = [rc.name for rc in fleet]
+    arrivals = [
+        Arrival(
+            draw(st.sampled_from([0, 1, 2, 3, 5])) * SECOND, draw(requests(f"a{number}", names, keep=keep))
+        )
+        for number in range(draw(st.integers(1, 12)))
+    ]
+    return Workload(fleet, tuple(arrivals))

@@ -1,0 +1,172 @@
+"""An ARC in a few lines: a context manager that waits for the grant and ends its body when it is over.
+
+    async with Client.connect() as client:
+        async with hold(client, "survey", {"robot/scout33": {}}, min_runtime=5) as held:
+            await held.command("robot/scout33", {"name": "echo", "value": 1})
+
+The body is cancelled when the hold is taken away (`Revoked` comes out of the `async with`), and when its
+minimum runtime is over (nothing comes out: it had its time). `holds` goes again each time it is granted again:
+
+    async for attempt in holds(client, "survey", {"robot/scout33": {}}, min_runtime=5):
+        async with attempt as held:
+            ...
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping
+from decimal import Decimal
+from types import TracebackType
+from typing import Any
+
+from zscout import clock
+from zscout.behaviors.client import Client
+from zscout.behaviors.request import Needs, OpenArc
+from zscout.messages import Done
+from zscout.scheduling.model import SECOND, Grant
+
+
+class Revoked(Exception):
+    """The hold was taken away; `outcome` is the protocol's word, the message the reason."""
+
+    def __init__(self, arc: OpenArc) -> None:
+        super().__init__(arc.reason or arc.outcome or "the hold is over")
+        self.outcome = arc.outcome or "lost"
+        self.by = arc.by
+
+
+class Held:
+    """A hold in force, inside the body."""
+
+    def __init__(self, client: Client, arc: OpenArc, grant: Grant) -> None:
+        self._client = client
+        self.arc = arc
+        self.grant = grant
+
+    @property
+    def rcs(self) -> list[str]:
+        return sorted(self.arc.needs)
+
+    @property
+    def active(self) -> bool:
+        """Whether the hold still stands, as far as this client has heard."""
+        return self.arc.grant == self.grant
+
+    @property
+    def remaining(self) -> float:
+        """Seconds of the minimum runtime that are left."""
+        return (self.arc.end - clock.now()) / SECOND
+
+    async def command(self, rc: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
+        """Has one of the held RCs do something. Raises CommandRefused."""
+        return await self._client.command(rc, self.grant, do, ttl=ttl)
+
+    async def over(self) -> None:
+        """Waits until the hold is over; for bodies that work elsewhere."""
+        while self.active:
+            if self.arc.keep:
+                await self._client.changed(self.arc)
+                continue
+            try:
+                async with asyncio.timeout(max(0.0, self.remaining)):
+                    await self._client.changed(self.arc)
+            except TimeoutError:
+                return
+
+
+class Attempt:
+    """One entry into an ARC's body. `again` lets a hold that was taken away be waited for once more."""
+
+    def __init__(self, client: Client, arc: OpenArc | None, ask: dict[str, Any], *, again: bool) -> None:
+        self._client, self._ask, self._again = client, ask, again
+        self.arc = arc
+        self._held: Held | None = None
+        self._body: asyncio.Task[Any] | None = None
+        self._watch: asyncio.Task[None] | None = None
+        self._cancelled = False
+        self._timely = False
+
+    async def __aenter__(self) -> Held:
+        if self.arc is None:
+            self.arc = await self._client.request(**self._ask)
+        try:
+            grant = await self._client.granted(self.arc)
+        except asyncio.CancelledError:
+            await self._client.end(self.arc)
+            raise
+        if grant is None:
+            raise Revoked(self.arc)
+        self._held = Held(self._client, self.arc, grant)
+        self._body = asyncio.current_task()
+        self._watch = asyncio.create_task(self._end_body(self._held))
+        return self._held
+
+    async def _end_body(self, held: Held) -> None:
+        await held.over()
+        self._timely = held.active or held.arc.outcome == "completed"
+        if self._body is not None:
+            self._cancelled = True
+            self._body.cancel()
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        assert self._held is not None and self._watch is not None and self._body is not None  # noqa: S101
+        arc = self._held.arc
+        self._watch.cancel()
+        ours = False
+        if self._cancelled:
+            # As asyncio.timeout does it: a cancellation that came from outside besides is not swallowed.
+            ours = self._body.uncancel() == 0 and (kind is asyncio.CancelledError or kind is None)
+        taken = not self._held.active and not self._timely
+        if self._timely:
+            arc.finish("completed", "its minimum runtime is over", clock.now())
+            return ours and kind is asyncio.CancelledError
+        if not taken:
+            await self._client.end(arc)
+            return False
+        if not ours and kind is not None:
+            await self._client.end(arc)
+            return False
+        if self._again and arc.open:
+            return True
+        revoked = Revoked(arc)
+        if arc.open:
+            await self._client.end(arc)
+        raise revoked from None
+
+
+def hold(
+    client: Client,
+    name: str,
+    needs: Needs,
+    *,
+    priority: int = 0,
+    min_runtime: float | Decimal = 1.0,
+    keep: bool = False,
+) -> Attempt:
+    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds."""
+    ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
+    return Attempt(client, None, ask, again=False)
+
+
+async def holds(
+    client: Client,
+    name: str,
+    needs: Needs,
+    *,
+    priority: int = 0,
+    min_runtime: float | Decimal = 1.0,
+    keep: bool = False,
+) -> AsyncIterator[Attempt]:
+    """The same, entered again whenever it was taken away and is granted again, until a body ends by itself
+    or has had its time."""
+    arc: OpenArc | None = None
+    ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
+    while arc is None or arc.open:
+        attempt = Attempt(client, arc, ask, again=True)
+        yield attempt
+        arc = attempt.arc
+        if arc is None:
+            return

@@ -1,0 +1,104 @@
+"""One request as its client sees it: what was asked, and how it stands by the newest word. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from decimal import Decimal
+from typing import Any
+
+from zscout.messages import Amounts, Ask, Notice, OpenRequest
+from zscout.scheduling.model import NO_TERM, SECOND, Grant, Ns, Place, Term
+
+Needs = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(slots=True)
+class OpenArc:
+    """A request from its first asking to its end.
+
+    `state` is `asking` until the first word, then `queued`, `running`, `ended` or `refused`.
+    """
+
+    id: str
+    name: str
+    needs: dict[str, Amounts]
+    priority: int
+    min_runtime: Decimal
+    keep: bool = False
+    state: str = "asking"
+    reason: str = ""
+    outcome: str | None = None
+    by: str | None = None
+    place: Place | None = None
+    ahead: int | None = None
+    grant: Grant | None = None
+    end: Ns = 0
+    """When the minimum runtime of the present hold is over, on this host's clock."""
+    since: Ns = 0
+    """When `state` began."""
+    last: tuple[Term, int] = field(default=(NO_TERM, 0))
+
+    @property
+    def open(self) -> bool:
+        return self.state in ("asking", "queued", "running")
+
+    def take(self, notice: Notice, now: Ns) -> bool:
+        """Takes a newer word about this request. False if it is an old one, or of an RCM that was replaced."""
+        if (notice.term, notice.step) <= self.last or not self.open:
+            return False
+        self.last = (notice.term, notice.step)
+        if notice.state != self.state or notice.grant != self.grant:
+            self.since = now
+        self.state = notice.state
+        self.reason = notice.reason
+        self.outcome, self.by = notice.outcome, notice.by
+        self.ahead = notice.ahead
+        if notice.place is not None:
+            self.place = notice.place
+        if notice.state == "running":
+            self.grant = notice.grant
+            self.end = now + round((notice.remaining or 0.0) * SECOND)
+        else:
+            self.grant = None
+        return True
+
+    def lose(self, reason: str, now: Ns) -> None:
+        """The hold is over by the client's own judgement; the request is asked again."""
+        self.state, self.reason, self.outcome, self.grant, self.since = "asking", reason, "lost", None, now
+
+    def finish(self, outcome: str, reason: str, now: Ns) -> None:
+        """The request is over by the client's own judgement."""
+        self.state, self.outcome, self.reason, self.grant, self.since = "ended", outcome, reason, None, now
+
+    def ask(self) -> Ask:
+        return Ask(
+            id=self.id,
+            arc=self.name,
+            needs=self.needs,
+            priority=self.priority,
+            min_runtime=self.min_runtime,
+            keep=self.keep,
+            place=self.place,
+        )
+
+    def told(self) -> OpenRequest:
+        """As an RCM that takes the lead is told of it."""
+        return OpenRequest(
+            id=self.id,
+            arc=self.name,
+            needs=self.needs,
+            priority=self.priority,
+            min_runtime=self.min_runtime,
+            keep=self.keep,
+            place=self.place,
+            grant=self.grant,
+        )
+
+
+def amounts(needs: Needs) -> dict[str, Amounts]:
+    """Needs as people write them (ints, floats, Decimals), as they are sent. 0.1 means one tenth."""
+    return {
+        rc: {name: value if isinstance(value, Decimal) else Decimal(str(value)) for name, value in params.items()}
+        for rc, params in needs.items()
+    }

@@ -1,0 +1,333 @@
+"""A resource controller on the mesh: the part that every driver shares.
+
+A driver subclasses `Driver` and says what its device does; `ResourceController` owns the keys, checks every
+command against the hold that stands when it is carried out, votes, and puts the device into its safe state
+when its holder is gone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any
+
+from zscout import clock
+from zscout.amounts import exact_amounts
+from zscout.drivers.holding import Change, Holding
+from zscout.keyexpr import Role, Token, new_instance
+from zscout.mesh import Declared, Mesh, Refused, Request
+from zscout.messages import (
+    Amounts,
+    Ballot,
+    Command,
+    Done,
+    EndedHold,
+    Grants,
+    Holder,
+    Proposal,
+    ProposedHolder,
+    RcAsk,
+    RcmState,
+    RcState,
+    StateAsk,
+)
+from zscout.scheduling.model import SECOND, Ns
+from zscout.scheduling.workload import excess
+from zscout.stall import StallWatch
+
+log = logging.getLogger(__name__)
+
+MIN_DELAY = 0.02
+MAX_TTL = 60.0
+REREAD_TIMEOUT = 0.5
+COMMAND_QUEUE = 64
+
+
+class Driver:
+    """What a device does. The defaults are those of an exclusive device without commands of its own.
+
+    Everything runs in the node's event loop, one call at a time; nothing may block.
+    """
+
+    sharable = False
+    activation: float = 0.0
+    """Seconds after a grant until the device has its full use, like a camera that warms up."""
+
+    async def begin(self, holder: Holder) -> None:
+        """Somebody begins to hold the device."""
+
+    async def safe(self) -> None:
+        """Nobody holds the device any more: motors stopped, transmitter off. Must not raise."""
+
+    async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
+        """Carries out `do` for its holder and returns what is answered. Raises Refused for what it can't do."""
+        raise Refused("unknown_command", f"this device does not know {str(do.get('name'))[:64]!r}")
+
+    def vote(self, holders: list[ProposedHolder]) -> str:
+        """Why a sharable device can't carry exactly these holders; empty if it can, and any subset of them."""
+        return ""
+
+    def capacity(self) -> Amounts:
+        """Bounds that people may like to see, by bandwidth parameter."""
+        return {}
+
+
+class ResourceController:
+    """One RC: its keys, its holds and its driver."""
+
+    def __init__(
+        self, mesh: Mesh, name: str, driver: Driver, *, hold_lease: float, stall: StallWatch
+    ) -> None:
+        self.mesh = mesh
+        self.name = name
+        self.driver = driver
+        self.holding = Holding(name, hold_lease=round(hold_lease * SECOND))
+        self.instance = new_instance()
+        self.rules = 0
+        self.health = "ok"
+        self._leaders: set[Token] = set()
+        self._declared: list[Declared] = []
+        self._warm_at: Ns = 0
+        self._work: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._rereading = False
+        self._timer: asyncio.TimerHandle | None = None
+        self._stall = stall
+
+    async def start(self) -> None:
+        """Starts empty, and obeys nothing before it has subscribed and then read `rcm/state`."""
+        keys, mesh = self.mesh.keys, self.mesh
+        self._state = mesh.publisher(keys.rc_state(self.name), RcState)
+        self._declared.append(mesh.watch(keys.alive_any(Role.RCM), self._on_leader))
+        self._declared.append(mesh.subscribe(keys.grants, Grants, self._on_grants))
+        await self._read_state()
+        self._spawn(self._worker())
+        self._declared.append(mesh.serve(keys.rc_state(self.name), RcAsk, self._on_state_asked))
+        if self.driver.sharable:
+            self._declared.append(mesh.serve(keys.vote(self.name), Proposal, self._on_proposal))
+        command = keys.command_any(self.name)
+        self._declared.append(mesh.serve(command, Command, self._on_command, depth=COMMAND_QUEUE))
+        token = Token(mesh.me.host, Role.RC, self.name, self.instance)
+        self._declared.append(mesh.alive(token))
+
+    async def stop(self) -> None:
+        """Leaves the mesh and puts the device into its safe state."""
+        for declared in reversed(self._declared):
+            declared.close()
+        if self._timer is not None:
+            self._timer.cancel()
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._state.close()
+        await self._guard(self.driver.safe())
+
+    def rules_changed(self) -> None:
+        """The driver votes by other rules from now on: earlier votes are void."""
+        self.rules += 1
+        self.publish()
+
+    def fail(self, why: str) -> None:
+        """The device can't carry its holders any longer: their holds end, the RC counts as lost."""
+        self.health = why
+        self._apply(self.holding.fail(why))
+        self.publish()
+
+    def recover(self) -> None:
+        """The device works again."""
+        self.health = "ok"
+        self.publish()
+
+    def publish(self, ended: list[EndedHold] | None = None) -> None:
+        self._state.put(self._told(ended or []))
+
+    # What is heard
+
+    def _on_leader(self, token: Token, alive: bool) -> None:
+        if alive:
+            self._leaders.add(token)
+        else:
+            self._leaders.discard(token)
+
+    def _on_grants(self, _key: str, said: Grants) -> None:
+        self._apply(self.holding.hear(said, clock.now()))
+
+    def _on_state_asked(self, request: Request[RcAsk]) -> None:
+        promise = request.message.promise
+        if promise is not None and not self.holding.promise(promise):
+            raise Refused(
+                "old_term", f"{self.name} obeys term {self.holding.term.counter}", self.holding.term
+            )
+        request.answer(self._told([]))
+
+    def _told(self, ended: list[EndedHold]) -> RcState:
+        return RcState(
+            rc=self.name,
+            host=self.mesh.me.host,
+            instance=self.instance,
+            sharable=self.driver.sharable,
+            term=self.holding.term,
+            seq=self.holding.seq,
+            holders=self.holding.holders(clock.now()),
+            ended=ended,
+            health=self.health,
+            rules=self.rules,
+            leader=bool(self._leaders),
+            capacity=self.driver.capacity(),
+        )
+
+    def _on_proposal(self, request: Request[Proposal]) -> None:
+        asked = request.message
+        try:
+            reason = self.driver.vote(asked.holders)
+        except ValueError as error:
+            raise Refused("bad_request", str(error)) from None
+        request.answer(Ballot(proposal=asked.proposal, accept=not reason, reason=reason))
+
+    # Commands
+
+    def _on_command(self, request: Request[Command]) -> None:
+        if self._work.qsize() >= COMMAND_QUEUE:
+            raise Refused("busy", f"{self.name} has {COMMAND_QUEUE} commands waiting; ask again")
+        if not 0 < request.message.ttl <= MAX_TTL:
+            raise Refused("bad_command", f"ttl must lie between 0 and {MAX_TTL:g} seconds")
+        self._work.put_nowait(("command", request))
+
+    async def _carry_out(self, request: Request[Command]) -> None:
+        command = request.message
+        sender = self.mesh.keys.sender_of(request.key)
+        waited = self._waited(request)
+        if waited > command.ttl * SECOND:
+            raise Refused(
+                "stale", f"the command waited {waited / SECOND:.2f} s, longer than its ttl {command.ttl:g} s"
+            )
+        refusal = self.holding.check(command.grant, str(sender), clock.now())
+        if refusal is not None and refusal.code == "not_yet":
+            await self._read_state()
+            refusal = self.holding.check(command.grant, str(sender), clock.now())
+        if refusal is not None:
+            raise Refused(refusal.code, refusal.message, self.holding.term)
+        warming = max(0.0, (self._warm_at - clock.now()) / SECOND)
+        if command.do.get("name") == "confirm":
+            request.answer(Done(warming=warming))
+            return
+        if warming:
+            raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
+        result = await self.driver.command(self.holding.held[command.grant].holder, command.do)
+        request.answer(Done(result=result))
+
+    def _waited(self, request: Request[Command]) -> Ns:
+        """How long a command may have waited: in our queue, and before it in the network through a stall."""
+        return clock.now() - request.arrived + self._stall.waited_through(request.arrived)
+
+    async def _worker(self) -> None:
+        """Carries out commands and changes of holders one at a time, in their order."""
+        while True:
+            what, item = await self._work.get()
+            if what == "command":
+                await self._answer(item)
+            else:
+                await self._change(item)
+
+    async def _answer(self, request: Request[Command]) -> None:
+        try:
+            await self._carry_out(request)
+        except Refused as refused:
+            request.refuse(refused.problem)
+        except Exception:
+            log.exception("%s: a command failed", self.name)
+            request.refuse(Refused("failed", f"{self.name} could not do it; see the log of its node").problem)
+
+    async def _change(self, change: Change) -> None:
+        # A hand-over goes on in another client: the same ARC has the same place, and no safe state is due.
+        stay = {holder.place for holder in change.began}
+        if any(holder.place not in stay for holder in change.stopped):
+            await self._guard(self.driver.safe())
+        for holder in change.began:
+            await self._guard(self.driver.begin(holder))
+
+    async def _guard(self, action: Any) -> None:
+        try:
+            await action
+        except Exception as error:
+            log.exception("%s: its driver failed", self.name)
+            self.fail(f"its driver failed: {error}")
+
+    # Holds
+
+    def _apply(self, change: Change) -> None:
+        if change:
+            known = {holder.place for holder in change.stopped}
+            if any(holder.place not in known for holder in change.began):
+                self._warm_at = clock.now() + round(self.driver.activation * SECOND)
+            self._work.put_nowait(("change", change))
+        if change.outdated or change.present or change.ended:
+            self.publish(change.ended)
+        if change.reread:
+            self._spawn(self._read_state())
+        self._set_timer()
+
+    async def _read_state(self) -> None:
+        if self._rereading:
+            return
+        self._rereading = True
+        try:
+            asked = StateAsk(holds_only=True)
+            replies = await self.mesh.ask(self.mesh.keys.rcm_state, asked, RcmState, timeout=REREAD_TIMEOUT)
+        finally:
+            self._rereading = False
+        states = [reply.message for reply in replies if reply.message is not None]
+        if states:
+            newest = max(states, key=lambda state: (state.term, state.seq))
+            self._apply(self.holding.read(newest, clock.now(), sharable=self.driver.sharable))
+
+    def _set_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        at = self.holding.next_expiry()
+        if at is not None:
+            delay = (at - clock.now()) / SECOND if at > clock.now() else MIN_DELAY
+            self._timer = asyncio.get_running_loop().call_later(delay, self._expire)
+
+    def _expire(self) -> None:
+        # After a stall of our own, what the RCM said meanwhile may still wait in the inbox: it goes first.
+        self._apply(self.holding.expire(clock.now(), lease=not self._stall.fresh()))
+
+    def _spawn(self, coroutine: Any) -> None:
+        task = asyncio.get_running_loop().create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+class ExclusiveDriver(Driver):
+    """A device that needs no driver of its own to be shared: it is held, and nothing more."""
+
+    def __init__(self, *, activation: float = 0.0) -> None:
+        self.activation = activation
+
+    async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
+        """Knows `echo`, which returns its `value`."""
+        if do.get("name") == "echo":
+            return do.get("value")
+        return await super().command(holder, do)
+
+
+class CapacityDriver(ExclusiveDriver):
+    """A sharable device that carries holders as long as no bandwidth parameter's sum exceeds its bound."""
+
+    sharable = True
+
+    def __init__(self, capacity: Mapping[str, Fraction], *, activation: float = 0.0) -> None:
+        super().__init__(activation=activation)
+        self._capacity = dict(capacity)
+
+    def vote(self, holders: list[ProposedHolder]) -> str:
+        wanted = ((holder.id, exact_amounts(holder.params)) for holder in holders)
+        return excess(self._capacity, wanted)
+
+    def capacity(self) -> Amounts:
+        return {name: Decimal(repr(float(bound))) for name, bound in self._capacity.items()}

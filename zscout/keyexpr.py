@@ -1,0 +1,225 @@
+"""The key space: every key expression of zscout is built and parsed here, and nowhere else.
+
+All keys lie under `zscout/<fleet>`. The sender of a request stands in its key, so that access control can
+check it; a receiver reads it from there and refuses wildcards in its place.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+from dataclasses import dataclass
+from typing import NamedTuple
+
+NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+ROOT = "zscout"
+
+
+class BadName(ValueError):
+    """A name or a key that can't stand in the key space; the message says which and why."""
+
+
+def check_name(name: str, what: str = "name") -> str:
+    """`name` itself if it may stand in a key; raises BadName otherwise."""
+    if NAME.fullmatch(name) is None:
+        raise BadName(f"{what} {name[:80]!r} is not valid: use 1 to 64 of A-Z a-z 0-9 _ . -")
+    return name
+
+
+def check_rc(name: str) -> str:
+    """`kind/name` itself if it names an RC; raises BadName otherwise."""
+    kind, slash, rest = name.partition("/")
+    if not slash:
+        raise BadName(f"RC {name[:130]!r} is not valid: write kind/name, like robot/scout33")
+    check_name(kind, "RC kind")
+    check_name(rest, "RC name")
+    return name
+
+
+def valid_name(text: str) -> str:
+    """`text` made a valid name, for host names and the like; empty input gives "unnamed"."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", text)[:64] or "unnamed"
+
+
+def new_instance() -> str:
+    """A name for one life of a process or an RC: two holders of one liveliness key would hide each other."""
+    return secrets.token_hex(6)
+
+
+class Sender(NamedTuple):
+    """Who speaks: `<host>/<client>`."""
+
+    host: str
+    client: str
+
+    def __str__(self) -> str:
+        return f"{self.host}/{self.client}"
+
+
+class Token(NamedTuple):
+    """A liveliness token: who is alive. `name` is `kind/name` for an RC."""
+
+    host: str
+    role: str
+    name: str
+    instance: str
+
+
+class Role:
+    """The roles under which something says that it is alive."""
+
+    NODE = "node"
+    CANDIDATE = "candidate"
+    RCM = "rcm"
+    RC = "rc"
+    CLIENT = "client"
+    LOAD = "load"
+    RECORDER = "recorder"
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The keys of one fleet. Arguments must be valid names; each method checks its own."""
+
+    fleet: str
+
+    def __post_init__(self) -> None:
+        check_name(self.fleet, "fleet")
+
+    @property
+    def base(self) -> str:
+        return f"{ROOT}/{self.fleet}"
+
+    @property
+    def everything(self) -> str:
+        return f"{self.base}/**"
+
+    # RCM
+
+    def schedule(self, sender: Sender) -> str:
+        return f"{self.base}/rcm/schedule/{_sender(sender)}"
+
+    @property
+    def schedule_any(self) -> str:
+        return f"{self.base}/rcm/schedule/*/*"
+
+    @property
+    def grants(self) -> str:
+        return f"{self.base}/rcm/grants"
+
+    @property
+    def rcm_state(self) -> str:
+        return f"{self.base}/rcm/state"
+
+    # Resource controllers
+
+    def vote(self, rc: str) -> str:
+        return f"{self.base}/rc/{check_rc(rc)}/vote"
+
+    def command(self, rc: str, sender: Sender) -> str:
+        return f"{self.base}/rc/{check_rc(rc)}/command/{_sender(sender)}"
+
+    def command_any(self, rc: str) -> str:
+        return f"{self.base}/rc/{check_rc(rc)}/command/*/*"
+
+    def rc_state(self, rc: str) -> str:
+        return f"{self.base}/rc/{check_rc(rc)}/state"
+
+    @property
+    def rc_state_any(self) -> str:
+        return f"{self.base}/rc/*/*/state"
+
+    def frame(self, rc: str) -> str:
+        return f"{self.base}/rc/{check_rc(rc)}/frame"
+
+    # Hosts
+
+    def load(self, host: str) -> str:
+        return f"{self.base}/host/{check_name(host, 'host')}/load"
+
+    @property
+    def load_any(self) -> str:
+        return f"{self.base}/host/*/load"
+
+    # Clients
+
+    def notice(self, client: Sender) -> str:
+        return f"{self.base}/client/{_sender(client)}/notice"
+
+    @property
+    def notice_any(self) -> str:
+        return f"{self.base}/client/*/*/notice"
+
+    def requests(self, client: Sender) -> str:
+        return f"{self.base}/client/{_sender(client)}/requests"
+
+    @property
+    def requests_any(self) -> str:
+        return f"{self.base}/client/*/*/requests"
+
+    # Liveliness
+
+    def alive(self, token: Token) -> str:
+        check_name(token.host, "host")
+        check_name(token.role, "role")
+        check_name(token.instance, "instance")
+        name = check_rc(token.name) if token.role == Role.RC else check_name(token.name)
+        return f"{self.base}/alive/{token.host}/{token.role}/{name}/{token.instance}"
+
+    def alive_any(self, role: str = "*") -> str:
+        """Tokens of a role, or of all."""
+        return f"{self.base}/alive/*/{role}/**" if role != "*" else f"{self.base}/alive/**"
+
+    # Parsing: each raises BadName for a key of another form
+
+    def sender_of(self, key: str) -> Sender:
+        """Who sent a request or command, or owns a client key: the last two chunks, or those of `client`."""
+        chunks = self._chunks(key)
+        match chunks:
+            case ["rcm", "schedule", host, client] | ["rc", _, _, "command", host, client]:
+                pass
+            case ["client", host, client, "notice" | "requests"]:
+                pass
+            case _:
+                raise BadName(f"{key[:200]!r} does not name its sender")
+        return Sender(check_name(host, "host"), check_name(client, "client"))
+
+    def rc_of(self, key: str) -> str:
+        match self._chunks(key):
+            case ["rc", kind, name, *_]:
+                return check_rc(f"{kind}/{name}")
+            case _:
+                raise BadName(f"{key[:200]!r} is not the key of an RC")
+
+    def host_of(self, key: str) -> str:
+        match self._chunks(key):
+            case ["host", host, *_]:
+                return check_name(host, "host")
+            case _:
+                raise BadName(f"{key[:200]!r} is not the key of a host")
+
+    def token_of(self, key: str) -> Token:
+        match self._chunks(key):
+            case ["alive", host, Role.RC, kind, name, instance]:
+                token = Token(host, Role.RC, f"{kind}/{name}", instance)
+            case ["alive", host, role, name, instance] if role != Role.RC:
+                token = Token(host, role, name, instance)
+            case _:
+                raise BadName(f"{key[:200]!r} is not the key of a liveliness token")
+        self.alive(token)
+        return token
+
+    def _chunks(self, key: str) -> list[str]:
+        if not key.startswith(f"{self.base}/"):
+            raise BadName(f"{key[:200]!r} is not a key of fleet {self.fleet}")
+        return key[len(self.base) + 1 :].split("/")
+
+
+def client_of(text: str) -> Sender:
+    """`<host>/<client>` as messages carry it; raises BadName for anything else."""
+    host, _, client = text.partition("/")
+    return Sender(check_name(host, "host"), check_name(client, "client"))
+
+
+def _sender(sender: Sender) -> str:
+    return f"{check_name(sender.host, 'host')}/{check_name(sender.client, 'client')}"

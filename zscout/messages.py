@@ -1,0 +1,374 @@
+"""What crosses the mesh: JSON objects with their schema in the Zenoh encoding (`docs/protocol.md`).
+
+Durations are seconds, never wall times. Unknown fields are ignored, wrong types refused. Terms, grants and
+places are arrays that compare element by element: `[counter, rcm]`, `[term, seq]`, `[term, arrival]`.
+"""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import Any, Literal, TypeAlias, TypeVar
+
+import msgspec
+
+from zscout.scheduling.model import NO_TERM, Grant, Place, Term
+
+MAX_PAYLOAD = 65_536
+"""Bytes of one message that is not a state answer."""
+MAX_STATE = 16_000_000
+"""Bytes of one answer about a whole fleet."""
+MAX_NEEDS = 64
+MAX_PARAMS = 16
+
+Amounts: TypeAlias = dict[str, Decimal]
+State: TypeAlias = Literal["queued", "running", "ended"]
+
+
+class Message(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Base of all messages."""
+
+
+# To the RCM
+
+
+class Ask(Message, frozen=True, tag_field="op", tag="request"):
+    """Asks for an ARC: all of `needs`, for at least `min_runtime` seconds.
+
+    `id` is the client's own and stays the same however often it asks; `place` is what an earlier RCM gave.
+    """
+
+    id: str
+    arc: str
+    needs: dict[str, Amounts]
+    priority: int
+    min_runtime: Decimal
+    keep: bool = False
+    place: Place | None = None
+
+
+class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
+    """The ARC is not wanted any more. `client` names its owner where that is not the sender."""
+
+    id: str
+    client: str | None = None
+
+
+class Release(Message, frozen=True, tag_field="op", tag="release"):
+    """Gives back what a running ARC holds. `client` names its owner where that is not the sender."""
+
+    id: str
+    client: str | None = None
+
+
+class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
+    """The sender's running ARC goes on in client `to`, under a new grant."""
+
+    id: str
+    to: str
+
+
+Operation: TypeAlias = Ask | Cancel | Release | HandOver
+
+
+class Notice(Message, frozen=True):
+    """How one request stands: the answer to an operation, and what the client is told at each change.
+
+    Of two notices about one request the one with the greater `(term, step)` is the newer.
+    """
+
+    id: str
+    arc: str
+    client: str
+    state: State
+    term: Term
+    step: int
+    priority: int = 0
+    reason: str = ""
+    outcome: str | None = None
+    """How the last hold, or the wait, came to its end."""
+    by: str | None = None
+    """The ARC that it was taken for."""
+    place: Place | None = None
+    ahead: int | None = None
+    """ARCs that rank before it in the queue."""
+    grant: Grant | None = None
+    rcs: list[str] = []
+    remaining: float | None = None
+    """Seconds until its minimum runtime is over."""
+
+
+# From the RCM to all
+
+
+class Holder(Message, frozen=True):
+    """One holder of one RC, told so fully that a new RCM can carry its ARC on from the RCs' word alone.
+
+    `rcs` names the whole gang. `remaining` seconds of its minimum runtime are left, negative where it is
+    over; with `keep` the hold does not end then."""
+
+    id: str
+    arc: str
+    client: str
+    grant: Grant
+    place: Place
+    rcs: list[str]
+    min_runtime: Decimal
+    remaining: float
+    priority: int = 0
+    keep: bool = False
+    params: Amounts = {}
+
+
+class Revocation(Message, frozen=True):
+    """A hold that is over, by name."""
+
+    id: str
+    arc: str
+    client: str
+    grant: Grant
+    rcs: list[str]
+    outcome: str
+    reason: str
+    by: str | None = None
+
+
+class Grants(Message, frozen=True):
+    """A publication of the leading RCM. For each RC touched, all its holders from now on.
+
+    `prev` is the seq of the publication before: a receiver that heard another one has missed something.
+    Without `rcs` and `revoked` it is a heartbeat; one comes at least every `every` seconds.
+    """
+
+    term: Term
+    seq: int
+    prev: int
+    every: float
+    rcs: dict[str, list[Holder]] = {}
+    revoked: list[Revocation] = []
+
+
+# The state of the RCM
+
+
+class StateAsk(Message, frozen=True):
+    """Asks how things stand. `arc` (a name or an id) asks for the story of one ARC besides."""
+
+    arc: str | None = None
+    holds_only: bool = False
+
+
+class HoldView(Message, frozen=True):
+    """A hold in force. `held` is how long it has stood, in seconds."""
+
+    id: str
+    arc: str
+    client: str
+    priority: int
+    grant: Grant
+    place: Place
+    needs: dict[str, Amounts]
+    min_runtime: Decimal
+    held: float
+    remaining: float
+    keep: bool = False
+
+
+class WaitView(Message, frozen=True):
+    """An ARC in the queue, in rank order. `waited` seconds since it was last queued."""
+
+    id: str
+    arc: str
+    client: str
+    priority: int
+    place: Place
+    needs: dict[str, Amounts]
+    min_runtime: Decimal
+    waited: float
+    reason: str
+    preemptions: int = 0
+
+
+class RcView(Message, frozen=True):
+    rc: str
+    present: bool
+    sharable: bool
+    holders: list[str] = []
+    """Ids of the ARCs that hold it."""
+
+
+class StoryLine(Message, frozen=True):
+    """Something that happened to an ARC, `ago` seconds before the answer."""
+
+    ago: float
+    text: str
+
+
+class RcmState(Message, frozen=True):
+    """What the RCM knows. `seq` is the last that it published; `more` counts queued ARCs left out."""
+
+    term: Term
+    seq: int
+    host: str
+    holds: list[HoldView] = []
+    queue: list[WaitView] = []
+    rcs: list[RcView] = []
+    story: list[StoryLine] = []
+    more: int = 0
+
+
+# RCs
+
+
+class ProposedHolder(Message, frozen=True):
+    id: str
+    arc: str
+    client: str
+    params: Amounts = {}
+
+
+class Proposal(Message, frozen=True):
+    """Would the RC carry exactly these holders?"""
+
+    proposal: int
+    term: Term
+    holders: list[ProposedHolder]
+
+
+class Ballot(Message, frozen=True):
+    proposal: int
+    accept: bool
+    reason: str = ""
+
+
+class Command(Message, frozen=True):
+    """Do `do` under `grant`, unless it has waited longer than `ttl` seconds by then.
+
+    `do` names what to do in `name`; the rest is the driver's. Every RC knows `confirm`.
+    """
+
+    grant: Grant
+    do: dict[str, Any]
+    ttl: float = 1.0
+
+
+class Done(Message, frozen=True):
+    """A command was carried out. `warming` seconds are left until the device has its full use."""
+
+    result: Any = None
+    warming: float = 0.0
+
+
+class RcAsk(Message, frozen=True):
+    """Asks an RC for its state. With `promise`, an RC that answers obeys no lower term again."""
+
+    promise: Term | None = None
+
+
+class EndedHold(Message, frozen=True):
+    """A hold that ended at the RC by itself: `why` is `time`, `lease` or `failed`."""
+
+    id: str
+    grant: Grant
+    why: str
+
+
+class RcState(Message, frozen=True):
+    """An RC as it is. `term`, `seq`: the newest publication heard, or term promised."""
+
+    rc: str
+    host: str
+    instance: str
+    sharable: bool
+    term: Term = NO_TERM
+    seq: int = 0
+    holders: list[Holder] = []
+    ended: list[EndedHold] = []
+    health: str = "ok"
+    """`ok`, or in words what is wrong; an RC that is not ok counts as lost."""
+    rules: int = 0
+    """Grows when what it votes by changes: earlier votes are void."""
+    leader: bool = False
+    """Whether it sees a leading RCM."""
+    capacity: Amounts = {}
+
+
+# Clients
+
+
+class OpenRequest(Message, frozen=True):
+    """A request as its client knows it, for an RCM that takes the lead."""
+
+    id: str
+    arc: str
+    needs: dict[str, Amounts]
+    priority: int
+    min_runtime: Decimal
+    keep: bool = False
+    place: Place | None = None
+    grant: Grant | None = None
+
+
+class ClientRequests(Message, frozen=True):
+    client: str
+    requests: list[OpenRequest]
+
+
+# Hosts
+
+
+class LoadReport(Message, frozen=True):
+    """A host's load. `number` counts the reports of one reporter; memory in bytes, `cpu` in percent of all."""
+
+    host: str
+    number: int
+    cores: int
+    load_average: tuple[float, float, float]
+    cpu: float
+    memory_available: int
+    memory_total: int
+
+
+# Errors
+
+
+class Problem(Message, frozen=True):
+    """Why something was refused. `term` is the term that the answerer has promised, where that is why."""
+
+    code: str
+    message: str
+    term: Term | None = None
+
+
+T = TypeVar("T")
+_ENCODER = msgspec.json.Encoder(decimal_format="number")
+_DECODERS: dict[Any, msgspec.json.Decoder[Any]] = {}
+
+
+class Malformed(ValueError):
+    """A payload that is not the message it should be; says what and where."""
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    return _ENCODER.encode(message)
+
+
+def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
+    """`payload` as a message of `kind` (a struct, or a union of tagged ones). Raises Malformed."""
+    if len(payload) > limit:
+        raise Malformed(f"{len(payload)} bytes are too many; at most {limit} are taken")
+    decoder = _DECODERS.get(kind)
+    if decoder is None:
+        decoder = _DECODERS[kind] = msgspec.json.Decoder(kind)
+    try:
+        return decoder.decode(payload)  # type: ignore[no-any-return]
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise Malformed(f"not a valid {_name(kind)}: {error}") from None
+
+
+def schema(kind: type) -> str:
+    """The name under which a message travels in the encoding."""
+    return f"zscout.{kind.__name__}.v1"
+
+
+def _name(kind: Any) -> str:
+    return getattr(kind, "__name__", "operation")

@@ -1,0 +1,332 @@
+"""Writes what the mesh shows to Rerun: a recording file, a live server for viewers, or both.
+
+Everything stands on one timeline, as a duration in seconds; the zero is the caller's. Names come from
+the mesh, so lanes, names and texts are bounded here, and a name that Rerun would read as a path is cleaned.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+import os
+import re
+import socket
+import threading
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Final, NamedTuple
+
+import numpy as np
+import rerun as rr
+
+from zscout.services.blueprint import APPLICATION, LINES, OPERATOR, OTHER, PALETTE, STATES, TIME, blueprint
+from zscout.strict import BadInput
+
+SERVER_MEMORY: Final = "200MB"
+"""What the live server keeps for viewers that come late; the oldest goes first."""
+MAX_ARCS: Final = 2000
+MAX_RCS: Final = 1000
+MAX_HOSTS: Final = 256
+MAX_SLOTS: Final = 8
+"""Rows of one sharable RC; more holders are summed up in the last row."""
+RC_STATES: Final = 256
+ARC_STATES: Final = 16
+"""Distinct texts of one lane that keep their colour; past it, the one longest unused loses it."""
+MAX_STATE: Final = 120
+MAX_EVENT: Final = 500
+"""Characters."""
+MAX_SECONDS: Final = 9e9
+"""Rerun counts nanoseconds in 64 bits."""
+OPERATOR_MARK: Final = " (operator)"
+"""Follows the ARC's name in an RC's lane where an operator holds it."""
+LEVELS: Final = frozenset({"CRITICAL", "ERROR", "WARN", "INFO", "DEBUG", "TRACE"})
+FLUSH_SECONDS: Final = 5.0
+DISCONNECT_SECONDS: Final = 8.0
+
+
+class TimelineError(BadInput):
+    """The recording can't be written or served: one line that says what, where and how to mend it."""
+
+
+class Holder(NamedTuple):
+    """An ARC that holds an RC; `operator` if its priority is an operator's."""
+
+    arc: str
+    operator: bool = False
+
+
+class _Lane:
+    """One lane of a state timeline: what it shows, and the texts it has given a colour."""
+
+    def __init__(self, path: list[object], capacity: int) -> None:
+        self.path = path
+        self.capacity = capacity
+        self.states: list[str] | None = None
+        self.colours: dict[str, int] = {}
+        """By text, the one longest unused first."""
+        self.slots: list[str] = []
+        """Holder by row, "" where the row is free."""
+
+    def learn(self, state: str, colour: int) -> bool:
+        """Whether the viewer must be told a colour."""
+        known = self.colours.pop(state, None)
+        self.colours[state] = colour
+        if len(self.colours) > self.capacity:
+            del self.colours[next(iter(self.colours))]
+        return known != colour
+
+    def seat(self, names: Sequence[str]) -> list[str]:
+        """Holders by row. Whoever stays keeps the row, so that no bar jumps; no row is taken away."""
+        wanted = dict.fromkeys(names)
+        crowded = len(wanted) > MAX_SLOTS
+        rows = MAX_SLOTS - 1 if crowded else MAX_SLOTS
+        self.slots = [name if name in wanted else "" for name in self.slots[:rows]] + [""] * len(
+            self.slots[rows:]
+        )
+        for name in (name for name in wanted if name not in self.slots):
+            if "" in self.slots[:rows]:
+                self.slots[self.slots.index("")] = name
+            elif len(self.slots) < rows:
+                self.slots.append(name)
+        if not crowded:
+            return self.slots or [""]
+        return [*self.slots[:rows], f"{len(wanted) - rows} more"]
+
+
+class Timeline:
+    """The Rerun side of a recorder. Safe to call from any thread; after `close` every call does nothing.
+
+    `fleet` names the recording, together with the time of the start. `path`: the `.rrd` file, replaced if it
+    is there, or None. `port`: the live server's TCP port on the address `bind`, 0 for a free one, or None for
+    no server. Raises TimelineError if the port is taken or the file can't be written.
+
+    `at` is seconds, of a size below `MAX_SECONDS`; any other number is a ValueError.
+    """
+
+    def __init__(
+        self, fleet: str, *, path: Path | None, bind: str = "127.0.0.1", port: int | None = None
+    ) -> None:
+        if path is None and port is None:
+            raise TimelineError("timeline: neither a file nor a port is given; name one, or both")
+        self.url: str | None = None
+        """Where a viewer finds the live server: `rerun URL`."""
+        self._path = path
+        self._lock = threading.RLock()
+        self._closed = False
+        self._arcs: dict[str, int] = {}
+        self._arc_lanes: dict[str, _Lane] = {}
+        self._rc_lanes: dict[str, _Lane] = {}
+        self._hosts: set[str] = set()
+        self._noted: set[str] = set()
+        self._begin, self._end = math.inf, -math.inf
+        start = datetime.now(UTC)
+        self._recording = rr.RecordingStream(
+            APPLICATION, recording_id=f"{fleet}-{start.strftime('%Y%m%dT%H%M%S.%fZ')}"
+        )
+        self._recording.set_log_time_enabled(False)
+        self._recording.set_log_tick_enabled(False)
+        self._open(path, bind, port)
+        self._recording.send_recording_name(f"{fleet}, {start:%Y-%m-%d %H:%M:%S} UTC")
+        self._recording.send_recording_start_time_nanos(int(start.timestamp() * 1e9))
+
+    def _open(self, path: Path | None, bind: str, port: int | None) -> None:
+        sinks: list[rr.GrpcServerSink | rr.FileSink] = []
+        if port is not None:
+            port = _free_port(bind, port)
+            host = f"[{bind}]" if ":" in bind else bind
+            self.url = f"rerun+http://{host}:{port}/proxy"
+            sinks.append(rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=SERVER_MEMORY))
+        if path is not None:
+            _check_writable(path)
+            sinks.append(rr.FileSink(path))
+        try:
+            self._recording.set_sinks(*sinks, default_blueprint=blueprint(live=True))
+            # The server comes up in a thread of its own; a flush is what tells of its failure.
+            self._recording.flush(timeout_sec=FLUSH_SECONDS)
+        except (RuntimeError, ValueError) as error:
+            self._disconnect()
+            raise TimelineError(
+                f"timeline: can't write to {path or self.url} ({error}); make room there, or choose another"
+            ) from error
+
+    def holders(self, at: float, rc: str, holders: Sequence[Holder]) -> None:
+        """From `at` on, the RC (`kind/name`) is held by exactly these ARCs; by nobody if empty.
+
+        Several holders get a row each. A row reads the ARC's name, with `OPERATOR_MARK` for an operator's."""
+        with self._lock:
+            if not self._ready(at):
+                return
+            if rc not in self._rc_lanes and len(self._rc_lanes) >= MAX_RCS:
+                self._note(at, f"more than {MAX_RCS} RCs: the others have no lane")
+                return
+            lane = self._rc_lanes.setdefault(rc, _Lane(_path("rc", rc), RC_STATES))
+            colours: dict[str, int] = {"": OTHER}
+            for holder in holders:
+                name = _text(holder.arc, MAX_STATE) + (OPERATOR_MARK if holder.operator else "")
+                colours[name] = OPERATOR if holder.operator else self._colour(at, holder.arc)
+            rows = lane.seat([name for name in colours if name])
+            self._show(lane, [(row, colours.get(row, OTHER)) for row in rows])
+
+    def arc(self, at: float, arc: str, state: str, detail: str = "") -> None:
+        """From `at` on, the ARC is in `state`: "waiting", "running", "preempted", "done" or another word.
+
+        `detail` says more in the same bar, as why it waits. An empty `state` ends the lane."""
+        with self._lock:
+            if not self._ready(at):
+                return
+            self._colour(at, arc)
+            if arc not in self._arcs:
+                return
+            lane = self._arc_lanes.setdefault(arc, _Lane(_path("arc", arc), ARC_STATES))
+            text = _text(f"{state} · {detail}" if state and detail else state, MAX_STATE)
+            self._show(lane, [(text, STATES.get(state, OTHER))])
+
+    def load(self, at: float, host: str, load1: float, cpu: float | None = None) -> None:
+        """A host's load average over 1 minute and, kept under `/cpu`, its CPU use (0 to 1).
+
+        What is not a finite number leaves a gap."""
+        with self._lock:
+            if not self._ready(at):
+                return
+            if host not in self._hosts:
+                if len(self._hosts) >= MAX_HOSTS:
+                    self._note(at, f"more than {MAX_HOSTS} hosts: the load of the others is not drawn")
+                    return
+                colour = LINES[len(self._hosts) % len(LINES)]
+                self._hosts.add(host)
+                line = rr.SeriesLines(names=[_text(host, MAX_STATE)], colors=[colour], widths=[2.0])
+                for folder in ("load", "cpu"):
+                    self._recording.log(_path(folder, host), line, static=True)
+            for folder, value in (("load", load1), ("cpu", cpu)):
+                if value is not None and math.isfinite(value):
+                    self._recording.log(_path(folder, host), rr.Scalars(value))
+
+    def event(self, at: float, text: str, level: str = "INFO") -> None:
+        """One line in words; `level` as in logging, WARN for what people should look at."""
+        with self._lock:
+            if not self._ready(at):
+                return
+            known = level if level in LEVELS else "INFO"
+            self._recording.log("events", rr.TextLog(_text(text, MAX_EVENT), level=known))
+
+    def close(self) -> None:
+        """Ends file and server, within seconds. The file then opens on the whole run.
+
+        Raises TimelineError if not everything could be written."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+        if self._end >= self._begin:
+            rows = sum(len(lane.states or [""]) for lane in self._rc_lanes.values())
+            final = blueprint(
+                False, self._end, begin=self._begin, rc_rows=rows, arc_rows=len(self._arc_lanes)
+            )
+            self._recording.send_blueprint(final)
+        try:
+            self._recording.flush(timeout_sec=FLUSH_SECONDS)
+        except (RuntimeError, ValueError) as error:
+            raise TimelineError(
+                f"timeline: the end of the recording {self._path or self.url} may be missing ({error}); "
+                "is there room on the disk?"
+            ) from error
+        finally:
+            self._disconnect()
+
+    def __enter__(self) -> Timeline:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _disconnect(self) -> None:
+        # A viewer that hangs can hold this up: then it is left to a thread that dies with the process.
+        thread = threading.Thread(target=self._recording.disconnect, name="rerun-disconnect", daemon=True)
+        thread.start()
+        thread.join(DISCONNECT_SECONDS)
+
+    def _colour(self, at: float, arc: str) -> int:
+        """The ARC's colour, by order of appearance."""
+        if arc not in self._arcs:
+            if len(self._arcs) >= MAX_ARCS:
+                self._note(
+                    at, f"more than {MAX_ARCS} ARC names: the others have no lane and no colour of their own"
+                )
+                return OTHER
+            self._arcs[arc] = PALETTE[len(self._arcs) % len(PALETTE)]
+        return self._arcs[arc]
+
+    def _show(self, lane: _Lane, rows: list[tuple[str, int]]) -> None:
+        news = [lane.learn(state, colour) for state, colour in rows if state]
+        if any(news):
+            configuration = rr.StateConfiguration(
+                values=list(lane.colours), colors=np.array(list(lane.colours.values()), np.uint32)
+            )
+            self._recording.log(lane.path, configuration, static=True)
+        states = [state for state, _ in rows]
+        if states != lane.states:
+            lane.states = states
+            self._recording.log(lane.path, rr.StateChange(state=states))
+
+    def _note(self, at: float, text: str) -> None:
+        if text not in self._noted:
+            self._noted.add(text)
+            self.event(at, f"timeline: {text}", "WARN")
+
+    def _ready(self, at: float) -> bool:
+        """Sets the time for what this thread logs next; False after `close`."""
+        if not abs(at) < MAX_SECONDS:
+            raise ValueError(f"timeline: {at} is no time in seconds; give a number below {MAX_SECONDS:g}")
+        if self._closed:
+            return False
+        self._begin, self._end = min(self._begin, at), max(self._end, at)
+        self._recording.set_time(TIME, duration=at)
+        return True
+
+
+def _path(folder: str, name: str) -> list[object]:
+    parts = (re.sub(r"[^A-Za-z0-9_.-]", "_", part)[:64] for part in name.split("/")[:4])
+    return [folder, *(part or "_" for part in parts)]
+
+
+def _text(text: str, limit: int) -> str:
+    """One line of at most `limit` characters."""
+    line = " ".join(text[: 2 * limit].split())
+    line = "".join(letter for letter in line if letter.isprintable())
+    return line if len(line) <= limit else line[: limit - 1] + "…"
+
+
+def _free_port(bind: str, port: int) -> int:
+    """Checks address and port first: Rerun itself says only that its thread ended."""
+    try:
+        address = ipaddress.ip_address(bind)
+    except ValueError as error:
+        raise TimelineError(
+            f"timeline: bind = {bind!r} is not an IP address; use 127.0.0.1, or 0.0.0.0 for all networks"
+        ) from error
+    if not 0 <= port <= 65535:
+        raise TimelineError(f"timeline: port {port} is not one of 0 to 65535; 9876 is Rerun's own")
+    family = socket.AF_INET6 if address.version == 6 else socket.AF_INET
+    try:
+        with socket.create_server((bind, port), family=family) as server:
+            return int(server.getsockname()[1])
+    except OSError as error:
+        raise TimelineError(
+            f"timeline: can't listen on {bind}, port {port} ({os.strerror(error.errno or 0)}); "
+            "choose another port, or end the program that has it"
+        ) from error
+
+
+def _check_writable(path: Path) -> None:
+    try:
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise TimelineError(
+            f"timeline: can't write the recording {path} ({error.strerror}); "
+            "give a file in a directory that is there and can be written"
+        ) from error

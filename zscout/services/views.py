@@ -1,0 +1,120 @@
+"""How the core's state is told on the mesh: conversions from its model to messages, and nothing else."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from fractions import Fraction
+
+from zscout.messages import Amounts, Holder, HoldView, ProposedHolder, RcView, Revocation, WaitView
+from zscout.scheduling.effects import Revoked
+from zscout.scheduling.floor import Floor
+from zscout.scheduling.model import SECOND, Arc, ArcId, Hold, Ns, Params
+
+
+def arc_id(client: str, request_id: str) -> ArcId:
+    """The core's name of a request: unique on the mesh, as a client's own id is not."""
+    return f"{client}/{request_id}"
+
+
+def request_id(arc: ArcId) -> str:
+    """The client's own id in an ArcId."""
+    return arc.rpartition("/")[2]
+
+
+def seconds(duration: Ns) -> Decimal:
+    return Decimal(duration).scaleb(-9)
+
+
+def amounts(params: Params) -> Amounts:
+    return {name: _decimal(value) for name, value in params.items()}
+
+
+def needs(arc: Arc) -> dict[str, Amounts]:
+    return {name: amounts(params) for name, params in sorted(arc.request.needs.items())}
+
+
+def holder(arc: Arc, hold: Hold, rc: str, now: Ns) -> Holder:
+    return Holder(
+        id=request_id(arc.id),
+        arc=arc.name,
+        client=arc.request.client,
+        grant=hold.grant,
+        place=arc.place,
+        rcs=sorted(arc.request.needs),
+        min_runtime=seconds(arc.request.min_runtime),
+        remaining=(hold.end - now) / SECOND,
+        priority=arc.request.priority,
+        keep=arc.request.keep,
+        params=amounts(arc.request.needs[rc]),
+    )
+
+
+def holders(floor: Floor, rc: str, now: Ns) -> list[Holder]:
+    """All holders of an RC."""
+    return [holder(arc, arc.hold, rc, now) for arc in floor.rc(rc).holders.values() if arc.hold is not None]
+
+
+def proposed(arc: Arc, params: Params) -> ProposedHolder:
+    return ProposedHolder(
+        id=request_id(arc.id), arc=arc.name, client=arc.request.client, params=amounts(params)
+    )
+
+
+def revocation(effect: Revoked, name: str) -> Revocation:
+    return Revocation(
+        id=request_id(effect.arc),
+        arc=name,
+        client=effect.client,
+        grant=effect.grant,
+        rcs=list(effect.rcs),
+        outcome=effect.outcome,
+        reason=effect.reason,
+        by=effect.by,
+    )
+
+
+def hold_view(arc: Arc, hold: Hold, now: Ns) -> HoldView:
+    return HoldView(
+        id=request_id(arc.id),
+        arc=arc.name,
+        client=arc.request.client,
+        priority=arc.request.priority,
+        grant=hold.grant,
+        place=arc.place,
+        needs=needs(arc),
+        min_runtime=seconds(arc.request.min_runtime),
+        held=(now - hold.start) / SECOND,
+        remaining=(hold.end - now) / SECOND,
+        keep=arc.request.keep,
+    )
+
+
+def wait_view(arc: Arc, now: Ns) -> WaitView:
+    return WaitView(
+        id=request_id(arc.id),
+        arc=arc.name,
+        client=arc.request.client,
+        priority=arc.request.priority,
+        place=arc.place,
+        needs=needs(arc),
+        min_runtime=seconds(arc.request.min_runtime),
+        waited=(now - arc.since) / SECOND,
+        reason=arc.reason,
+        preemptions=arc.preemptions,
+    )
+
+
+def rc_views(floor: Floor) -> list[RcView]:
+    return [
+        RcView(
+            rc=rc.name,
+            present=rc.present,
+            sharable=rc.sharable,
+            holders=[request_id(arc) for arc in rc.holders],
+        )
+        for _, rc in sorted(floor.rcs.items())
+    ]
+
+
+def _decimal(value: Fraction) -> Decimal:
+    return Decimal(value.numerator) / Decimal(value.denominator)
