@@ -31,6 +31,10 @@ BAD_FLEETS = {
     "\n[fleet\nname = 1": f"line 2, column 7: Expected ']' at the end of a table declaration; {SYNTAX}",
     "x = " + "1" * 5000: "a whole number has thousands of digits; shorten it",
     "x = " + "[" * 5000: "is nested too deep; no key goes deeper than a few tables",
+    "\n" + ".".join(["a"] * 300_000) + " = 1": "line 2 has a dotted key of more than 32 parts; shorten it",
+    "["
+    + " . ".join(['"\\""', "'b'"] * 99_000)
+    + "]": "line 1 has a dotted key of more than 32 parts; shorten it",
     # Keys and tables
     "[flet]": "flet: unknown key; did you mean fleet?",
     "[fleet]\ncandiates = []": "fleet.candiates: unknown key; did you mean candidates?",

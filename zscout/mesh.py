@@ -16,7 +16,7 @@ import os
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeAlias, TypeVar
 
 # Zenoh reads this once, when it is loaded. With few receiving threads one cut-off host stalls every link.
 os.environ.setdefault(
@@ -155,6 +155,9 @@ class Declared:
                 log.debug("undeclaring failed: %s", error)
 
 
+_Item: TypeAlias = tuple[_Declaration | None, Callable[..., None], tuple[Any, ...]]
+
+
 @dataclass(slots=True)
 class _Inbox:
     """From Zenoh's threads into the event loop, waking it once for whatever has gathered."""
@@ -201,7 +204,7 @@ class _Inbox:
 
 
 class Mesh:
-    """One process's place on the mesh. Open with `await Mesh.open(...)`, or as an async context manager."""
+    """One process's place on the mesh. `await Mesh.open(...)`; an async context manager."""
 
     def __init__(
         self, session: zenoh.Session, keys: Keys, me: Sender, loop: asyncio.AbstractEventLoop
@@ -400,7 +403,7 @@ class Mesh:
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_STATE,
     ) -> Declared:
-        """Calls `handler(key, message)` for every publication on `key`; malformed ones are logged and dropped."""
+        """Calls `handler(key, message)` for every publication on `key`; malformed ones are logged."""
         state = _Declaration(depth=depth)
 
         def on_sample(sample: zenoh.Sample) -> None:
@@ -421,7 +424,6 @@ class Mesh:
     def hear(self, key: str, handler: Callable[[], None]) -> Declared:
         """Calls `handler()` on Zenoh's own thread for every publication on `key`, unread: to know that
         somebody speaks costs next to nothing that way. It must return at once."""
-
 
         def on_sample(_: zenoh.Sample) -> None:
             handler()

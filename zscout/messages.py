@@ -317,7 +317,7 @@ class ClientRequests(Message, frozen=True):
 
 
 class LoadReport(Message, frozen=True):
-    """A host's load. `number` counts the reports of one reporter; memory in bytes, `cpu` in percent of all."""
+    """A host's load. `number` counts one reporter's reports; memory in bytes, `cpu` in percent of all."""
 
     host: str
     number: int

@@ -33,10 +33,14 @@ _MAX_MAGNITUDE: Final = 18
 """Largest power of ten of any number, and of any whole number; more would make exact sums slow."""
 _MAX_PLACES: Final = 100
 _MAX_SHOWN: Final = 60
+_MAX_DEPTH: Final = 32
 
 _NAME: Final = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
 _BARE_KEY: Final = re.compile(r"[A-Za-z0-9_-]+")
 _AT: Final = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
+_PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_DEEP_KEY: Final = re.compile(rf"""(?<![\w"'-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MAX_DEPTH}}}""")
+"""A dotted key that is longer than any here. tomllib takes hours over one that fills the file."""
 _NAME_RULE: Final = f'1 to {MAX_NAME} letters A to Z, digits, "_", "." or "-"'
 
 
@@ -129,6 +133,10 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
     Numbers with a point are read as Decimal, exactly; struct fields may be Decimal, float, int, str, bool,
     Literal, lists and tables of these, and structs (let them forbid unknown fields)."""
     where = Where(source)
+    deep = _DEEP_KEY.search(text)
+    if deep:
+        line = text.count("\n", 0, deep.start()) + 1
+        raise where.bad(f"line {line} has a dotted key of more than {_MAX_DEPTH} parts", "shorten it")
     try:
         data = tomllib.loads(text, parse_float=_decimal)
     except tomllib.TOMLDecodeError as error:

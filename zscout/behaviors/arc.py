@@ -5,7 +5,7 @@
             await held.command("robot/scout33", {"name": "echo", "value": 1})
 
 The body is cancelled when the hold is taken away (`Revoked` comes out of the `async with`), and when its
-minimum runtime is over (nothing comes out: it had its time). `holds` goes again each time it is granted again:
+minimum runtime is over (nothing comes out: it had its time). `holds` goes again when it is granted again:
 
     async for attempt in holds(client, "survey", {"robot/scout33": {}}, min_runtime=5):
         async with attempt as held:
@@ -58,6 +58,13 @@ class Held:
         """Seconds of the minimum runtime that are left."""
         return (self.arc.end - clock.now()) / SECOND
 
+    @property
+    def completed(self) -> bool:
+        """Whether the hold is over because it had its minimum runtime."""
+        if self.active:
+            return not self.arc.keep and self.remaining <= 0
+        return self.arc.outcome == "completed"
+
     async def command(self, rc: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
         """Has one of the held RCs do something. Raises CommandRefused."""
         return await self._client.command(rc, self.grant, do, ttl=ttl)
@@ -81,11 +88,7 @@ class Attempt:
     def __init__(self, client: Client, arc: OpenArc | None, ask: dict[str, Any], *, again: bool) -> None:
         self._client, self._ask, self._again = client, ask, again
         self.arc = arc
-        self._held: Held | None = None
-        self._body: asyncio.Task[Any] | None = None
-        self._watch: asyncio.Task[None] | None = None
-        self._cancelled = False
-        self._timely = False
+        self._entered: _Entered | None = None
 
     async def __aenter__(self) -> Held:
         if self.arc is None:
@@ -97,44 +100,54 @@ class Attempt:
             raise
         if grant is None:
             raise Revoked(self.arc)
-        self._held = Held(self._client, self.arc, grant)
-        self._body = asyncio.current_task()
-        self._watch = asyncio.create_task(self._end_body(self._held))
-        return self._held
-
-    async def _end_body(self, held: Held) -> None:
-        await held.over()
-        self._timely = held.active or held.arc.outcome == "completed"
-        if self._body is not None:
-            self._cancelled = True
-            self._body.cancel()
+        held = Held(self._client, self.arc, grant)
+        body = asyncio.current_task()
+        assert body is not None  # noqa: S101 - this is a coroutine
+        self._entered = _Entered(held, body)
+        self._entered.watch = asyncio.create_task(self._entered.interrupt_when_over())
+        return held
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> bool:
-        assert self._held is not None and self._watch is not None and self._body is not None  # noqa: S101
-        arc = self._held.arc
-        self._watch.cancel()
-        ours = False
-        if self._cancelled:
-            # As asyncio.timeout does it: a cancellation that came from outside besides is not swallowed.
-            ours = self._body.uncancel() == 0 and (kind is asyncio.CancelledError or kind is None)
-        taken = not self._held.active and not self._timely
-        if self._timely:
-            arc.finish("completed", "its minimum runtime is over", clock.now())
-            return ours and kind is asyncio.CancelledError
-        if not taken:
-            await self._client.end(arc)
-            return False
-        if not ours and kind is not None:
-            await self._client.end(arc)
+        assert self._entered is not None  # noqa: S101 - entered before left
+        held, arc = self._entered.held, self._entered.held.arc
+        interrupted = self._entered.leave() and kind is asyncio.CancelledError
+        if held.completed:
+            self._client.complete(arc)
+            return interrupted
+        failed = kind is not None and not interrupted
+        if held.active or failed:
+            if arc.open:
+                await self._client.end(arc)
             return False
         if self._again and arc.open:
-            return True
+            return interrupted
         revoked = Revoked(arc)
         if arc.open:
             await self._client.end(arc)
         raise revoked from None
+
+
+class _Entered:
+    """A body that runs, and the watch that cancels it when its hold is over."""
+
+    def __init__(self, held: Held, body: asyncio.Task[Any]) -> None:
+        self.held, self.body = held, body
+        self.watch: asyncio.Task[None] | None = None
+        self._interrupted = False
+
+    async def interrupt_when_over(self) -> None:
+        await self.held.over()
+        self._interrupted = True
+        self.body.cancel()
+
+    def leave(self) -> bool:
+        """Ends the watch. True if it was the watch that cancelled the body, and nobody else besides."""
+        if self.watch is not None:
+            self.watch.cancel()
+        # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
+        return self._interrupted and self.body.uncancel() == 0
 
 
 def hold(

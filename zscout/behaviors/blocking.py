@@ -64,7 +64,9 @@ class BlockingHeld:
 class Lab:
     """A client whose event loop runs in a thread of its own."""
 
-    def __init__(self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> None:
+    def __init__(
+        self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None
+    ) -> None:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="zscout", daemon=True)
         self._thread.start()

@@ -198,7 +198,9 @@ class Client:
     async def end(self, arc: OpenArc) -> None:
         """Gives back a hold, or leaves the queue. Tried a few times; the RCM sees our token die otherwise."""
         operation = Release(id=arc.id) if arc.state == "running" else Cancel(id=arc.id)
-        arc.finish("released" if arc.state == "running" else "cancelled", "given up by this client", clock.now())
+        arc.finish(
+            "released" if arc.state == "running" else "cancelled", "given up by this client", clock.now()
+        )
         self._wake(arc)
         key = self.mesh.keys.schedule(self.mesh.me)
         for _ in range(END_TRIES):
@@ -207,6 +209,12 @@ class Client:
                 break
             if self.leader is None:
                 break
+        self._forget(arc)
+
+    def complete(self, arc: OpenArc) -> None:
+        """An ARC has had its time by this host's clock; RCs and RCM end it by theirs."""
+        arc.finish("completed", "its minimum runtime is over", clock.now())
+        self._wake(arc)
         self._forget(arc)
 
     async def hand_over(self, arc: OpenArc, to: Sender) -> None:
@@ -226,7 +234,9 @@ class Client:
     async def state(self, arc: str | None = None, *, timeout: float = QUERY_TIMEOUT) -> RcmState | None:
         """How things stand at the RCM, with the story of `arc` if one is named; None if no RCM answered."""
         asked = StateAsk(arc=arc)
-        replies = await self.mesh.ask(self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout, enough=_answered)
+        replies = await self.mesh.ask(
+            self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout, enough=_answered
+        )
         states = [reply.message for reply in replies if reply.message is not None]
         return max(states, key=lambda state: state.term, default=None)
 

@@ -44,7 +44,7 @@ class OpenArc:
         return self.state in ("asking", "queued", "running")
 
     def take(self, notice: Notice, now: Ns) -> bool:
-        """Takes a newer word about this request. False if it is an old one, or of an RCM that was replaced."""
+        """Takes a newer word about this request. False if it is an old one, or a replaced RCM's."""
         if (notice.term, notice.step) <= self.last or not self.open:
             return False
         self.last = (notice.term, notice.step)
@@ -99,6 +99,9 @@ class OpenArc:
 def amounts(needs: Needs) -> dict[str, Amounts]:
     """Needs as people write them (ints, floats, Decimals), as they are sent. 0.1 means one tenth."""
     return {
-        rc: {name: value if isinstance(value, Decimal) else Decimal(str(value)) for name, value in params.items()}
+        rc: {
+            name: value if isinstance(value, Decimal) else Decimal(str(value))
+            for name, value in params.items()
+        }
         for rc, params in needs.items()
     }

@@ -63,11 +63,11 @@ class Driver:
         """Nobody holds the device any more: motors stopped, transmitter off. Must not raise."""
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        """Carries out `do` for its holder and returns what is answered. Raises Refused for what it can't do."""
+        """Carries out `do` and returns what is answered. Raises Refused for what can't be done."""
         raise Refused("unknown_command", f"this device does not know {str(do.get('name'))[:64]!r}")
 
     def vote(self, holders: list[ProposedHolder]) -> str:
-        """Why a sharable device can't carry exactly these holders; empty if it can, and any subset of them."""
+        """Why a sharable device can't carry these holders; empty if it can, and any subset of them."""
         return ""
 
     def capacity(self) -> Amounts:

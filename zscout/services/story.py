@@ -20,7 +20,7 @@ class Story:
         self._lines.append((now, arc, name, text))
 
     def of(self, arc: str, now: Ns) -> list[StoryLine]:
-        """The latest lines about an ARC, named by its name, its id, or `<host>/<client>/<id>`; oldest first."""
+        """The latest lines about an ARC (its name, id, or `<host>/<client>/<id>`), oldest first."""
         lines = [
             StoryLine(ago=(now - at) / SECOND, text=text)
             for at, full, name, text in self._lines
