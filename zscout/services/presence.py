@@ -166,7 +166,7 @@ class Presence:
         self._correct(name, state)
 
     def _correct(self, name: str, state: RcState) -> None:
-        """Makes an RC's word and the core's agree: what it lost has ended, what it has too much is revoked."""
+        """Makes an RC's word and the core's agree: what it lost has ended, what is too much is revoked."""
         holders = self.reign.core.floor.rc(name).holders
         ours = {arc.hold.grant: arc for arc in holders.values() if arc.hold is not None}
         theirs = {holder.grant for holder in state.holders}
