@@ -7,9 +7,7 @@ them (`Mesh`).
 
 from __future__ import annotations
 
-import ipaddress
 import os
-import re
 import socket
 from collections.abc import Mapping
 from decimal import Decimal
@@ -19,6 +17,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta, Struct, structs
 
+from zscout.endpoints import check_links, check_multicast, ip_of
 from zscout.keyexpr import valid_name
 from zscout.scheduling.model import SECOND, Ns
 from zscout.strict import (
@@ -46,13 +45,6 @@ MAX_PARAMETERS: Final = 64
 Strategy = Literal["priority"]
 Driver = Literal["exclusive", "capacity"]
 _Endpoints = Annotated[tuple[str, ...], Meta(max_length=MAX_ENDPOINTS)]
-
-_ENDPOINT: Final = re.compile(
-    r"(?P<protocol>[a-z]+)/(?P<host>\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9_.-]+):(?P<port>[0-9]{1,5})"
-    r"(?P<more>[?#][A-Za-z0-9_.,:;=/#-]+)?"
-)
-_PROTOCOLS: Final = ("tcp", "tls", "udp", "quic", "ws")
-_INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:,@-]{1,64}")
 
 
 class Mesh(Struct, frozen=True, forbid_unknown_fields=True):
@@ -121,8 +113,6 @@ class RcSpec(Struct, frozen=True):
     """Of a `capacity` driver: the greatest sum of each bandwidth parameter; empty for others."""
     activation: Ns
     """From a grant until the device can be used, in ns (a camera warms up)."""
-    grace: Ns
-    """From the end of a hold until the device has reached its safe state, in ns."""
 
 
 class Recorder(Struct, frozen=True):
@@ -186,7 +176,6 @@ class _RcTable(Struct, frozen=True, forbid_unknown_fields=True):
     driver: Driver
     capacity: Annotated[dict[str, Decimal], Meta(max_length=MAX_PARAMETERS)] | None = None
     activation: Decimal = Decimal(0)
-    grace: Decimal = Decimal(0)
 
 
 class _RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -253,8 +242,8 @@ def _fleet(file: _FleetFile, top: Where) -> Fleet:
     for number, host in enumerate(table.candidates):
         check_name(host, (at / "candidates").item(number))
     check_unique(table.candidates, at / "candidates")
-    _check_mesh(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
-    _check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")
+    check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
+    check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")
     return Fleet(
         name=table.name,
         candidates=table.candidates,
@@ -295,7 +284,7 @@ def _node(file: _NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     check_name(host, top / "node" / "host")
     own = {key: value for key, value in structs.asdict(file.mesh).items() if value is not None}
     mesh = structs.replace(fleet.mesh, **own)
-    _check_mesh(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
+    check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_unique((rc.name for rc in file.rc), top / "rc", "name")
     return Node(
         host=host,
@@ -324,14 +313,13 @@ def _rc(table: _RcTable, at: Where) -> RcSpec:
         driver=table.driver,
         capacity=amounts(capacity, at / "capacity"),
         activation=seconds_to_ns(table.activation, at / "activation", high=hour),
-        grace=seconds_to_ns(table.grace, at / "grace", high=hour),
     )
 
 
 def _recorder(table: _RecorderTable, folder: Path, at: Where) -> Recorder:
     if not table.path or "\0" in table.path:
         raise (at / "path").bad(f"{quoted(table.path)} is no folder", 'name one, as in path = "runs"')
-    address = _ip("127.0.0.1" if table.bind == "localhost" else table.bind)
+    address = ip_of("127.0.0.1" if table.bind == "localhost" else table.bind)
     if address is None:
         raise (at / "bind").bad(f"{quoted(table.bind)} is not an IP address", 'write one, as in "127.0.0.1"')
     if not address.is_loopback and not table.allow_remote:
@@ -340,53 +328,3 @@ def _recorder(table: _RecorderTable, folder: Path, at: Where) -> Recorder:
             'write "127.0.0.1", or add allow_remote = true if that is meant',
         )
     return Recorder(path=folder / table.path, bind=str(address), port=table.port)
-
-
-def _check_mesh(listen: tuple[str, ...], connect: tuple[str, ...], interface: str, at: Where) -> None:
-    for number, endpoint in enumerate(listen):
-        _check_endpoint(endpoint, (at / "listen").item(number), lowest_port=0)
-    for number, endpoint in enumerate(connect):
-        _check_endpoint(endpoint, (at / "connect").item(number), lowest_port=1)
-    check_unique(listen, at / "listen")
-    check_unique(connect, at / "connect")
-    if not _INTERFACE.fullmatch(interface):
-        raise (at / "interface").bad(
-            f"{quoted(interface)} names no interface", 'write "auto", or as in "eth0"'
-        )
-
-
-def _check_endpoint(endpoint: str, where: Where, *, lowest_port: int) -> None:
-    found = _ENDPOINT.fullmatch(endpoint)
-    if not found or found["protocol"] not in _PROTOCOLS or not _is_host(found["host"]):
-        remedy = f'write protocol/host:port, as in "tcp/127.0.0.1:7447"; protocols: {", ".join(_PROTOCOLS)}'
-        raise where.bad(f"{quoted(endpoint)} is not an endpoint", remedy)
-    if not lowest_port <= int(found["port"]) <= 65_535:
-        raise where.bad(f"{quoted(endpoint)} has no valid port", f"write one from {lowest_port} to 65535")
-
-
-def _check_multicast(address: str, where: Where) -> None:
-    host, _, port = address.rpartition(":")
-    ip = _ip(host.removeprefix("[").removesuffix("]"))
-    if (
-        ip is None
-        or not ip.is_multicast
-        or not re.fullmatch("[0-9]{1,5}", port)
-        or not 0 < int(port) < 65_536
-    ):
-        raise where.bad(
-            f"{quoted(address)} is not a multicast address", 'write ip:port, as in "224.0.0.224:7446"'
-        )
-
-
-def _is_host(host: str) -> bool:
-    if host.startswith("["):
-        return isinstance(_ip(host[1:-1]), ipaddress.IPv6Address)
-    # Digits and dots alone are meant as an IPv4 address.
-    return _ip(host) is not None if re.fullmatch("[0-9.]+", host) else True
-
-
-def _ip(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(text)
-    except ValueError:
-        return None

@@ -11,7 +11,8 @@ import secrets
 from dataclasses import dataclass
 from typing import NamedTuple
 
-NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+MAX_NAME = 64
+NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
 ROOT = "zscout"
 
 

@@ -24,9 +24,10 @@ from typing import Any, Final, NamedTuple, TypeVar
 import msgspec
 from msgspec import inspect
 
+from zscout.keyexpr import MAX_NAME, NAME
+
 T = TypeVar("T")
 
-MAX_NAME: Final = 64
 MAX_SECONDS: Final = Decimal(1_000_000_000)
 """Longest time a file may give, about 31 years; whole ns stay within 63 bits."""
 _MAX_MAGNITUDE: Final = 18
@@ -35,11 +36,10 @@ _MAX_PLACES: Final = 100
 _MAX_SHOWN: Final = 60
 _MAX_DEPTH: Final = 32
 
-_NAME: Final = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
 _BARE_KEY: Final = re.compile(r"[A-Za-z0-9_-]+")
 _AT: Final = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
 _PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
-_DEEP_KEY: Final = re.compile(rf"""(?<![\w"'-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MAX_DEPTH}}}""")
+_DEEP_KEY: Final = re.compile(rf"""(?<![\w"'\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MAX_DEPTH}}}""")
 """A dotted key that is longer than any here. tomllib takes hours over one that fills the file."""
 _NAME_RULE: Final = f'1 to {MAX_NAME} letters A to Z, digits, "_", "." or "-"'
 
@@ -161,7 +161,7 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
 
 def check_name(value: str, where: Where) -> str:
     """Returns the name if it may stand in a mesh key (`[A-Za-z0-9_.-]+`, at most 64). Raises BadInput."""
-    if not _NAME.fullmatch(value):
+    if not NAME.fullmatch(value):
         raise where.bad(f"{quoted(value)} is not a name", f"write {_NAME_RULE}")
     return value
 
@@ -169,7 +169,7 @@ def check_name(value: str, where: Where) -> str:
 def check_rc_name(value: str, where: Where) -> str:
     """Returns the name of an RC if it is `kind/name`, both names by themselves. Raises BadInput."""
     kind, _, name = value.partition("/")
-    if not (_NAME.fullmatch(kind) and _NAME.fullmatch(name)):
+    if not (NAME.fullmatch(kind) and NAME.fullmatch(name)):
         remedy = f'write kind/name, as in "robot/scout33", each of {_NAME_RULE}'
         raise where.bad(f"{quoted(value)} is not the name of an RC", remedy)
     return value
