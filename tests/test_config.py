@@ -327,9 +327,7 @@ def test_every_key_of_a_node_file() -> None:
     assert (made.host, made.candidate, made.load) == ("anvil", False, False)
     assert made.rcs == (
         config.RcSpec("robot/scout33", "exclusive", {}, 2_500_000_000),
-        config.RcSpec(
-            "radio/rf0", "capacity", {"command_rate": Fraction(10), "share": Fraction(1, 10)}, 0, 0
-        ),
+        config.RcSpec("radio/rf0", "capacity", {"command_rate": Fraction(10), "share": Fraction(1, 10)}, 0),
     )
     assert made.recorder == config.Recorder(Path("hosts/tapes"), "0.0.0.0", 1234)  # noqa: S104
 

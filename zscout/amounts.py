@@ -15,13 +15,14 @@ MAX_SECONDS = Decimal(10 * 366 * 86_400)
 
 def exact(value: Decimal, what: str) -> Fraction:
     """A number that is not negative, exactly. Raises ValueError for NaN, infinity, and absurd sizes."""
+    said = str(value)[:40]
     if not value.is_finite():
-        raise ValueError(f"{what} must be a number, not {value}")
+        raise ValueError(f"{what} must be a number, not {said}")
     if value < 0:
-        raise ValueError(f"{what} must not be negative, and is {value}")
+        raise ValueError(f"{what} must not be negative, and is {said}")
     # A Fraction of 1e999999 would take all memory: look at the exponent before converting.
     if value and not -MAX_EXPONENT <= value.adjusted() <= MAX_EXPONENT:
-        raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {value}")
+        raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {said}")
     if len(value.as_tuple().digits) > MAX_DIGITS:
         raise ValueError(f"{what} has more than {MAX_DIGITS} digits")
     return Fraction(value)

@@ -27,7 +27,7 @@ os.environ.setdefault(
 
 import msgspec
 import zenoh
-from zenoh.handlers import Callback
+from zenoh.handlers import Callback, RingChannel
 
 from zscout import clock, messages
 from zscout.config import Mesh as MeshConfig
@@ -43,6 +43,8 @@ QUEUE_DEPTH = 1_024
 """Items of one declaration that may wait for the event loop."""
 BLOCK_US = 100_000
 """The longest that a publication waits for a peer that does not read, before that peer is given up."""
+OVERHEARD = 32
+"""Publications kept for whoever looks only now and then."""
 SCOUTING_DELAY_MS = 200
 CLOSE_TIMEOUT = 3.0
 
@@ -145,7 +147,6 @@ class Declared:
         return self._state.missed
 
     def close(self) -> None:
-        self._state.closed = True
         if self._undeclare is not None:
             undeclare: Callable[[], Any] = self._undeclare
             self._undeclare = None
@@ -156,6 +157,33 @@ class Declared:
 
 
 _Item: TypeAlias = tuple[_Declaration | None, Callable[..., None], tuple[Any, ...]]
+
+
+class Overheard(Declared, Generic[S]):
+    """Publications that wake nobody: the latest are kept, outside Python, until somebody looks."""
+
+    def __init__(self, subscriber: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]], kind: type[S]) -> None:
+        super().__init__(subscriber.undeclare)
+        self._subscriber, self._kind = subscriber, kind
+
+    def take(self) -> list[S]:
+        """What came since the last look, oldest first; malformed ones are dropped without a word."""
+        found: list[S] = []
+        while (sample := self._subscriber.try_recv()) is not None:
+            try:
+                found.append(messages.decode(sample.payload.to_bytes(), self._kind, messages.MAX_STATE))
+            except Malformed:
+                continue
+        return found
+
+
+@dataclass(slots=True)
+class _Shared:
+    """A subscription whose publications are read once for all handlers of this process."""
+
+    state: _Declaration
+    handlers: list[Callable[[str, Any], None]] = field(default_factory=list)
+    undeclare: Callable[[], Any] = lambda: None
 
 
 @dataclass(slots=True)
@@ -211,6 +239,7 @@ class Mesh:
     ) -> None:
         self._session = session
         self._inbox = _Inbox(loop)
+        self._shared: dict[tuple[Any, ...], _Shared] = {}
         self.keys = keys
         self.me = me
 
@@ -281,29 +310,15 @@ class Mesh:
             self._inbox.offer(None, arrived, reply)
 
         def on_final() -> None:
-            self._inbox.offer(None, over)
+            if not done.done():
+                self._inbox.offer(None, over)
 
-        payload = None if message is None else messages.encode(message)
+        self._get(key, message, Callback(on_reply, on_final, indirect=False), timeout)
+        guard = loop.call_later(timeout + 0.5, over)
         try:
-            self._session.get(
-                key,
-                Callback(on_reply, on_final, indirect=False),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=timeout,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.INTERACTIVE_HIGH,
-                express=True,
-                payload=payload,
-                encoding=None if message is None else _encoding(type(message)),
-            )
-        except zenoh.ZError as error:
-            raise MeshError(f"{key} can't be asked: {error}") from None
-        try:
-            async with asyncio.timeout(timeout + 0.5):
-                await done
-        except TimeoutError:
-            pass
+            await done
+        finally:
+            guard.cancel()
         return replies
 
     async def ask_one(
@@ -312,6 +327,55 @@ class Mesh:
         """The first answer, message or problem; None if there was none within `timeout` seconds."""
         replies = await self.ask(key, message, kind, timeout=timeout, enough=lambda _: True)
         return replies[0] if replies else None
+
+    def ask_then(
+        self,
+        key: str,
+        message: msgspec.Struct,
+        kind: type[R],
+        then: Callable[[Reply[R] | None], None],
+        *,
+        timeout: float,
+    ) -> None:
+        """Asks, and calls `then` once with the first answer, or with None: cheaper than a task that waits."""
+        open_: list[Callable[[Reply[R] | None], None]] = [then]
+
+        def tell(answer: Reply[R] | None) -> None:
+            if open_:
+                open_.pop()(answer)
+
+        def arrived(reply: zenoh.Reply) -> None:
+            got = _reply(reply, kind, messages.MAX_STATE)
+            if got is not None:
+                tell(got)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            self._inbox.offer(None, arrived, reply)
+
+        def on_final() -> None:
+            if open_:
+                self._inbox.offer(None, tell, None)
+
+        self._get(key, message, Callback(on_reply, on_final, indirect=False), timeout)
+
+    def _get(
+        self, key: str, message: msgspec.Struct | None, handler: Callback[zenoh.Reply], timeout: float
+    ) -> None:
+        try:
+            self._session.get(
+                key,
+                handler,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+                express=True,
+                payload=None if message is None else messages.encode(message),
+                encoding=None if message is None else _encoding(type(message)),
+            )
+        except zenoh.ZError as error:
+            raise MeshError(f"{key} can't be asked: {error}") from None
 
     def serve(
         self,
@@ -360,7 +424,12 @@ class Mesh:
                 raise
 
         queryable = self._session.declare_queryable(key, Callback(on_query, _nothing, indirect=False))
-        return Declared(queryable.undeclare, state)
+
+        def leave() -> None:
+            state.closed = True
+            queryable.undeclare()  # type: ignore[no-untyped-call]
+
+        return Declared(leave, state)
 
     # Publications
 
@@ -403,8 +472,28 @@ class Mesh:
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_STATE,
     ) -> Declared:
-        """Calls `handler(key, message)` for every publication on `key`; malformed ones are logged."""
-        state = _Declaration(depth=depth)
+        """Calls `handler(key, message)` for every publication on `key`; malformed ones are logged.
+
+        All who subscribe alike share one subscription and one reading of each message."""
+        alike = (key, kind, depth, limit)
+        shared = self._shared.get(alike)
+        if shared is None:
+            shared = self._shared[alike] = _Shared(_Declaration(depth=depth))
+            shared.undeclare = self._subscribe(key, kind, shared, limit)
+        handlers, state, undeclare = shared.handlers, shared.state, shared.undeclare
+        handlers.append(handler)
+
+        def leave() -> None:
+            handlers.remove(handler)
+            if not handlers:
+                state.closed = True
+                del self._shared[alike]
+                undeclare()
+
+        return Declared(leave, state)
+
+    def _subscribe(self, key: str, kind: type[S], shared: _Shared, limit: int) -> Callable[[], Any]:
+        state = shared.state
 
         def on_sample(sample: zenoh.Sample) -> None:
             if not self._inbox.offer(state, handle, sample):
@@ -414,22 +503,23 @@ class Mesh:
             try:
                 message: S = messages.decode(sample.payload.to_bytes(), kind, limit)
             except Malformed as error:
-                log.warning("%s: %s", sample.key_expr, error)
+                log.warning("ignored a publication on %.200r: %s", str(sample.key_expr), error)
                 return
-            handler(str(sample.key_expr), message)
+            name = str(sample.key_expr)
+            for handler in tuple(shared.handlers):
+                try:
+                    handler(name, message)
+                except BadName as error:
+                    log.warning("ignored a publication on %.200r: %s", name, error)
+                except Exception:
+                    log.exception("a handler failed")
 
-        subscriber = self._session.declare_subscriber(key, Callback(on_sample, _nothing, indirect=False))
-        return Declared(subscriber.undeclare, state)
+        return self._session.declare_subscriber(key, Callback(on_sample, _nothing, indirect=False)).undeclare
 
-    def hear(self, key: str, handler: Callable[[], None]) -> Declared:
-        """Calls `handler()` on Zenoh's own thread for every publication on `key`, unread: to know that
-        somebody speaks costs next to nothing that way. It must return at once."""
-
-        def on_sample(_: zenoh.Sample) -> None:
-            handler()
-
-        subscriber = self._session.declare_subscriber(key, Callback(on_sample, _nothing, indirect=False))
-        return Declared(subscriber.undeclare)
+    def overhear(self, key: str, kind: type[S]) -> Overheard[S]:
+        """Keeps the latest publications on `key` for whoever looks: with a `kind` of few fields, to know now
+        and then who spoke costs next to nothing that way."""
+        return Overheard(self._session.declare_subscriber(key, RingChannel(OVERHEARD)), kind)
 
     # Liveliness
 

@@ -14,6 +14,7 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 
 import click
+import uvloop
 
 from zscout import __version__
 from zscout.config import Node, RcSpec, default_node, load_node
@@ -124,7 +125,7 @@ def main(file: Path | None, log_level: str) -> None:
     )
     try:
         node = load_node(file) if file is not None else default_node()
-        asyncio.run(_main(node))
+        uvloop.run(_main(node))
     except BadInput as error:
         click.echo(f"zscout-node: {error}", err=True)
         sys.exit(2)

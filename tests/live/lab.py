@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import random
 import signal
@@ -13,10 +14,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from zscout import clock
 from zscout.behaviors.client import Client
 from zscout.config import Fleet, load_fleet
-from zscout.keyexpr import new_instance
-from zscout.messages import RcmState
+from zscout.keyexpr import Role, Token, new_instance
+from zscout.messages import RcAsk, RcmState, RcState
+from zscout.scheduling.model import Ns
 
 START = 20.0
 """Seconds within which anything that is waited for must have come true, on a busy machine."""
@@ -28,16 +31,20 @@ class Lab:
     Use as an async context manager; everything that was started is gone afterwards.
     """
 
-    def __init__(self, folder: Path, *, lease: float = 1.0, candidates: Sequence[str] = (), extra: str = "") -> None:
+    def __init__(
+        self, folder: Path, *, lease: float = 1.0, candidates: Sequence[str] = (), extra: str = ""
+    ) -> None:
         self.folder = folder
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
         self.others: list[subprocess.Popen[bytes]] = []
         self.clients: list[Client] = []
+        self.holders: list[HolderProcess] = []
         self.fleet_file = folder / "fleet.toml"
         names = ", ".join(f'"{name}"' for name in candidates)
+        port = random.randint(20_000, 60_000)  # noqa: S311
         self.fleet_file.write_text(
             f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\n'
-            f'[mesh]\nmulticast_address = "224.0.0.224:{random.randint(20_000, 60_000)}"\n'
+            f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\n'
             f'interface = "lo"\nlease = {lease}\n{extra}'
         )
         self.fleet: Fleet = load_fleet(self.fleet_file)
@@ -75,6 +82,56 @@ class Lab:
         self.clients.append(client)
         return client
 
+    def signal(self, host: str, number: signal.Signals) -> Ns:
+        """Sends a signal to a node; returns when, on this host's clock."""
+        self.nodes[host].send_signal(number)
+        return clock.now()
+
+    async def logged(self, host: str, text: str) -> None:
+        """Waits until a node has written `text` to its log."""
+        async with asyncio.timeout(START):
+            while True:
+                if text in self.log(host):
+                    return
+                await asyncio.sleep(0.02)
+
+    async def living(self, client: Client, role: str, until: Callable[[list[str]], bool]) -> None:
+        """Waits until the hosts that have a token of this role are as they should be."""
+        async with asyncio.timeout(START):
+            while True:
+                tokens = await client.mesh.living(client.mesh.keys.alive_any(role), timeout=1)
+                if until([token.host for token in tokens]):
+                    return
+                await asyncio.sleep(0.02)
+
+    async def holder(self, name: str) -> HolderProcess:
+        """Starts a client process (`tests/live/holder.py`) and waits until it is on the mesh."""
+        with (self.folder / f"{name}.log").open("ab") as log:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                "-m",
+                "tests.live.holder",
+                name,
+                env=self.env,
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=log,
+            )
+        holder = HolderProcess(name, process)
+        self.holders.append(holder)
+        await holder.event("up")
+        return holder
+
+    async def rc(self, client: Client, name: str) -> RcState:
+        """An RC's own word about itself."""
+        async with asyncio.timeout(START):
+            while True:
+                reply = await client.mesh.ask_one(
+                    client.mesh.keys.rc_state(name), RcAsk(), RcState, timeout=0.5
+                )
+                if reply is not None and reply.message is not None:
+                    return reply.message
+
     async def state(self, client: Client, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state as soon as `until` holds of it; fails after START seconds."""
         seen: RcmState | None = None
@@ -101,6 +158,9 @@ class Lab:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        for holder in self.holders:
+            holder.kill()
+        await asyncio.gather(*(holder.process.wait() for holder in self.holders))
         await asyncio.gather(*(client.close() for client in self.clients), return_exceptions=True)
         for process in self.others:
             if process.poll() is None:
@@ -112,3 +172,63 @@ class Lab:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+class HolderProcess:
+    """A client process: what it is told, and what it has told and nobody has looked at yet."""
+
+    def __init__(self, name: str, process: asyncio.subprocess.Process) -> None:
+        self.name, self.process = name, process
+
+    async def order(self, order: str, **details: Any) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps({"order": order, **details}).encode() + b"\n")
+        await self.process.stdin.drain()
+
+    async def event(self, *names: str) -> dict[str, Any]:
+        """The next event of one of these names; what comes before it is skipped."""
+        assert self.process.stdout is not None
+        skipped: list[dict[str, Any]] = []
+        try:
+            async with asyncio.timeout(START):
+                while line := await self.process.stdout.readline():
+                    event: dict[str, Any] = json.loads(line)
+                    if event["event"] in names:
+                        return event
+                    skipped.append(event)
+        except TimeoutError:
+            pass
+        raise AssertionError(f"{self.name} did not say {names}; it said {skipped}")
+
+    def signal(self, number: signal.Signals) -> Ns:
+        """Sends a signal; returns when, on this host's clock."""
+        self.process.send_signal(number)
+        return clock.now()
+
+    def kill(self) -> Ns:
+        """Kills it with -9, stopped or not."""
+        return self.signal(signal.SIGKILL) if self.process.returncode is None else clock.now()
+
+
+class LeaderWatch:
+    """When leaders' liveliness tokens came and went, as one client saw it."""
+
+    def __init__(self, client: Client) -> None:
+        self.came: dict[Token, Ns] = {}
+        self.gone: dict[Token, Ns] = {}
+        self._news = asyncio.Event()
+        client.mesh.watch(client.mesh.keys.alive_any(Role.RCM), self._seen)
+
+    def _seen(self, token: Token, alive: bool) -> None:
+        (self.came if alive else self.gone)[token] = clock.now()
+        self._news.set()
+
+    async def lost(self, host: str) -> Ns:
+        """Waits until the token of a leader at `host` has gone; returns when it did."""
+        async with asyncio.timeout(START):
+            while True:
+                self._news.clear()
+                for token, at in self.gone.items():
+                    if token.host == host:
+                        return at
+                await self._news.wait()

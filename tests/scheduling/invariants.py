@@ -22,6 +22,7 @@ class Ledger:
         self.requests: dict[ArcId, Request] = {request.arc: request for request in requests}
         self.open: dict[ArcId, Granted] = {}
         self.newest = Grant(NO_TERM, 0)
+        self.handed_over: set[ArcId] = set()
 
     def take(self, now: Ns, core: Core, effects: list[Effect]) -> None:
         """Takes the effects of one batch, and compares the outcome with what the core believes."""
@@ -42,6 +43,7 @@ class Ledger:
             for arc in core.floor.running.values()
             if arc.hold is not None
         }
+        assert not self.handed_over, "handed over to nobody"
         assert held == believed, "the effects told do not add up to what the core holds"
 
     def holders(self, rc: RcName) -> list[ArcId]:
@@ -56,6 +58,10 @@ class Ledger:
         assert effect.end is None or effect.end == effect.start + request.min_runtime
         self.newest = effect.grant
         self.open[effect.arc] = effect
+        if effect.arc in self.handed_over:
+            # The same hold goes on; rules that changed meanwhile do not touch it.
+            self.handed_over.remove(effect.arc)
+            return
         for rc in effect.rcs:
             holders = self.holders(rc)
             if rc in self.capacity:
@@ -68,6 +74,8 @@ class Ledger:
         hold = self.open.pop(effect.arc)
         assert hold.grant == effect.grant, "a hold is revoked under another grant than it was given"
         assert hold.rcs == effect.rcs, "a part of a gang is revoked"
+        if effect.outcome is Outcome.HANDED_OVER:
+            self.handed_over.add(effect.arc)
         request = self.requests[effect.arc]
         over = now >= hold.start + request.min_runtime
         if effect.outcome is Outcome.COMPLETED:

@@ -187,7 +187,7 @@ class Chaos:
         return False
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(st.data(), st.lists(st.tuples(st.sampled_from(OPS), st.integers(0, 11)), max_size=60))
 def test_promises_hold_in_any_chaos_and_in_the_end_all_are_served(
     draw: st.DataObject, ops: list[tuple[str, int]]

@@ -62,6 +62,16 @@ def question(effects: list[Effect]) -> int:
     return proposal.proposal
 
 
+def vote_all(core: Core, effects: list[Effect]) -> list[Effect]:
+    """Answers all questions at once, for RCs that carry two holders; returns all effects to the end."""
+    told = list(effects)
+    while questions := only(Propose, effects):
+        votes = [Vote(one.proposal, accept=len(one.holders) <= 2) for one in questions]
+        effects = core.handle(1, *votes)
+        told += effects
+    return told
+
+
 # Slow voters
 
 
@@ -125,6 +135,35 @@ def test_a_silent_rc_is_asked_once_a_quantum() -> None:
     assert len(list(core.votes.out())) <= 8
 
 
+def test_what_an_open_visit_would_free_is_off_limits() -> None:
+    """Were `b` let at robot/x while `a`'s votes are out, `low` would be kept where the steps evict it."""
+    core = core_with("robot/x", sharable=["radio/0"])
+    everybody = [
+        request("mid", "robot/x", "radio/0", priority=2),
+        request("low", "radio/0", priority=1),
+        request("a", "radio/0", priority=9),
+    ]
+    # Any two of the three fit on the radio.
+    out = [effect for one in everybody[:2] for effect in vote_all(core, core.handle(1, Asked(one)))]
+    assert granted(out) == ["mid", "low"]
+    asked = core.handle(1, Asked(everybody[2]))
+    assert granted(core.handle(1, Asked(request("b", "robot/x", priority=5)))) == []
+    effects = vote_all(core, asked)
+    assert [(gone.arc, gone.by) for gone in only(Revoked, effects)] == [("low", "a"), ("mid", "b")]
+    # Freed of `mid`, the radio has room again: preempted and started again in one pass.
+    assert granted(effects) == ["a", "b", "low"]
+
+
+def test_who_is_blocked_only_by_what_an_open_visit_would_free_keeps_its_place() -> None:
+    core = core_with("robot/a", "robot/b", "robot/c", sharable=["radio/0"])
+    core.handle(0, Asked(request("v", "robot/a", "robot/b", priority=5)))
+    asked = core.handle(1, Asked(request("top", "robot/a", "radio/0", priority=9)))
+    core.handle(1, Asked(request("next", "robot/b", "robot/c", priority=5)))
+    # Its equal must not take robot/c before it: equal priority would never give it back.
+    assert granted(core.handle(1, Asked(request("last", "robot/c", priority=5)))) == []
+    assert granted(vote_all(core, asked)) == ["top", "next"]
+
+
 # Votes
 
 
@@ -138,6 +177,9 @@ def test_what_was_accepted_stands_for_every_subset_and_is_not_asked_again() -> N
     core.handle(0, Vote(proposal.proposal, accept=True))
     core.handle(1, RcReported("radio/0", ended=("a", "b")))
     assert sorted(core.floor.running) == ["a", "b"], "queued again and granted without a question"
+    # With a gone for good, what was accepted of both stands of b.
+    core.handle(2, Released("a"))
+    assert granted(core.handle(2, RcReported("radio/0", ended=("b",)))) == ["b"]
 
 
 def test_an_answer_to_a_question_that_became_void_changes_nothing() -> None:

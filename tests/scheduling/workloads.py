@@ -17,14 +17,22 @@ _shares = st.sampled_from([Fraction(1, 10), Fraction(2, 10), Fraction(3, 10), Fr
 # 0.1 + 0.2 fills 0.3 exactly: with floats it would not.
 _capacities = st.sampled_from([Fraction(2, 10), Fraction(3, 10), Fraction(6, 10), Fraction(1)])
 
-params: st.SearchStrategy[Params] = st.dictionaries(st.sampled_from(PARAMETERS), _shares, max_size=2)
-capacity: st.SearchStrategy[Params] = st.dictionaries(st.sampled_from(PARAMETERS), _capacities, max_size=2)
+# Mostly `rate` on both sides, so that RCs are short of it and reprieves matter.
+params: st.SearchStrategy[Params] = st.one_of(
+    st.fixed_dictionaries({"rate": _shares}),
+    st.dictionaries(st.sampled_from(PARAMETERS), _shares, max_size=2),
+)
+capacity: st.SearchStrategy[Params] = st.one_of(
+    st.fixed_dictionaries({"rate": _capacities}),
+    st.dictionaries(st.sampled_from(PARAMETERS), _capacities, max_size=2),
+)
 
 
 @st.composite
 def rcs(draw: st.DrawFn) -> tuple[WorkloadRc, ...]:
-    """One to six RCs, exclusive and sharable mixed."""
-    kinds = draw(st.lists(st.booleans(), min_size=1, max_size=6))
+    """One to six RCs, more often few, exclusive and sharable mixed."""
+    number_of = draw(st.sampled_from([1, 2, 2, 3, 3, 4, 6]))
+    kinds = draw(st.lists(st.booleans(), min_size=number_of, max_size=number_of))
     return tuple(
         WorkloadRc(f"radio/{number}", sharable=True, capacity=draw(capacity))
         if sharable
@@ -58,6 +66,6 @@ def workloads(draw: st.DrawFn, *, keep: bool = True) -> Workload:
         Arrival(
             draw(st.sampled_from([0, 1, 2, 3, 5])) * SECOND, draw(requests(f"a{number}", names, keep=keep))
         )
-        for number in range(draw(st.integers(1, 12)))
+        for number in range(draw(st.sampled_from([1, 2, 4, 6, 8, 10, 12])))
     ]
     return Workload(fleet, tuple(arrivals))

@@ -11,6 +11,8 @@ from collections.abc import Callable, Coroutine, Mapping
 from decimal import Decimal
 from typing import Any, Self
 
+import msgspec
+
 from zscout import clock
 from zscout.behaviors.request import Needs, OpenArc, amounts
 from zscout.config import Fleet, fleet_from_env
@@ -28,6 +30,7 @@ from zscout.messages import (
     RcmState,
     Release,
     StateAsk,
+    absurd,
 )
 from zscout.scheduling.model import NO_TERM, SECOND, Grant, Ns, Term
 from zscout.stall import StallWatch
@@ -40,8 +43,9 @@ ASK_AGAIN = 5.0
 BACKOFF = (0.05, 1.0)
 """Seconds before a question that nobody answered is repeated: first, and at most."""
 CONFIRM_TIMEOUT = 1.0
+LOOKS = 10
+"""How often within a hold lease a client looks whether the RCM spoke."""
 END_TRIES = 3
-ABSURD_JUMP = 1_000_000
 TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full"})
 
 
@@ -59,6 +63,12 @@ class CommandRefused(Exception):
     def __init__(self, rc: str, problem: Problem) -> None:
         super().__init__(f"{rc}: {problem.message}")
         self.code = problem.code
+
+
+class _Spoken(msgspec.Struct, frozen=True):
+    """What a client reads of the RCM's publications."""
+
+    term: Term
 
 
 class Client:
@@ -101,10 +111,11 @@ class Client:
     def _start(self) -> None:
         keys, mesh = self.mesh.keys, self.mesh
         self._stall.start()
+        self._spoken = mesh.overhear(keys.grants, _Spoken)
         self._declared = [
             mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice),
             mesh.serve(keys.requests(mesh.me), RcAsk, self._on_requests),
-            mesh.hear(keys.grants, self._on_rcm_speaks),
+            self._spoken,
             mesh.watch(keys.alive_any(Role.RCM), self._on_leader),
             mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance())),
         ]
@@ -256,7 +267,7 @@ class Client:
     # What is heard
 
     def _on_notice(self, _key: str, notice: Notice) -> None:
-        if notice.term < self.term:
+        if notice.term < self.term or absurd(notice.term, self.term):
             return
         self.term = notice.term
         arc = self._arcs.get(notice.id)
@@ -282,15 +293,16 @@ class Client:
     def _on_requests(self, request: Request[RcAsk]) -> None:
         promise = request.message.promise
         if promise is not None:
-            absurd = self.term != NO_TERM and promise.counter > self.term.counter + ABSURD_JUMP
-            if promise < self.term or absurd:
+            if promise < self.term or absurd(promise, self.term):
                 raise Refused("old_term", f"this client obeys term {self.term.counter}", self.term)
             self.term = promise
         arcs = [arc.told() for arc in self._arcs.values() if arc.open]
         request.answer(ClientRequests(client=str(self.mesh.me), requests=arcs))
 
-    def _on_rcm_speaks(self) -> None:
-        self._heard = clock.now()
+    def _rcm_spoke(self) -> bool:
+        # As at the RCs: one that was replaced, or that nobody can believe, keeps no hold alive.
+        terms = [said.term for said in self._spoken.take()]
+        return any(term >= self.term and not absurd(term, self.term) for term in terms)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         if alive:
@@ -328,9 +340,10 @@ class Client:
         key = self.mesh.keys.schedule(self.mesh.me)
         replies = await self.mesh.ask(key, arc.ask(), Notice, timeout=QUERY_TIMEOUT, enough=_answered)
         for reply in replies:
-            if reply.message is not None and reply.message.term >= self.term:
-                self.term = reply.message.term
-                self._take(arc, reply.message)
+            notice = reply.message
+            if notice is not None and notice.term >= self.term and not absurd(notice.term, self.term):
+                self.term = notice.term
+                self._take(arc, notice)
         return replies
 
     async def _keep_asking(self) -> None:
@@ -350,7 +363,10 @@ class Client:
         """Ends holds when no RCM was heard for the hold lease: their RCs have ended them as well."""
         lease = self.fleet.timing.hold_lease
         while True:
-            await asyncio.sleep(lease / SECOND / 10)
+            await asyncio.sleep(lease / SECOND / LOOKS)
+            if self._rcm_spoke():
+                # It may have spoken right after the last look.
+                self._heard = clock.now() - lease // LOOKS
             if clock.now() - self._heard < lease or self._stall.fresh():
                 continue
             for arc in list(self._arcs.values()):

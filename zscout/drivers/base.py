@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping
+from collections.abc import Coroutine, Mapping
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any
@@ -18,7 +18,7 @@ from zscout import clock
 from zscout.amounts import exact_amounts
 from zscout.drivers.holding import Change, Holding
 from zscout.keyexpr import Role, Token, new_instance
-from zscout.mesh import Declared, Mesh, Refused, Request
+from zscout.mesh import Declared, Mesh, Refused, Reply, Request
 from zscout.messages import (
     Amounts,
     Ballot,
@@ -33,6 +33,7 @@ from zscout.messages import (
     RcmState,
     RcState,
     StateAsk,
+    absurd,
 )
 from zscout.scheduling.model import SECOND, Ns
 from zscout.scheduling.workload import excess
@@ -43,6 +44,8 @@ log = logging.getLogger(__name__)
 MIN_DELAY = 0.02
 MAX_TTL = 60.0
 REREAD_TIMEOUT = 0.5
+REREADS = 4
+"""Readings in a row when publications overtake the answers."""
 COMMAND_QUEUE = 64
 
 
@@ -93,7 +96,7 @@ class ResourceController:
         self._warm_at: Ns = 0
         self._work: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._rereading = False
+        self._reading: asyncio.Task[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._stall = stall
 
@@ -153,7 +156,7 @@ class ResourceController:
             self._leaders.discard(token)
 
     def _on_grants(self, _key: str, said: Grants) -> None:
-        self._apply(self.holding.hear(said, clock.now()))
+        self._apply(self.holding.hear(said, clock.now(), sharable=self.driver.sharable))
 
     def _on_state_asked(self, request: Request[RcAsk]) -> None:
         promise = request.message.promise
@@ -175,9 +178,14 @@ class ResourceController:
             ended=ended,
             health=self.health,
             rules=self.rules,
-            leader=bool(self._leaders),
+            leader=self._sees_leader(),
             capacity=self.driver.capacity(),
         )
+
+    def _sees_leader(self) -> bool:
+        """A leader counts while it is heard: its token lives on when its program hangs."""
+        # Half a hold lease is longer than a heartbeat, and leaves a successor time before holds end.
+        return bool(self._leaders) and clock.now() - self.holding.heard < self.holding.hold_lease // 2
 
     def _on_proposal(self, request: Request[Proposal]) -> None:
         asked = request.message
@@ -190,6 +198,7 @@ class ResourceController:
     # Commands
 
     def _on_command(self, request: Request[Command]) -> None:
+        self.mesh.keys.sender_of(request.key)  # a sender without a valid name is refused here
         if self._work.qsize() >= COMMAND_QUEUE:
             raise Refused("busy", f"{self.name} has {COMMAND_QUEUE} commands waiting; ask again")
         if not 0 < request.message.ttl <= MAX_TTL:
@@ -242,9 +251,8 @@ class ResourceController:
             request.refuse(Refused("failed", f"{self.name} could not do it; see the log of its node").problem)
 
     async def _change(self, change: Change) -> None:
-        # A hand-over goes on in another client: the same ARC has the same place, and no safe state is due.
-        stay = {holder.place for holder in change.began}
-        if any(holder.place not in stay for holder in change.stopped):
+        # A device that still serves others, or goes on in another client, stays as it is.
+        if change.stopped and not change.stayed and not _handed_over(change):
             await self._guard(self.driver.safe())
         for holder in change.began:
             await self._guard(self.driver.begin(holder))
@@ -260,8 +268,7 @@ class ResourceController:
 
     def _apply(self, change: Change) -> None:
         if change:
-            known = {holder.place for holder in change.stopped}
-            if any(holder.place not in known for holder in change.began):
+            if change.began and not change.stayed and not _handed_over(change):
                 self._warm_at = clock.now() + round(self.driver.activation * SECOND)
             self._work.put_nowait(("change", change))
         if change.outdated or change.present or change.ended:
@@ -271,18 +278,33 @@ class ResourceController:
         self._set_timer()
 
     async def _read_state(self) -> None:
-        if self._rereading:
-            return
-        self._rereading = True
-        try:
+        """Reads `rcm/state`. Who wants that while it is under way waits for the same reading."""
+        if self._reading is None or self._reading.done():
+            self._reading = self._spawn(self._read())
+        await asyncio.wait({self._reading})
+
+    async def _read(self) -> None:
+        for _ in range(REREADS):
             asked = StateAsk(holds_only=True)
-            replies = await self.mesh.ask(self.mesh.keys.rcm_state, asked, RcmState, timeout=REREAD_TIMEOUT)
-        finally:
-            self._rereading = False
-        states = [reply.message for reply in replies if reply.message is not None]
-        if states:
+            replies = await self.mesh.ask(
+                self.mesh.keys.rcm_state, asked, RcmState, timeout=REREAD_TIMEOUT, enough=self._current
+            )
+            states = [reply.message for reply in replies if reply.message is not None]
+            # One absurd answer must not hide the true one.
+            states = [state for state in states if not absurd(state.term, self.holding.term)]
+            if not states:
+                return
             newest = max(states, key=lambda state: (state.term, state.seq))
+            overtaken = (newest.term, newest.seq) < (self.holding.term, self.holding.seq)
             self._apply(self.holding.read(newest, clock.now(), sharable=self.driver.sharable))
+            # What was published while the answer was on its way may have hidden the very gap it was for.
+            if not overtaken:
+                return
+
+    def _current(self, reply: Reply[RcmState]) -> bool:
+        """Whether nobody else needs to be heard: the answer is of an RCM that is obeyed already."""
+        state, holding = reply.message, self.holding
+        return state is not None and state.term == holding.term and state.seq >= holding.seq
 
     def _set_timer(self) -> None:
         if self._timer is not None:
@@ -297,10 +319,18 @@ class ResourceController:
         # After a stall of our own, what the RCM said meanwhile may still wait in the inbox: it goes first.
         self._apply(self.holding.expire(clock.now(), lease=not self._stall.fresh()))
 
-    def _spawn(self, coroutine: Any) -> None:
+    def _spawn(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+        return task
+
+
+def _handed_over(change: Change) -> bool:
+    """Whether all who stopped go on in another client: the same ARC has the same place."""
+    before = {holder.place: holder.client for holder in change.stopped}
+    after = {holder.place: holder.client for holder in change.began}
+    return before.keys() == after.keys() and all(after[place] != client for place, client in before.items())
 
 
 class ExclusiveDriver(Driver):

@@ -2,7 +2,8 @@
 
 The rules, all of them:
 
-- What an RCM publishes is ordered by (term, seq). Older than the newest heard or promised: ignored.
+- What an RCM publishes is ordered by (term, seq). Older than the newest heard or promised: ignored. So is a
+  term absurdly far above it: it would silence every RCM to come.
 - A publication that touches this RC lists all its holders from then on.
 - A gap, or a new term, means that something was missed: the RC reads `rcm/state` and presents its hold. A
   snapshot may add a hold that was missed; it ends nothing.
@@ -19,13 +20,11 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from zscout.messages import EndedHold, Grants, Holder, RcmState
+from zscout.messages import EndedHold, Grants, Holder, RcmState, absurd
 from zscout.scheduling.model import NO_TERM, SECOND, Grant, Ns, Term
 
 REMEMBERED = 64
 """Grants that ended lately, kept to say why a command under one of them is refused."""
-ABSURD_JUMP = 1_000_000
-"""A term whose counter is this far above all that was heard is an error, not an election."""
 MAX_HOLDERS = 1_024
 
 
@@ -45,6 +44,8 @@ class Change:
     stopped: list[Holder] = field(default_factory=list)
     ended: list[EndedHold] = field(default_factory=list)
     """Of the stopped, those whose hold ended here by itself."""
+    stayed: bool = False
+    """Others hold the RC before and after."""
     outdated: bool = False
     """The speaker is behind: publish this RC's state, so that it sees the newer term."""
     reread: bool = False
@@ -80,14 +81,19 @@ class Holding:
 
     # What an RCM says
 
-    def hear(self, said: Grants, now: Ns) -> Change:
-        """Takes a publication."""
+    def hear(self, said: Grants, now: Ns, *, sharable: bool = True) -> Change:
+        """Takes a publication. Of several holders of an exclusive RC only the newest grant is obeyed."""
         if (said.term, said.seq) < (self.term, self.seq):
             return Change(outdated=said.term < self.term)
+        if absurd(said.term, self.term):
+            return Change()
         change = Change(reread=said.term != self.term or said.prev > self.seq)
         self.term, self.seq, self.heard = said.term, said.seq, now
         holders = said.rcs.get(self.rc)
         if holders is not None:
+            if len(holders) > 1 and not sharable:
+                holders = [max(holders, key=lambda holder: holder.grant)]
+                change.present = True
             reasons = {revoked.grant: f"{revoked.outcome}: {revoked.reason}" for revoked in said.revoked}
             self._replace(holders[:MAX_HOLDERS], reasons, change, now)
         return change
@@ -96,6 +102,8 @@ class Holding:
         """Takes a snapshot: what was missed is added, what the snapshot does not know is presented."""
         if (state.term, state.seq) < (self.term, self.seq):
             return Change(outdated=state.term < self.term)
+        if absurd(state.term, self.term):
+            return Change()
         self.term, self.seq, self.heard = state.term, state.seq, now
         change = Change()
         known = {view.grant for view in state.holds if self.rc in view.needs}
@@ -124,7 +132,7 @@ class Holding:
 
     def promise(self, term: Term) -> bool:
         """Obeys no lower term again. False: a higher one is known, or the jump is absurd."""
-        if term < self.term or (self.term != NO_TERM and term.counter > self.term.counter + ABSURD_JUMP):
+        if term < self.term or absurd(term, self.term):
             return False
         if term != self.term:
             self.term, self.seq = term, 0
@@ -170,7 +178,7 @@ class Holding:
             return None
         if grant in self._ended:
             return Refusal("ended", f"the hold of {self.rc} is over: {self._ended[grant]}")
-        if (grant.term, grant.seq) > (self.term, self.seq):
+        if (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term):
             return Refusal("not_yet", f"{self.rc} has not heard of this grant")
         if not self.held:
             return Refusal("free", f"{self.rc} is held by nobody; ask the RCM for it")
@@ -199,10 +207,12 @@ class Holding:
     def _begin(self, holder: Holder, change: Change, now: Ns) -> None:
         self.held[holder.grant] = Held(holder, now + round(holder.remaining * SECOND))
         change.began.append(holder)
+        change.stayed = len(self.held) > len(change.began)
 
     def _stop(self, grant: Grant, why: str, change: Change, ended: str | None = None) -> None:
         holder = self.held.pop(grant).holder
         change.stopped.append(holder)
+        change.stayed = len(self.held) > len(change.began)
         if ended is not None:
             change.ended.append(EndedHold(id=holder.id, grant=grant, why=ended))
         self._ended[grant] = why

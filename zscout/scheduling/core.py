@@ -136,6 +136,10 @@ class Core:
         arcs = (*self.floor.queued.values(), *self.floor.running.values())
         return [arc for arc in arcs if arc.request.client == client]
 
+    def given(self, place: Place) -> bool:
+        """Whether `place` may have been given; of earlier terms the core does not know."""
+        return place.term != self.term or place.arrival <= self._arrivals
+
     def _ask(self, request: Request, place: Place | None) -> None:
         if self.floor.arc(request.arc) is not None:
             return

@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
+from typing import TypeVar
 
 from zscout import clock
 from zscout.config import Fleet
-from zscout.keyexpr import Role, Token, new_instance
-from zscout.mesh import Declared, Mesh
-from zscout.messages import ClientRequests, Grants, RcAsk, RcState
+from zscout.keyexpr import BadName, Role, Token, client_of, new_instance
+from zscout.mesh import Declared, Mesh, Reply
+from zscout.messages import ClientRequests, Grants, RcAsk, RcState, absurd
 from zscout.scheduling.model import NO_TERM, SECOND, Term
 from zscout.services.election import Election
 from zscout.services.rcm import Rcm
 from zscout.services.rebuild import rebuild
 
 log = logging.getLogger(__name__)
+R = TypeVar("R")
 
 MAX_ATTEMPTS = 3
 """Terms tried in one go when RCs turn out to have promised higher ones."""
@@ -78,6 +81,9 @@ class Candidate:
         self._changed.set()
 
     def _see(self, term: Term) -> None:
+        if absurd(term, self.known):
+            log.warning("ignored term %d: absurdly far above %d", term.counter, self.known.counter)
+            return
         if term > self.known:
             self.known = term
         if self.rcm is not None and term > self.rcm.term:
@@ -112,7 +118,7 @@ class Candidate:
         """Whether most RCs still see a leader: then it is this candidate that is cut off."""
         timeout = self.fleet.timing.rebuild / SECOND
         replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=timeout)
-        states = [reply.message for reply in replies if reply.message is not None]
+        states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
         for state in states:
             self._see(state.term)
         seeing = sum(1 for state in states if state.leader)
@@ -139,11 +145,21 @@ class Candidate:
                     self._see(problem.term)
             if self.known > term:
                 continue
-            states = [reply.message for reply in rcs if reply.message is not None]
-            asked = [reply.message for reply in clients if reply.message is not None]
-            self._lead(term, states, asked)
+            asked = self._credible(clients, lambda told: keys.requests(client_of(told.client)))
+            self._lead(term, self._credible(rcs, lambda state: keys.rc_state(state.rc)), asked)
             return True
         return False
+
+    def _credible(self, replies: list[Reply[R]], key_of: Callable[[R], str]) -> list[R]:
+        """The messages of `replies` that name in themselves whom their key names; others prove nothing."""
+        messages = []
+        for reply in replies:
+            try:
+                if reply.message is not None and reply.key == key_of(reply.message):
+                    messages.append(reply.message)
+            except BadName as error:
+                log.warning("ignored an answer on %.200r: %s", reply.key, error)
+        return messages
 
     def _lead(self, term: Term, states: list[RcState], asked: list[ClientRequests]) -> None:
         inheritance = rebuild(states, asked, clock.now())

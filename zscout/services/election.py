@@ -48,7 +48,8 @@ class Election:
         if alive:
             self._leaders[instance] = now
         elif self._leaders.pop(instance, None) is not None and not self._leaders:
-            self._since = max(self._since, now)
+            # Who has seen a leader is on the mesh: there is nothing to settle any more.
+            self._since = now
 
     def heard(self, term: Term, now: Ns) -> None:
         """A leader spoke."""
@@ -68,7 +69,7 @@ class Election:
         if not self.eligible:
             return None
         if self.sees_leader(now):
-            return min(heard + self.silence for heard in self._leaders.values())
+            return max(self._not_before, *(heard + self.silence for heard in self._leaders.values()))
         return max(self._since + self._turn() * TURN, self._not_before)
 
     def _turn(self) -> int:

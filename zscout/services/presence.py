@@ -141,6 +141,8 @@ class Presence:
                 if state is not None and state.instance == token.instance and token.name not in self._joined:
                     self._take_in(token.name, state)
                     return
+            # No answer can come at once, and again and again: a token may stand for nothing.
+            await asyncio.sleep(timeout)
 
     def _take_in(self, name: str, state: RcState) -> None:
         self._joined[name] = state

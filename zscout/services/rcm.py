@@ -10,13 +10,14 @@ import asyncio
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any
 
 from zscout import clock
 from zscout.amounts import duration, exact_amounts
 from zscout.config import Fleet
 from zscout.keyexpr import BadName, Role, Sender, Token, check_name, check_rc, client_of
-from zscout.mesh import Declared, Mesh, Refused, Request
+from zscout.mesh import Declared, Mesh, MeshError, Refused, Reply, Request
 from zscout.messages import (
     MAX_PARAMS,
     Ask,
@@ -64,6 +65,12 @@ MAX_LISTED = 1_000
 LATE_VOTE = 2.0
 """Seconds within which a late vote is still heard."""
 REPLY_SLACK = 0.1
+REASONS_EVERY = 0.1
+"""Seconds at most until a waiting client hears that its reason to wait has changed: in a busy queue every
+grant changes many reasons, and only the last is of use."""
+LOG_EVERY = 0.1
+MAX_LOGGED = 50
+"""Lines in one entry of the log; the story has them all."""
 MAX_PRIORITY = 1_000_000
 
 
@@ -83,6 +90,12 @@ class Rcm:
         self._declared: list[Declared] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._wake: asyncio.TimerHandle | None = None
+        self._wake_at: Ns | None = None
+        self._armed: Ns = 0
+        """When the timer goes off: it may be earlier than it need be."""
+        self._untold: set[ArcId] = set()
+        """ARCs whose reason to wait has not been published yet."""
+        self._unlogged: list[str] = []
         self._answers: dict[ArcId, list[Request[Operation]]] = {}
         self._names: dict[ArcId, str] = {}
         self._ended: OrderedDict[ArcId, tuple[Ns, Notice]] = OrderedDict()
@@ -108,7 +121,7 @@ class Rcm:
         self._carry_out(effects, everything=True)
         token = Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)
         self._declared += [
-            mesh.serve(keys.schedule_any, Operation, self._on_operation),
+            mesh.serve(keys.schedule_any, Operation, self._on_operation, limit=self.fleet.limits.max_payload),
             mesh.serve(keys.rcm_state, StateAsk, self._on_state_asked),
             *self.presence.watch(),
             mesh.alive(token),
@@ -125,6 +138,7 @@ class Rcm:
         self.presence.stop()
         if self._wake is not None:
             self._wake.cancel()
+        self._log()
         for task in list(self._tasks):
             task.cancel()
         for requests in self._answers.values():
@@ -188,6 +202,8 @@ class Rcm:
             raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
         if ask.place is not None and ask.place.term > self.term:
             raise Refused("bad_request", "place is of a term that has not been; leave it out")
+        if ask.place is not None and (ask.place.arrival < 1 or not self.core.given(ask.place)):
+            raise Refused("bad_request", "place was never given; leave it out")
         try:
             check_name(ask.arc, "arc")
             for name, params in ask.needs.items():
@@ -307,16 +323,25 @@ class Rcm:
             rcs=list(effect.rcs),
         )
         self._notify(notice)
-        if not effect.requeued:
+        # What was handed over goes on under its own name.
+        if self.core.floor.arc(effect.arc) is None:
             self._remember(effect.arc, notice)
 
     def _queued(self, effect: Queued) -> None:
-        arc = self.core.floor.queued.get(effect.arc)
-        if arc is None or not effect.settled:
+        if effect.arc not in self.core.floor.queued or not effect.settled:
             return
-        self._tell(arc.id, arc.name, f"waits: {effect.reason}")
-        self._notify(self._of_arc(arc))
-        self._answer(arc.id)
+        if not self._untold:
+            asyncio.get_running_loop().call_later(REASONS_EVERY, self._tell_reasons)
+        self._untold.add(effect.arc)
+        self._answer(effect.arc)
+
+    def _tell_reasons(self) -> None:
+        untold, self._untold = self._untold, set()
+        waiting = self.core.floor.queued
+        for arc in [waiting[arc] for arc in untold if arc in waiting]:
+            self._tell(arc.id, arc.name, f"waits: {arc.reason}")
+            if not self._closed:
+                self._notify(self._of_arc(arc))
 
     def _dropped(self, effect: Dropped) -> None:
         name = self._name(effect.arc)
@@ -332,31 +357,46 @@ class Rcm:
         arcs = ((self.core.floor.arc(arc), params) for arc, params in effect.holders.items())
         holders = [views.proposed(arc, params) for arc, params in arcs if arc is not None]
         proposal = Proposal(proposal=effect.proposal, term=self.term, holders=holders)
-        self.spawn(self._collect_vote(effect.rc, proposal))
-
-    async def _collect_vote(self, rc: str, proposal: Proposal) -> None:
-        """Asks one vote. Overdue is told once; a late answer is still welcome."""
-        timing = self.fleet.timing
+        # Overdue is told once; a late answer is still welcome.
         overdue = asyncio.get_running_loop().call_later(
-            timing.vote_timeout / SECOND, self.feed, VoteOverdue(proposal.proposal)
+            self.fleet.timing.vote_timeout / SECOND, self.feed, VoteOverdue(effect.proposal)
         )
-        reply = await self.mesh.ask_one(self.mesh.keys.vote(rc), proposal, Ballot, timeout=LATE_VOTE)
+        voted = partial(self._voted, effect.rc, effect.proposal, overdue)
+        try:
+            self.mesh.ask_then(self.mesh.keys.vote(effect.rc), proposal, Ballot, voted, timeout=LATE_VOTE)
+        except MeshError as error:
+            log.warning("%s", error)
+
+    def _voted(
+        self, rc: str, proposal: int, overdue: asyncio.TimerHandle, reply: Reply[Ballot] | None
+    ) -> None:
         overdue.cancel()
         ballot = reply.message if reply is not None else None
-        if ballot is None or ballot.proposal != proposal.proposal:
+        if ballot is None or ballot.proposal != proposal:
             if reply is not None and reply.problem is not None:
                 log.warning("%s did not vote: %s", rc, reply.problem.message)
-            self.feed(VoteOverdue(proposal.proposal))
+            self.feed(VoteOverdue(proposal))
         else:
-            self.feed(Vote(proposal.proposal, ballot.accept, ballot.reason[:500]))
+            self.feed(Vote(proposal, ballot.accept, ballot.reason[:500]))
 
     def _set_wake(self, at: Ns | None) -> None:
+        """A timer that goes off too early is left alone: most ends are put off before they come."""
+        self._wake_at = at
+        if at is None or (self._wake is not None and self._armed <= at):
+            return
         if self._wake is not None:
             self._wake.cancel()
-            self._wake = None
-        if at is not None:
-            delay = max(0.0, (at - clock.now()) / SECOND)
-            self._wake = asyncio.get_running_loop().call_later(delay, self.feed, Tick())
+        self._armed = at
+        delay = max(0.0, (at - clock.now()) / SECOND)
+        self._wake = asyncio.get_running_loop().call_later(delay, self._on_wake)
+
+    def _on_wake(self) -> None:
+        self._wake = None
+        at = self._wake_at
+        if at is not None and clock.now() < at:
+            self._set_wake(at)
+        elif at is not None:
+            self.feed(Tick())
 
     # Words
 
@@ -365,7 +405,17 @@ class Rcm:
 
     def _tell(self, arc: ArcId, name: str, text: str) -> None:
         self.story.tell(clock.now(), arc, name, text)
-        log.info("%s %s", name, text)
+        if not self._unlogged:
+            asyncio.get_running_loop().call_later(LOG_EVERY, self._log)
+        self._unlogged.append(f"{name} {text}")
+
+    def _log(self) -> None:
+        """Writes down what happened lately as one entry: a log that costs as much as a grant is too dear."""
+        lines, self._unlogged = self._unlogged, []
+        if len(lines) > MAX_LOGGED:
+            lines[MAX_LOGGED:] = [f"and {len(lines) - MAX_LOGGED} lines more; ask `zscout why`"]
+        if lines:
+            log.info("%s", "\n  ".join(lines))
 
     def _of_arc(self, arc: Arc) -> Notice:
         state: State = "queued" if arc.hold is None else "running"

@@ -1,7 +1,8 @@
 """What stands when a new RCM takes the lead, from what RCs and clients say. Pure.
 
 RCs know the holds, clients their requests and places. A hold stands if every RC of its gang is there and
-holds it under the same grant; a gang with an absent RC is broken, and queued again with its place.
+holds it under the same grant; a gang with an absent RC is broken, and queued again with its place. What a
+client that answers does not ask for any more is not carried on: it gave it up while nobody led.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ def rebuild(states: Iterable[RcState], clients: Iterable[ClientRequests], now: N
             arc = views.arc_id(holder.client, holder.id)
             parts.setdefault((arc, holder.grant), {})[state.rc] = holder
     asked: dict[str, tuple[str, OpenRequest]] = {}
+    answered: set[str] = set()
     for answer in clients:
+        answered.add(answer.client)
         for request in answer.requests:
             asked[views.arc_id(answer.client, request.id)] = (answer.client, request)
 
@@ -48,6 +51,9 @@ def rebuild(states: Iterable[RcState], clients: Iterable[ClientRequests], now: N
         if arc in seen:
             continue
         seen.add(arc)
+        if arc not in asked and next(iter(held.values())).client in answered:
+            log.info("%s is given up by its client", arc)
+            continue
         try:
             _inherit_hold(result, arc, grant, held, asked.get(arc), now)
         except (BadName, ValueError) as error:

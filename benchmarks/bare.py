@@ -1,0 +1,119 @@
+"""The bare cost: a plain Zenoh query, with nothing of zscout on the path.
+
+`python -m benchmarks.bare CONFIG KEY BYTES` is the other end: a queryable whose direct callback sends BYTES.
+`--answer TEXT` sends TEXT instead. It says "ready" on stdout, and ends when stdin is closed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import queue
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import zenoh
+from zenoh.handlers import Callback
+
+from benchmarks.stats import Samples
+
+KEY = "bench/bare"
+START = 20.0
+WARM_UP = 200
+
+
+def settings(address: str) -> zenoh.Config:
+    """A peer that finds others by multicast at `address`, on loopback."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"peer"')
+    config.insert_json5("scouting/multicast/address", f'"{address}"')
+    config.insert_json5("scouting/multicast/interface", '"lo"')
+    config.insert_json5("transport/shared_memory/enabled", "false")
+    return config
+
+
+class BareQuery:
+    """Asks in two ways, and goes on with the one that proves faster."""
+
+    def __init__(self, session: zenoh.Session, payload: bytes) -> None:
+        self._session, self._payload = session, payload
+        self.once = self._blocking
+
+    def choose(self) -> str:
+        """Waits for the other end, tries both ways, and returns the name of the faster."""
+        deadline = time.monotonic() + START
+        while not self._answered():
+            if time.monotonic() > deadline:
+                raise TimeoutError("the bare queryable was not found")
+        ways = {"blocking handler": self._blocking, "callback and queue": self._callback}
+        tried = {name: Samples() for name in ways}
+        for _ in range(WARM_UP):
+            for name, way in ways.items():
+                tried[name].add(way())
+        fastest = min(ways, key=lambda name: tried[name].median)
+        self.once = ways[fastest]
+        return fastest
+
+    def _answered(self) -> bool:
+        return any(reply.ok is not None for reply in self._session.get(KEY, payload=self._payload, timeout=1.0))
+
+    def _blocking(self) -> float:
+        start = time.perf_counter()
+        reply = self._session.get(KEY, payload=self._payload, express=True).recv()
+        took = time.perf_counter() - start
+        assert reply.ok is not None, "the bare query failed"
+        return took
+
+    def _callback(self) -> float:
+        arrived: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
+        handler = Callback(arrived.put, _nothing, indirect=False)
+        start = time.perf_counter()
+        self._session.get(KEY, handler, payload=self._payload, express=True)
+        reply = arrived.get(timeout=START)
+        took = time.perf_counter() - start
+        assert reply.ok is not None, "the bare query failed"
+        return took
+
+
+@contextmanager
+def other_end(address: str, key: str, *more: str) -> Iterator[subprocess.Popen[str]]:
+    """Runs the queryable in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.bare", address, key, *more]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        assert process.stdout.readline().strip() == "ready", "the bare queryable did not start"
+        yield process
+    finally:
+        process.stdin.close()
+        process.wait(10)
+
+
+def _nothing() -> None:
+    pass
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("address")
+    parser.add_argument("key")
+    parser.add_argument("bytes", type=int, nargs="?", default=0)
+    parser.add_argument("--answer")
+    args = parser.parse_args()
+    reply = args.answer.encode() if args.answer is not None else b"x" * args.bytes
+    concrete = "*" not in args.key
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(args.key if concrete else query.key_expr, reply, express=True)
+        query.drop()  # type: ignore[no-untyped-call]
+
+    with zenoh.open(settings(args.address)) as session:
+        session.declare_queryable(args.key, Callback(answer, _nothing, indirect=False), complete=False)
+        print("ready", flush=True)
+        sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""The other end of the asyncio face: `Mesh.serve` that answers at once. Ends when stdin is closed.
+
+`python -m benchmarks.face FLEET_FILE`
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+
+from benchmarks.loop import run
+from zscout.config import load_fleet
+from zscout.keyexpr import Keys, Sender
+from zscout.mesh import Mesh, Request
+from zscout.messages import Notice, StateAsk
+from zscout.scheduling.model import Grant, Place, Term
+
+RC = "bench/face"
+TERM = Term(1, "0123456789ab")
+NOTICE = Notice(
+    id="0123456789ab",
+    arc="bench",
+    client="bench/bench",
+    state="running",
+    term=TERM,
+    step=1,
+    place=Place(TERM, 1),
+    grant=Grant(TERM, 1),
+    rcs=["robot/r0"],
+    remaining=60.0,
+)
+"""What a grant is answered with."""
+
+
+def key(keys: Keys) -> str:
+    """Where it answers: a key of the fleet that nothing else uses."""
+    return keys.vote(RC)
+
+
+async def serve(fleet_file: Path) -> None:
+    fleet = load_fleet(fleet_file)
+
+    def answer(request: Request[StateAsk]) -> None:
+        request.answer(NOTICE)
+
+    async with await Mesh.open(fleet.name, Sender("bench", "face"), fleet.mesh) as mesh:
+        mesh.serve(key(mesh.keys), StateAsk, answer)
+        print("ready", flush=True)
+        await asyncio.to_thread(sys.stdin.read)
+
+
+if __name__ == "__main__":
+    run(serve(Path(sys.argv[1])))

@@ -1,0 +1,153 @@
+"""Latencies as a program on the mesh sees them, each against the bare query of the same rounds."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import zenoh
+
+from benchmarks import bare, face
+from benchmarks.stats import Row, Samples, of_latency
+from tests.live.lab import Lab
+from zscout import messages
+from zscout.behaviors.client import Client
+from zscout.behaviors.request import Needs, OpenArc
+from zscout.messages import Ask, Notice, StateAsk
+from zscout.scheduling.model import Place
+
+EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
+SHARABLE = ["radio/rf0", "video/ch1"]
+SPACERS = 3
+"""Bare queries that do not count between two measurements, so that nothing pays for what the one before it
+left behind, and all find the processors awake."""
+HOLD = 60.0
+
+
+def fleet_of(folder: Path) -> Lab:
+    """The RCM's node apart from those of the RCs, as on a mesh; not started yet."""
+    return Lab(folder, candidates=["lead"])
+
+
+def start(lab: Lab) -> None:
+    lab.node("lead")
+    lab.node("left", *EXCLUSIVE[0::2], f"{SHARABLE[0]}:rate=10")
+    lab.node("right", *EXCLUSIVE[1::2], f"{SHARABLE[1]}:rate=10")
+
+
+async def running(client: Client, arc: OpenArc) -> None:
+    """Waits for the grant, without the confirmation at the RCs."""
+    while arc.state != "running":
+        assert arc.open, f"{arc.name} ended: {arc.reason}"
+        await client.changed(arc)
+
+
+async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> list[Row]:
+    """Rows for the bare query, its asyncio face, the grants and the release."""
+    client, second = await lab.client("bench"), await lab.client("second")
+    await lab.ready(client, *EXCLUSIVE, *SHARABLE)
+    one: Needs = {EXCLUSIVE[0]: {}}
+    five: Needs = {name: {} for name in EXCLUSIVE[:5]}
+    votes: Needs = {name: {"rate": 4} for name in SHARABLE}
+    ask = len(messages.encode(Ask("0123456789ab", "bench", {EXCLUSIVE[0]: {}}, 0, 60)))  # type: ignore[arg-type]
+    address = lab.fleet.mesh.multicast_address.replace("224.0.0.224", "224.0.0.225")
+
+    async def face_query() -> float:
+        start = time.perf_counter()
+        reply = await client.mesh.ask_one(face.key(client.mesh.keys), StateAsk(arc="x" * ask), Notice, timeout=5)
+        took = time.perf_counter() - start
+        assert reply is not None and reply.message is not None, "the face did not answer"
+        return took
+
+    def grant(needs: Needs) -> Callable[[], Awaitable[float]]:
+        async def measured() -> float:
+            start = time.perf_counter()
+            arc = await client.request("bench", needs, min_runtime=HOLD)
+            await running(client, arc)
+            took = time.perf_counter() - start
+            await client.end(arc)
+            return took
+
+        return measured
+
+    def confirmed(needs: Needs) -> Callable[[], Awaitable[float]]:
+        async def measured() -> float:
+            start = time.perf_counter()
+            arc = await client.request("bench", needs, min_runtime=HOLD)
+            await client.granted(arc)
+            took = time.perf_counter() - start
+            await client.end(arc)
+            return took
+
+        return measured
+
+    async def next_waiter() -> float:
+        holder = await client.request("holder", one, min_runtime=HOLD)
+        await running(client, holder)
+        waiter = await second.request("waiter", one, min_runtime=HOLD)
+        assert waiter.state == "queued"
+        for _ in range(SPACERS):
+            query.once()
+        start = time.perf_counter()
+        released = asyncio.create_task(client.end(holder))
+        await running(second, waiter)
+        took = time.perf_counter() - start
+        await released
+        await second.end(waiter)
+        return took
+
+    measured: dict[str, Callable[[], Awaitable[float]]] = {
+        "query, asyncio face": face_query,
+        "grant, 1 RC": grant(one),
+        "grant, 5 RCs": grant(five),
+        "grant, 2 votes": grant(votes),
+        "grant and confirmation, 1 RC": confirmed(one),
+        "grant and confirmation, 5 RCs": confirmed(five),
+        "grant and confirmation, 2 votes": confirmed(votes),
+        "release to next grant": next_waiter,
+    }
+    aims = {
+        "grant, 1 RC": 1.5,
+        "grant, 5 RCs": 1.5,
+        "grant, 2 votes": 2.6,
+        "release to next grant": 2.0,
+    }
+    samples = {name: Samples() for name in measured}
+    bare_samples = Samples()
+    other = subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.face", str(lab.fleet_file)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert other.stdin is not None and other.stdout is not None
+    try:
+        assert other.stdout.readline().strip() == "ready"
+        while await client.mesh.ask_one(face.key(client.mesh.keys), None, Notice, timeout=1) is None:
+            pass
+        size = len(messages.encode(face.NOTICE))
+        with bare.other_end(address, bare.KEY, str(size)), zenoh.open(bare.settings(address)) as session:
+            query = bare.BareQuery(session, b"x" * ask)
+            way = query.choose()
+            progress(f"bare query: {way}, {ask} bytes out, {size} back")
+            for number in range(-rounds // 10, rounds):
+                for name, measure in measured.items():
+                    for _ in range(SPACERS):
+                        query.once()
+                    reference = query.once()
+                    took = await measure()
+                    if number >= 0:
+                        samples[name].add(took)
+                        bare_samples.add(reference)
+                if number % 100 == 0:
+                    progress(f"latencies: round {number} of {rounds}")
+    finally:
+        other.stdin.close()
+        await asyncio.to_thread(other.wait, 10)
+    rows = [of_latency("bare query", bare_samples, bare_samples)]
+    rows += [of_latency(name, samples[name], bare_samples, aim=aims.get(name)) for name in measured]
+    return rows

@@ -1,0 +1,69 @@
+"""`zscout keys`: what it lists is there, and answers where it says so."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.tools import zscout_soon
+from tests.live.lab import Lab
+from zscout.messages import RcAsk, RcmState, RcState, StateAsk
+
+pytestmark = pytest.mark.live
+
+
+def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a", "radio/rf0:rate=10")
+            client = await lab.client("program")
+            state = await lab.ready(client, "robot/a", "radio/rf0")
+            shown = json.loads((await zscout_soon("keys", "--json", env=lab.env)).stdout)
+            base = f"zscout/{lab.fleet.name}"
+            assert (shown["fleet"], shown["base"]) == (lab.fleet.name, base)
+            assert shown["links"] >= 1
+            alive = {(one["host"], one["role"], one["name"]): one for one in shown["alive"]}
+            assert set(alive) == {
+                ("anvil", "node", "node"),
+                ("anvil", "candidate", "node"),
+                ("anvil", "rcm", "node"),
+                ("anvil", "load", "node"),
+                ("anvil", "rc", "robot/a"),
+                ("anvil", "rc", "radio/rf0"),
+                ("test", "client", "program"),
+            }
+            rcm = alive["anvil", "rcm", "node"]
+            assert rcm["token"] == f"{base}/alive/anvil/rcm/node/{state.term.rcm}"
+            queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
+            assert queries == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
+            assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=2) is not None
+            for rc in ("robot/a", "radio/rf0"):
+                served = {key["key"] for key in alive["anvil", "rc", rc]["keys"] if key["how"] == "query"}
+                assert (f"{base}/rc/{rc}/vote" in served) == (rc == "radio/rf0")
+                key = f"{base}/rc/{rc}/state"
+                assert key in served
+                assert await client.mesh.ask_one(key, RcAsk(), RcState, timeout=2) is not None
+
+            plain = await zscout_soon("keys", env=lab.env)
+            assert plain.returncode == 0
+            lines = [line.split() for line in plain.stdout.splitlines()[3:]]
+            listed = {(host, role, name, how, f"{base}/{key}") for host, role, name, how, key, *_ in lines}
+            assert {line for line in listed if line[3] != "-"} == {
+                (*who, key["how"], key["key"]) for who, one in alive.items() for key in one["keys"]
+            }
+
+    asyncio.run(story())
+
+
+def test_where_nobody_is_it_says_so(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            shown = await zscout_soon("keys", env=lab.env)
+            assert (shown.returncode, shown.stdout) == (3, "")
+            assert "no other program either" in shown.stderr
+            assert len(shown.stderr.splitlines()) == 1
+
+    asyncio.run(story())

@@ -1,0 +1,165 @@
+"""The `zscout` group: lazy, quick, one line for each error, exit codes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from decimal import Decimal
+from pathlib import Path
+
+import click
+import pytest
+
+from tests.cli.fleet import ZSCOUT
+from tests.live.lab import Lab
+from zscout.cli.arguments import gather_needs, parse_duration, parse_need
+from zscout.cli.common import plain_table, span
+from zscout.cli.main import COMMANDS, main
+from zscout.strict import BadInput
+
+HEAVY = ("zenoh", "rich", "rerun", "msgspec", "numpy", "cv2")
+
+
+def zscout(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*ZSCOUT, *args], env=os.environ | env, capture_output=True, text=True, timeout=30)
+
+
+def test_help_loads_nothing_heavy_and_lists_all() -> None:
+    script = (
+        "import sys; from zscout.cli.main import main\n"
+        "try: main(['--help'])\n"
+        f"finally: sys.stderr.write(' '.join(name for name in {HEAVY} if name in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_every_command_is_there_and_its_help_has_examples(name: str) -> None:
+    command = main.get_command(click.Context(main), name)
+    assert command is not None
+    assert command.name == name
+    assert command.help is not None
+    assert "Example" in command.help
+
+
+def test_an_unknown_command_is_one_line_with_a_hint() -> None:
+    done = zscout("statu")
+    assert done.returncode == 2
+    assert done.stderr == "zscout: there is no command 'statu'; did you mean status? (see zscout --help)\n"
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["request"], "Missing argument 'NEED...'"),
+        (["request", "robot/a", "--"], "no command follows the --"),
+        (["request", "robot/a", "--priority", "high"], "'high' is not a valid integer range"),
+        (["request", "robot"], "need \"robot\": RC 'robot' is not valid: write kind/name"),
+        (["request", "robot/a", "robot/a"], "robot/a is named twice"),
+        (["request", "robot/a", "--again"], "--again runs a command again"),
+        (["request", "robot/a", "--min-runtime", "0"], "--min-runtime must be positive"),
+        (["cancel"], "Missing argument 'ARC'"),
+    ],
+)
+def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
+    done = zscout(*args)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("zscout")
+    assert words in done.stderr
+
+
+def test_a_fleet_file_that_is_not_there_is_named() -> None:
+    done = zscout("--fleet", "nowhere.toml", "cancel", "x")
+    assert done.returncode == 2
+    assert done.stderr == "zscout: nowhere.toml: there is no such file; check the path\n"
+    named = zscout("cancel", "x", ZSCOUT_FLEET="nowhere.toml")
+    assert named.returncode == 2
+    assert "named by $ZSCOUT_FLEET" in named.stderr
+
+
+@pytest.mark.live
+def test_a_mesh_without_an_rcm_is_3_within_seconds(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    begin = time.monotonic()
+    done = zscout("--fleet", str(lab.fleet_file), "request", "robot/a")
+    assert done.returncode == 3
+    assert time.monotonic() - begin < 10
+    who = "(no other program either); start zscout-node"
+    assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} {who}")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_closed_pipe_is_quiet() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    process = subprocess.Popen(
+        [*ZSCOUT, "completion", "fish"], stdout=write, stderr=subprocess.PIPE, text=True
+    )
+    os.close(write)
+    _, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (1, "")
+
+
+def test_completion_knows_the_commands_without_loading_them() -> None:
+    script = zscout("completion", "bash")
+    assert script.returncode == 0
+    assert "_ZSCOUT_COMPLETE=bash_complete" in script.stdout
+    asked = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout re", COMP_CWORD="1")
+    assert asked.stdout.split() == ["plain,request", "plain,release", "plain,replay"]
+    options = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout request --min", COMP_CWORD="2")
+    assert options.stdout.split() == ["plain,--min-runtime"]
+    unknown = zscout("completion", SHELL="/bin/tcsh")
+    assert unknown.returncode == 2
+    assert "write one of bash, zsh, fish" in unknown.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("5", "5"), ("1.5", "1.5"), (".5", "0.5"), ("300ms", "0.3"), ("2m", "120"), ("1h", "3600"), ("7s", "7")],
+)
+def test_durations(text: str, seconds: str) -> None:
+    assert parse_duration(text, "--timeout") == Decimal(seconds)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "5x", "-1", "1e3", "nan", "1_0", "٣", "5 s", "mm", "0", "1ss", "99999999h"]
+)
+def test_what_is_no_duration_is_refused(text: str) -> None:
+    with pytest.raises(BadInput, match="--timeout"):
+        parse_duration(text, "--timeout")
+
+
+def test_needs() -> None:
+    assert parse_need("robot/scout33") == ("robot/scout33", {})
+    rc, params = parse_need("radio/rf0:command_rate=0.1,other=2")
+    assert (rc, params) == ("radio/rf0", {"command_rate": Decimal("0.1"), "other": Decimal(2)})
+    assert gather_needs([(rc, params), ("robot/a", {})]) == {"radio/rf0": params, "robot/a": {}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "robot", "robot/", "/a", "a/b/c", "a/b:", "a/b:rate", "a/b:rate=", "a/b:rate=-1", "a/b:rate=nan",
+     "a/b:rate=1,rate=2", "a/b:rate=1,", "a/b:=1", "a/*", "a/b:rate=1e999", "a/b:ra te=1", "a/b\n"],
+)  # fmt: skip
+def test_what_is_no_need_is_refused(text: str) -> None:
+    with pytest.raises(BadInput, match="need "):
+        parse_need(text)
+
+
+def test_spans_of_time_as_people_read_them() -> None:
+    spans = [0.0, 0.44, 9.96, 59.4, 59.996, 185, 7440, 93_600, -1]
+    said = ["0.0 s", "0.4 s", "10 s", "59 s", "1 min", "3 min 5 s", "2 h 4 min", "1 d 2 h", "0.0 s"]
+    assert [span(seconds) for seconds in spans] == said
+
+
+def test_plain_tables_align() -> None:
+    assert plain_table(["RC", "holder"], [["robot/a", "x"], ["b/c", ""]]) == [
+        "RC       holder",
+        "robot/a  x",
+        "b/c",
+    ]

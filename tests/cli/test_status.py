@@ -1,0 +1,217 @@
+"""`zscout status` on a real mesh: what it shows in a pipe, at a terminal, and to programs."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import subprocess
+import termios
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.cli.tools import COMMAND, PATIENCE, Terminal, zscout_soon
+from tests.live.lab import Lab
+
+pytestmark = pytest.mark.live
+
+
+def section(text: str, title: str) -> list[list[str]]:
+    """The rows of one table of the plain output, without its heads; cells are two spaces or more apart."""
+    lines = text.split(f"\n{title}\n", 1)[1].split("\n\n", 1)[0].splitlines()
+    return [[cell.strip() for cell in line.split("  ") if cell.strip()] for line in lines[1:]]
+
+
+def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a", "radio/rf0:rate=10")
+            lab.node("bellows", "robot/b")
+            client, other = await lab.client("program"), await lab.client("other")
+            await lab.ready(client, "robot/a", "robot/b", "radio/rf0")
+            needs = {"robot/a": {}, "radio/rf0": {"rate": 4}}
+            survey = await client.request("survey", needs, priority=1, min_runtime=600)
+            take = await other.request("take", {"robot/b": {}}, priority=10, min_runtime=600, keep=True)
+            await other.request("second", {"robot/b": {}}, priority=1, min_runtime=60)
+            await client.request("first", {"robot/b": {}}, priority=2, min_runtime=60)
+            await client.request("ghost", {"robot/nowhere": {}}, priority=0, min_runtime=60)
+            state = await lab.state(client, lambda state: len(state.queue) == 3 and len(state.holds) == 2)
+
+            plain = await zscout_soon("status", env=lab.env)
+            assert (plain.returncode, plain.stderr) == (0, "")
+            assert f"Fleet {lab.fleet.name}: {state.host} leads, term {state.term.counter}" in plain.stdout
+            assert section(plain.stdout, "RCs") == [
+                ["radio/rf0", "shared", "held", "anvil", "survey (rate=4)"],
+                ["robot/a", "exclusive", "held", "anvil", "survey"],
+                ["robot/b", "exclusive", "held", "bellows", "take"],
+                ["robot/nowhere", "exclusive", "absent", "-"],
+            ]
+            running = section(plain.stdout, "Running")
+            assert [(row[0], row[1], *row[-2:]) for row in running] == [
+                ("take", "10", "test/other", "robot/b"),
+                ("survey", "1", "test/program", "radio/rf0 robot/a"),
+            ]
+            assert running[0][3].endswith(", keeps")
+            waiting = section(plain.stdout, "Waiting")
+            assert [row[:3] for row in waiting] == [
+                ["1", "first", "2"],
+                ["2", "second", "1"],
+                ["3", "ghost", "0"],
+            ]
+            assert "held by take, priority 10" in waiting[0][-1]
+            assert waiting[2][-1] == "robot/nowhere not on the mesh"
+            hosts = {row[0]: row for row in section(plain.stdout, "Hosts")}
+            assert set(hosts) == {"anvil", "bellows", "test"}
+            assert hosts[state.host][1] == "leads"
+            assert " of " in hosts["anvil"][2]
+            assert hosts["anvil"][-1] == "node, 2 RCs"
+            assert hosts["test"][1:] == ["alive", "-", "-", "-", "2 clients"]
+            assert "\x1b" not in plain.stdout
+
+            shown = json.loads((await zscout_soon("status", "--json", env=lab.env)).stdout)
+            assert shown["rcm"]["host"] == state.host
+            assert [(rc["rc"], rc["present"], rc["sharable"], rc["host"]) for rc in shown["rcs"]] == [
+                ("radio/rf0", True, True, "anvil"),
+                ("robot/a", True, False, "anvil"),
+                ("robot/b", True, False, "bellows"),
+                ("robot/nowhere", False, False, None),
+            ]
+            assert shown["rcs"][0]["holders"] == [
+                {"arc": "survey", "id": survey.id, "client": "test/program"}
+            ]
+            kept = next(hold for hold in shown["holds"] if hold["id"] == take.id)
+            assert (kept["keep"], kept["priority"], kept["needs"]) == (True, 10, {"robot/b": {}})
+            assert 590 < kept["remaining"] < 600
+            assert [wait["arc"] for wait in shown["queue"]] == ["first", "second", "ghost"]
+            loads = {host["host"]: host["load"] for host in shown["hosts"]}
+            assert loads["anvil"]["cores"] >= 1
+            assert loads["test"] is None
+
+    asyncio.run(story())
+
+
+def test_watching_in_a_pipe_prints_a_block_when_something_happens(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a")
+            bellows = lab.node("bellows", "robot/b")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a", "robot/b")
+            watcher = await asyncio.create_subprocess_exec(
+                *COMMAND, "status", "--watch", env=lab.env, stdout=subprocess.PIPE
+            )
+            stdout = watcher.stdout
+            assert stdout is not None
+            blocks: list[str] = []
+
+            async def block_with(*words: str) -> str:
+                text = ""
+                async with asyncio.timeout(PATIENCE):
+                    while True:
+                        line = (await stdout.readline()).decode()
+                        assert line
+                        if line.startswith("Fleet "):
+                            blocks.append(text)
+                            text = ""
+                        text += line
+                        if all(word in text for word in words):
+                            return text
+
+            await block_with("robot/a  exclusive  free", "bellows")
+            arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
+            await block_with("robot/a  exclusive  held   anvil    survey")
+            await client.end(arc)
+            await block_with("robot/a  exclusive  free")
+            bellows.kill()
+            await block_with("robot/b  exclusive  absent", "gone for")
+            watcher.send_signal(signal.SIGINT)
+            assert await watcher.wait() == 130
+            # Loads and spans of time make no block.
+            assert len(blocks) <= 12
+            assert len(blocks) == len(set(blocks))
+
+    asyncio.run(story())
+
+
+def test_watching_as_json_prints_a_line_each_time(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a")
+            watcher = await asyncio.create_subprocess_exec(
+                *COMMAND, "status", "--watch", "--json", env=lab.env, stdout=subprocess.PIPE
+            )
+            stdout = watcher.stdout
+            assert stdout is not None
+
+            async def holders() -> Any:
+                async with asyncio.timeout(PATIENCE):
+                    return json.loads(await stdout.readline())["rcs"][0]["holders"]
+
+            assert await holders() == []
+            await client.request("survey", {"robot/a": {}}, min_runtime=600)
+            while not (held := await holders()):
+                pass
+            assert held[0]["arc"] == "survey"
+            watcher.terminate()
+            assert await watcher.wait() == 128 + signal.SIGTERM
+
+    asyncio.run(story())
+
+
+def test_watching_at_a_terminal_draws_in_place_until_q(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a")
+
+            def watch(terminal: Terminal, words: str) -> str:
+                return terminal.until(words)
+
+            with Terminal("status", "--watch", env=lab.env) as terminal:
+                before = terminal.modes
+                await asyncio.to_thread(watch, terminal, "q or Ctrl-C ends")
+                modes = terminal.modes[3]
+                assert isinstance(modes, int)
+                assert not modes & termios.ICANON
+                await client.request("survey", {"robot/a": {}}, priority=10, min_runtime=600)
+                await asyncio.to_thread(watch, terminal, "Running")
+                assert "\x1b[1A" in terminal.raw, "the picture is drawn over the last"
+                assert "\x1b[1;31m" in terminal.raw, "an operator's hold is red"
+                terminal.press("q")
+                assert await asyncio.to_thread(terminal.end) == 0
+                assert terminal.modes == before
+            with Terminal("status", "--watch", env=lab.env) as terminal:
+                before = terminal.modes
+                await asyncio.to_thread(watch, terminal, "q or Ctrl-C ends")
+                terminal.process.send_signal(signal.SIGINT)
+                assert await asyncio.to_thread(terminal.end) == 130
+                assert terminal.modes == before
+                assert "Traceback" not in terminal.text
+
+    asyncio.run(story())
+
+
+def test_without_an_rcm_it_shows_what_is_there_and_says_so(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a", extra="candidate = false")
+            client = await lab.client("program")
+            async with asyncio.timeout(PATIENCE):
+                while len(await client.mesh.living(client.mesh.keys.alive_any("rc"), timeout=1)) == 0:
+                    await asyncio.sleep(0.05)
+            shown = await zscout_soon("status", env=lab.env)
+            assert shown.returncode == 3
+            assert "nobody leads" in shown.stdout
+            assert ["anvil", "node, 1 RC"] in [[row[0], row[-1]] for row in section(shown.stdout, "Hosts")]
+            assert shown.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name}")
+            assert len(shown.stderr.splitlines()) == 1
+            told = await zscout_soon("status", "--json", env=lab.env)
+            assert told.returncode == 3
+            assert json.loads(told.stdout)["rcm"] is None
+
+    asyncio.run(story())

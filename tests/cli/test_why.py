@@ -1,0 +1,95 @@
+"""`zscout why` on a real mesh: the story of an ARC in words, and who is in its way."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.tools import zscout_here, zscout_soon
+from tests.live.lab import Lab
+
+pytestmark = pytest.mark.live
+
+
+def test_the_story_of_an_arc(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a", "robot/b", "radio/rf0:rate=10")
+            client, other = await lab.client("program"), await lab.client("other")
+            await lab.ready(client, "robot/a", "robot/b", "radio/rf0")
+            survey = await client.request(
+                "survey", {"robot/a": {}, "radio/rf0": {"rate": 4}}, min_runtime=600
+            )
+            await other.request("mapping", {"radio/rf0": {"rate": 5}}, min_runtime=600, keep=True)
+            await other.request("take", {"robot/a": {}}, priority=10, min_runtime=600)
+            await other.request("late", {"robot/b": {}, "robot/nowhere": {}}, min_runtime=30)
+            await lab.state(client, lambda state: len(state.holds) == 2 and len(state.queue) == 2)
+
+            plain = await zscout_soon("why", "survey", env=lab.env)
+            assert (plain.returncode, plain.stderr) == (0, "")
+            lines = plain.stdout.splitlines()
+            assert lines[0].startswith(
+                f"survey (id {survey.id}, of test/program, priority 0) has waited for "
+            )
+            assert "held by take, priority 10" in lines[1]
+            assert lines[2].endswith("in the queue of 2; it wants 10 min")
+            assert lines[3:5] == ["  it was preempted once", "Needs"]
+            assert lines[5].startswith(
+                "  radio/rf0 (rate=4): shared with mapping (rate=5) of test/other, priority 0,"
+            )
+            assert lines[5].endswith(" left at least")
+            assert lines[6].startswith("  robot/a: held by take of test/other, priority 10, for ")
+            assert lines[7] == "Story"
+            told = [line.split(" ago  ", 1)[1] for line in lines[8:]]
+            assert told[:2] == [
+                "asked for radio/rf0, robot/a at priority 0",
+                "granted radio/rf0, robot/a",
+            ]
+            assert told[2].startswith("preempted: preempted by take")
+            assert told[3].startswith("waits: ")
+
+            by_id = json.loads((await zscout_soon("why", survey.id, "--json", env=lab.env)).stdout)
+            (arc,) = by_id["arcs"]
+            assert (arc["arc"], arc["state"], arc["preemptions"], arc["queued"]) == ("survey", "queued", 1, 2)
+            assert [need["rc"] for need in arc["needs"]] == ["radio/rf0", "robot/a"]
+            (holder,) = arc["needs"][1]["holders"]
+            assert (holder["arc"], holder["client"], holder["priority"]) == ("take", "test/other", 10)
+            assert [line["text"] for line in arc["story"]][:2] == told[:2]
+            assert arc["story"][0]["ago"] >= arc["story"][1]["ago"] >= 0
+
+            missing = (await zscout_soon("why", "late", env=lab.env)).stdout
+            assert "  robot/nowhere: not on the mesh\n" in missing
+            assert "  robot/b: no other ARC holds it\n" in missing
+            runs = (await zscout_soon("why", "take", env=lab.env)).stdout
+            assert "take (id " in runs
+            assert " has run for " in runs
+            assert " of its minimum runtime of 10 min\nHolds\n" in runs
+
+            # Two of one name are told of one by one; ended ones from memory; unknown ones with what is near.
+            twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1)
+            both = json.loads((await zscout_soon("why", "take", "--json", env=lab.env)).stdout)["arcs"]
+            assert [arc["state"] for arc in both] == ["running", "queued"]
+            assert [arc["story"][0]["text"] for arc in both] == [
+                "asked for robot/a at priority 10",
+                "asked for robot/nowhere at priority 0",
+            ]
+            assert both[1]["id"] == twin.id
+            await client.end(survey)
+            ended = await zscout_soon("why", "survey", env=lab.env)
+            assert ended.returncode == 0
+            assert ended.stdout.startswith("survey is not open any more\nStory\n")
+            assert "cancelled" in ended.stdout.splitlines()[-1]
+            unknown = await zscout_soon("why", "mappin", env=lab.env)
+            assert (unknown.returncode, unknown.stdout) == (1, "")
+            assert unknown.stderr == 'zscout: no ARC "mappin" is known; did you mean mapping?\n'
+
+    asyncio.run(story())
+
+
+def test_what_names_no_arc_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("", "a\nb", "x" * 300):
+        assert zscout_here("why", name) == 2
+        assert capsys.readouterr().err.endswith("names no ARC; zscout status lists them\n")

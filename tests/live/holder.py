@@ -1,0 +1,98 @@
+"""A client process for live tests: asks for ARCs, holds or waits, and can be killed or frozen.
+
+    python -m tests.live.holder NAME        (the fleet is the one that ZSCOUT_FLEET names)
+
+Orders come as JSON lines on stdin, what happens goes out as JSON lines on stdout, with `at` in ns of this
+host's clock. Orders: {"order": "ask", "arc", "needs", "priority", "min_runtime", "keep"},
+{"order": "command", "rc", "do", "ttl"} under the last grant of this process, {"order": "end"}.
+It ends when its stdin does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from typing import Any
+
+from zscout import clock
+from zscout.behaviors.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.request import OpenArc
+from zscout.scheduling.model import Grant
+
+
+def say(event: str, **details: Any) -> None:
+    sys.stdout.write(json.dumps({"event": event, "at": clock.now(), **details}) + "\n")
+    sys.stdout.flush()
+
+
+class Holder:
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self.arc: OpenArc | None = None
+        self.grant: Grant | None = None
+        self.tasks: set[asyncio.Task[None]] = set()
+        client.watch(self._told)
+
+    def _told(self, arc: OpenArc) -> None:
+        """A new word of the RCM: `queued`, `running` or `ended`."""
+        say(arc.state, arc=arc.name, reason=arc.reason, outcome=arc.outcome, grant=arc.grant, place=arc.place)
+
+    async def obey(self, order: dict[str, Any]) -> None:
+        match order.pop("order"):
+            case "ask":
+                await self._ask(**order)
+            case "command":
+                await self._command(**order)
+            case "end" if self.arc is not None:
+                await self.client.end(self.arc)
+                say("given_up")
+
+    async def _ask(self, arc: str, needs: dict[str, Any], **how: Any) -> None:
+        try:
+            self.arc = await self.client.request(arc, needs, **how)
+        except RequestRefused as refused:
+            say("refused", code=refused.code)
+            return
+        asked = self.arc
+        while asked.open:
+            try:
+                grant = await self.client.granted(asked)
+            except CommandRefused as refused:
+                say("not_entered", code=refused.code, reason=str(refused))
+                return
+            if grant is None:
+                return
+            self.grant = grant
+            say("entered", arc=asked.name, grant=grant)
+            while asked.grant == grant:
+                await self.client.changed(asked)
+
+    async def _command(self, rc: str, do: dict[str, Any], ttl: float = 1.0) -> None:
+        assert self.grant is not None
+        try:
+            done = await self.client.command(rc, self.grant, do, ttl=ttl)
+        except CommandRefused as refused:
+            say("command", code=refused.code, reason=str(refused))
+        else:
+            say("command", code="done", result=done.result)
+
+    def start(self, line: bytes) -> None:
+        task = asyncio.get_running_loop().create_task(self.obey(json.loads(line)))
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
+
+
+async def main() -> None:
+    loop = asyncio.get_running_loop()
+    orders = asyncio.StreamReader()
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(orders), sys.stdin)
+    async with await Client.connect(sys.argv[1], host="test") as client:
+        holder = Holder(client)
+        say("up")
+        while line := await orders.readline():
+            holder.start(line)
+
+
+if __name__ == "__main__":
+    asyncio.run(main())

@@ -1,0 +1,97 @@
+"""The leading RCM dies: nobody who runs is disturbed, nobody who waits loses the place."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.live.crew import Crew, Stand
+from tests.live.lab import Lab, LeaderWatch
+from zscout import clock
+from zscout.behaviors.client import Client
+from zscout.keyexpr import Role
+from zscout.scheduling.model import SECOND, Ns
+
+pytestmark = pytest.mark.live
+
+ROBOTS = [f"robot/r{number}" for number in range(5)]
+RUNNING, WAITING = 5, 10
+APART = "candidate = false"
+
+
+async def grant_of(client: Client, rc: str) -> Ns:
+    """Asks for a free RC; returns when it was granted, as the asker saw it."""
+    arc = await client.request("next", {rc: {}}, min_runtime=600)
+    while arc.state != "running":
+        await client.changed(arc)
+    granted = clock.now()
+    await client.granted(arc)
+    return granted
+
+
+def test_a_successor_carries_everything_on(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=("a", "b")) as lab:
+            lab.node("c", *ROBOTS, "robot/free", extra=APART)
+            lab.node("a")
+            client = await lab.client("asker")
+            await lab.ready(client, *ROBOTS, "robot/free")
+            lab.node("b")
+            leaders = LeaderWatch(client)
+            crew = Crew()
+            await crew.assemble(lab, ROBOTS, waiting=WAITING)
+            before = await lab.state(client, lambda state: len(state.queue) == WAITING)
+            stood = Stand(before)
+            assert before.host == "a"
+            assert len(stood.holds) == RUNNING
+            await lab.living(client, Role.CANDIDATE, lambda hosts: "b" in hosts)
+
+            killed = lab.signal("a", signal.SIGKILL)
+            ended = await leaders.lost("a")
+            granted = await grant_of(client, "robot/free")
+            print(
+                f"kill -9 of the leader -> its token ends: {(ended - killed) / SECOND * 1000:.0f} ms; "
+                f"token's end -> next grant: {(granted - ended) / SECOND * 1000:.0f} ms"
+            )
+            assert (granted - ended) / SECOND < 0.5
+            stood.went_on(await lab.state(client, lambda state: len(state.holds) > RUNNING), "next")
+            after = await crew.checked(lab, client, stood, since=clock.now())
+            assert after.host == "b"
+
+            # The queue is not only remembered but works: the first in it follows a body that ends.
+            heirs = [view.arc for view in after.queue if set(view.needs) == {ROBOTS[1]}]
+            await crew.bodies[1].finish()
+            state = await lab.state(client, lambda state: len(state.queue) == WAITING - 1)
+            assert [hold.arc for hold in state.holds if hold.arc in dict(stood.queue)] == heirs[:1]
+            await asyncio.gather(*(body.finish() for body in crew.bodies if body is not crew.bodies[1]))
+
+    asyncio.run(story())
+
+
+def test_the_only_rcm_killed_and_started_again_finds_everything(tmp_path: Path) -> None:
+    async def story() -> None:
+        # A process takes its time to start on a busy machine; holds must last that long.
+        async with Lab(tmp_path, extra="[timing]\nhold_lease = 15\n") as lab:
+            lab.node("c", *ROBOTS, extra=APART)
+            lab.node("a")
+            client = await lab.client("asker")
+            await lab.ready(client, *ROBOTS)
+            leaders = LeaderWatch(client)
+            crew = Crew()
+            await crew.assemble(lab, ROBOTS, waiting=WAITING)
+            before = await lab.state(client, lambda state: len(state.queue) == WAITING)
+            lab.signal("a", signal.SIGKILL)
+            await leaders.lost("a")
+            alone = clock.now()
+            for body in crew.bodies:
+                await body.beats_on(alone)
+            lab.nodes["a"].wait()
+            lab.node("a")
+            after = await crew.checked(lab, client, Stand(before), since=clock.now())
+            assert after.term.counter > before.term.counter
+            await asyncio.gather(*(body.finish() for body in crew.bodies))
+
+    asyncio.run(story())

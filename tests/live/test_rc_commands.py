@@ -1,0 +1,263 @@
+"""What an RC obeys, live: every refusal, failing drivers, and the end of holds that nobody ends."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, running, until
+from tests.live.lab import START, Lab
+from zscout import clock
+from zscout.behaviors.arc import Revoked, hold
+from zscout.behaviors.client import Client
+from zscout.drivers.base import COMMAND_QUEUE, MAX_TTL
+from zscout.mesh import zenoh_config
+from zscout.messages import Done, EndedHold, Problem, RcState, decode
+from zscout.scheduling.model import SECOND, Grant
+
+pytestmark = pytest.mark.live
+
+WAIT = {"name": "wait"}
+
+
+def test_every_refusal(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a")
+            client, other = await asyncio.gather(lab.client(), lab.client())
+            async with Stand(lab) as stand:
+                bench, warm = Bench(), Bench(activation=600)
+                rc = await stand.rc("robot/bench", bench)
+                await stand.rc("robot/warm", warm)
+                state = await lab.ready(client, "robot/bench", "robot/warm")
+                never = Grant(state.term, 0)
+
+                def echo(grant: Grant, **how: Any) -> Coroutine[Any, Any, Done]:
+                    return client.command("robot/bench", grant, ECHO, **how)
+
+                assert await answer(echo(never)) == "free"
+
+                arc, grant = await running(client, "one", "robot/bench")
+                assert (await echo(grant)).result == 1
+                assert await answer(echo(never)) == "not_holder"
+                assert await answer(other.command("robot/bench", grant, ECHO)) == "wrong_client"
+                assert (
+                    await answer(other.command("robot/bench", grant, {"name": "confirm"})) == "wrong_client"
+                )
+                assert await answer(echo(Grant(grant.term, grant.seq + 1000))) == "not_yet"
+                for ttl in (0, -1, MAX_TTL + 1):
+                    assert await answer(echo(grant, ttl=ttl)) == "bad_command"
+                for name in ("no such thing", 7, None):
+                    assert (
+                        await answer(client.command("robot/bench", grant, {"name": name}))
+                        == "unknown_command"
+                    )
+                assert await answer(client.command("robot/bench", grant, {"name": "crash"})) == "failed"
+                await _malformed(lab, client, grant)
+
+                # While one command takes its time, those behind it grow stale, and too many are refused.
+                slow = asyncio.create_task(client.command("robot/bench", grant, WAIT, timeout=START))
+                await bench.waiting.wait()
+                stale = asyncio.create_task(echo(grant, ttl=0.05, timeout=START))
+                many = [
+                    asyncio.create_task(echo(grant, ttl=60, timeout=START)) for _ in range(COMMAND_QUEUE - 1)
+                ]
+                await until(lambda: rc._work.qsize() == COMMAND_QUEUE)
+                assert await answer(echo(grant)) == "busy"
+                sent = clock.now()
+                await until(lambda: clock.now() - sent > 0.1 * SECOND)
+                bench.go_on.set()
+                assert (await slow).result is None
+                assert await answer(stale) == "stale"
+                assert {await answer(task) for task in many} == {"done"}
+
+                _, warming = await running(client, "warm", "robot/warm")
+                done = await client.command("robot/warm", warming, {"name": "confirm"})
+                assert 590 < done.warming <= 600
+                assert await answer(client.command("robot/warm", warming, ECHO)) == "warming"
+
+                await client.end(arc)
+                assert await answer(echo(grant)) == "ended"
+                await until(lambda: bench.calls == ["begin one", "safe"])
+                _, brief = await running(client, "brief", "robot/bench", min_runtime=0.2)
+                await until(lambda: not rc.holding.held)
+                assert await answer(echo(brief)) == "ended"
+                assert warm.calls == ["begin warm"]
+
+    asyncio.run(story())
+
+
+async def _malformed(lab: Lab, client: Client, grant: Grant) -> None:
+    key = client.mesh.keys.command("robot/bench", client.mesh.me)
+    good = f'"grant": [[{grant.term.counter}, "{grant.term.rcm}"], {grant.seq}]'
+    payloads = {
+        b"": "malformed",
+        b"not JSON": "malformed",
+        b"[]": "malformed",
+        b"{}": "malformed",
+        b'{"grant": null, "do": {}}': "malformed",
+        f'{{{good}, "do": "echo"}}'.encode(): "malformed",
+        f'{{{good}, "do": {{}}, "ttl": "1"}}'.encode(): "malformed",
+        f'{{{good}, "do": {{}}, "ttl": NaN}}'.encode(): "malformed",
+        f'{{{good}, "do": {{}}}}'.encode(): "unknown_command",
+    }
+
+    def raw() -> dict[bytes, str]:
+        codes = {}
+        with zenoh.open(zenoh_config(lab.fleet.mesh)) as session:
+            for payload in payloads:
+                got: list[zenoh.Reply] = []
+                while not got:
+                    got = list(session.get(key, payload=payload, timeout=2))
+                (reply,) = got
+                assert reply.err is not None
+                problem: Problem = decode(reply.err.payload.to_bytes(), Problem)
+                codes[payload] = problem.code
+        return codes
+
+    assert await asyncio.to_thread(raw) == payloads
+
+
+def test_what_piles_up_while_a_node_stands_still_is_refused(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, lease=5, extra="[timing]\nhold_lease = 10\n") as lab:
+            lab.node("a")
+            lab.node("c", "robot/x", extra="candidate = false")
+            client = await lab.client()
+            await lab.ready(client, "robot/x")
+            arc, grant = await running(client, "one", "robot/x")
+            lab.signal("c", signal.SIGSTOP)
+            sent = clock.now()
+            old = [
+                asyncio.create_task(client.command("robot/x", grant, ECHO, ttl=0.3, timeout=START))
+                for _ in range(5)
+            ]
+            await until(lambda: clock.now() - sent > 0.8 * SECOND)
+            assert not any(task.done() for task in old)
+            lab.signal("c", signal.SIGCONT)
+            assert [await answer(task) for task in old] == ["stale"] * 5
+            assert await answer(client.command("robot/x", grant, ECHO, ttl=5)) == "done"
+            assert arc.grant == grant
+
+    asyncio.run(story())
+
+
+def test_a_failing_device_ends_the_whole_gang_which_waits_for_it(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/a")
+            client = await lab.client()
+            async with Stand(lab) as stand:
+                bench = Bench()
+                rc = await stand.rc("robot/bench", bench)
+                await lab.ready(client, "robot/a", "robot/bench")
+                arc, grant = await running(client, "gang", "robot/a", "robot/bench")
+                place = arc.place
+
+                rc.fail("smoke comes out of it")
+                await until(lambda: arc.state == "queued")
+                assert (arc.outcome, arc.place) in (("lost", place), (None, place))
+                assert bench.calls == ["begin gang", "safe"]
+                waits = await lab.state(client, lambda state: [wait.arc for wait in state.queue] == ["gang"])
+                assert waits.queue[0].reason == "robot/bench not on the mesh"
+                assert not (await lab.rc(client, "robot/a")).holders
+                for name in ("robot/a", "robot/bench"):
+                    assert await answer(client.command(name, grant, ECHO)) == "ended"
+                # What the gang does not hold any more is there for others.
+                brief, _ = await running(client, "brief", "robot/a")
+                await client.end(brief)
+
+                bench.broken = True
+                rc.recover()
+                # It is granted, its driver can't begin, and the gang is queued again.
+                await until(lambda: bench.calls.count("begin gang") == 2 and rc.health != "ok")
+                assert "no power" in (await lab.rc(client, "robot/bench")).health
+                await lab.state(client, lambda state: not state.holds and len(state.queue) == 1)
+                bench.broken = False
+                rc.recover()
+                again = await client.granted(arc)
+                assert again is not None
+                assert again > grant
+                assert arc.place == place
+
+    asyncio.run(story())
+
+
+def test_one_of_two_holders_ends_and_the_device_serves_the_other(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a")
+            client = await lab.client()
+            async with Stand(lab) as stand:
+                bench = SharedBench(activation=0.3)
+                await stand.rc("radio/bench", bench)
+                await lab.ready(client, "radio/bench")
+                _, first = await running(client, "first", "radio/bench")
+                async with asyncio.timeout(START):
+                    while await answer(client.command("radio/bench", first, ECHO)) == "warming":
+                        pass
+                arc, second = await running(client, "second", "radio/bench")
+                # The device is warm: one more holder changes nothing for those who are at work.
+                assert await answer(client.command("radio/bench", first, ECHO)) == "done"
+                assert await answer(client.command("radio/bench", second, ECHO)) == "done"
+                await client.end(arc)
+                assert await answer(client.command("radio/bench", second, ECHO)) == "ended"
+                assert await answer(client.command("radio/bench", first, ECHO)) == "done"
+                assert bench.calls == ["begin first", "begin second"]
+
+    asyncio.run(story())
+
+
+def test_holds_end_at_rc_and_client_when_no_rcm_is_heard_for_the_hold_lease(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, extra="[timing]\nhold_lease = 1.5\n") as lab:
+            lab.node("a")
+            lab.node("c", "robot/x", "robot/y", extra="candidate = false")
+            client = await lab.client()
+            async with Stand(lab) as stand:
+                bench = Bench()
+                await stand.rc("robot/bench", bench)
+                await lab.ready(client, "robot/x", "robot/y", "robot/bench")
+                ended: dict[str, list[EndedHold]] = {}
+
+                def on_state(_key: str, state: RcState) -> None:
+                    ended.setdefault(state.rc, []).extend(state.ended)
+
+                client.mesh.subscribe(client.mesh.keys.rc_state_any, RcState, on_state)
+                kept, kept_grant = await running(client, "kept", "robot/y", min_runtime=0.1, keep=True)
+                grants: list[Grant] = []
+                with pytest.raises(Revoked) as revoked:  # noqa: PT012
+                    async with hold(
+                        client, "gang", {"robot/x": {}, "robot/bench": {}}, min_runtime=600
+                    ) as held:
+                        grants.append(held.grant)
+                        killed = lab.signal("a", signal.SIGKILL)
+                        async with asyncio.timeout(START):
+                            await asyncio.Event().wait()
+                assert revoked.value.outcome == "lost"
+                # The last word may have been half a second old when the RCM died.
+                assert 0.9 < (clock.now() - killed) / SECOND < START
+                await until(lambda: set(ended) == {"robot/x", "robot/y", "robot/bench"})
+                assert {(hold.why, hold.grant) for holds in ended.values() for hold in holds} == {
+                    ("lease", grants[0]),
+                    ("lease", kept_grant),
+                }
+                await until(lambda: bench.calls == ["begin gang", "safe"] and kept.grant is None)
+                for name, grant in (("robot/x", grants[0]), ("robot/y", kept_grant)):
+                    assert not (await lab.rc(client, name)).holders
+                    assert await answer(client.command(name, grant, ECHO)) == "ended"
+
+                # What is still wanted is granted anew as soon as somebody leads.
+                lab.nodes["a"].wait()
+                lab.node("a")
+                again = await client.granted(kept)
+                assert again is not None
+                assert again > kept_grant
+
+    asyncio.run(story())

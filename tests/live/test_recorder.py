@@ -1,0 +1,335 @@
+"""The recorder beside real nodes and clients: what its file says when it is read back."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import groupby
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from tests.live.lab import START, Lab
+from tests.services.paper_run import colours, events, lanes, rows
+from zscout.behaviors.arc import hold
+from zscout.config import Mesh, Recorder
+from zscout.keyexpr import Role
+from zscout.messages import LoadReport, RcState
+from zscout.services.blueprint import OPERATOR
+from zscout.services.recorder_files import new_recording, prune
+from zscout.services.recorder_process import Job, Recording, beside, encode_job
+from zscout.strict import BadInput
+
+pytestmark = pytest.mark.live
+
+MARK = " (operator)"
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
+def recorder(folder: str = "runs") -> str:
+    return f'[recorder]\npath = "{folder}"\nport = {free_port()}'
+
+
+async def recording(lab: Lab) -> None:
+    """Waits until a recorder misses nothing any more."""
+    there = asyncio.Event()
+    mesh = lab.clients[0].mesh
+    watch = mesh.watch(mesh.keys.alive_any(Role.RECORDER), lambda _token, _alive: there.set())
+    async with asyncio.timeout(START):
+        await there.wait()
+    watch.close()
+
+
+async def reported(lab: Lab, *hosts: str) -> None:
+    """Waits until each of these hosts has told its load."""
+    missing, done = set(hosts), asyncio.Event()
+
+    def heard(_key: str, report: LoadReport) -> None:
+        missing.discard(report.host)
+        if not missing:
+            done.set()
+
+    mesh = lab.clients[0].mesh
+    subscription = mesh.subscribe(mesh.keys.load_any, LoadReport, heard)
+    async with asyncio.timeout(START):
+        await done.wait()
+    subscription.close()
+
+
+async def until(ask: Callable[[], bool]) -> None:
+    """Waits for what no event tells of."""
+    async with asyncio.timeout(START):
+        while True:
+            if ask():
+                return
+            await asyncio.sleep(0.05)
+
+
+async def ended(lab: Lab, host: str) -> None:
+    """Ends a node in order; its recorder's file is finished then."""
+    lab.nodes[host].terminate()
+    assert await asyncio.to_thread(lab.nodes[host].wait, START) == 0
+
+
+def the_file(folder: Path) -> Path:
+    (path,) = folder.glob("*.rrd")
+    return path
+
+
+def lane(path: Path, entity: str) -> list[list[str]]:
+    """What a lane showed, one after the other."""
+    return [states for _, states in lanes(path, entity)[entity]]
+
+
+def words(path: Path, arc: str) -> list[str]:
+    """The states of an ARC, one after the other, without their details."""
+    return [state for state, _ in groupby(text.split(" · ")[0] for (text,) in lane(path, f"/arc/{arc}"))]
+
+
+def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/a", "radio/a:rate=10", extra=recorder())
+            lab.node("b", "robot/b")
+            client = await lab.client("crew")
+            await lab.ready(client, "robot/a", "radio/a", "robot/b")
+            await recording(lab)
+            both = {"robot/a": {}, "robot/b": {}, "radio/a": {"rate": 4}}
+            survey = await client.request("survey", both, min_runtime=60)
+            listen = await client.request("listen", {"radio/a": {"rate": 5}}, min_runtime=60)
+            later = await client.request("later", {"robot/b": {}}, min_runtime=0.3)
+            assert (survey.state, listen.state, later.state) == ("running", "running", "queued")
+            async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=0.5):
+                await lab.state(client, lambda state: {wait.arc for wait in state.queue} == {"survey"})
+                await asyncio.Event().wait()
+            await lab.state(client, lambda state: "survey" in {held.arc for held in state.holds})
+            await reported(lab, "a", "b")
+            await client.end(survey)
+            await client.end(listen)
+            await lab.state(client, lambda state: not state.holds and not state.queue)
+            await ended(lab, "b")
+            await lab.state(client, lambda state: "robot/b" not in {rc.rc for rc in state.rcs if rc.present})
+            await ended(lab, "a")
+
+    asyncio.run(story())
+    path = the_file(tmp_path / "runs")
+    assert lane(path, "/rc/robot/a") == [[""], ["survey"], ["operator" + MARK], ["survey"], [""]]
+    assert [held for held, _ in groupby(lane(path, "/rc/robot/b"))][:4] == [[""], ["survey"], ["later"], [""]]
+    radio = lane(path, "/rc/radio/a")
+    assert ["survey", "listen"] in radio
+    assert radio[-1] == ["", ""]
+    assert colours(path, "/rc/robot/**")["/rc/robot/a"]["operator" + MARK] == OPERATOR
+
+    assert words(path, "survey") == ["running", "preempted", "running", "done"]
+    assert words(path, "listen") == ["running", "done"]
+    assert words(path, "later") == ["waiting", "running", "done"]
+    assert words(path, "operator") == ["running", "done"]
+    waiting = next(text for (text,) in lane(path, "/arc/later") if text.startswith("waiting"))
+    assert "robot/b" in waiting
+    assert "survey" in waiting
+    assert any("operator" in text for (text,) in lane(path, "/arc/survey") if text.startswith("preempted"))
+
+    told = events(path)
+    for text in (
+        "node b is there",
+        "robot/b is offered by b",
+        "client test/crew joined",
+        "survey runs on radio/a, robot/a, robot/b",
+        "later completed: its minimum runtime is over",
+        "node b is gone",
+        "robot/b is gone from b",
+    ):
+        assert text in told
+    assert any(text.startswith("survey is preempted by operator") for text in told)
+    assert any(text in ("a leads", "b leads") for text in told)
+
+    loads = list(rows(path, "/load/**", "Scalars:scalars"))
+    assert {entity for entity, _, _ in loads} == {"/load/a", "/load/b"}
+    assert all(0 <= load <= 1000 for _, _, (load,) in loads)
+    assert all(0 <= cpu <= 1 for _, _, (cpu,) in rows(path, "/cpu/**", "Scalars:scalars"))
+
+
+def test_a_recorder_starts_in_the_middle_and_outlives_the_leader(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=["a", "b"]) as lab:
+            lab.node("a")
+            client = await lab.client("crew")
+            await lab.ready(client)
+            lab.node("b", "robot/b", "robot/c")
+            await lab.ready(client, "robot/b", "robot/c")
+            first = await client.request("twin", {"robot/b": {}}, min_runtime=60)
+            second = await client.request("twin", {"robot/c": {}}, priority=5, min_runtime=60)
+            waiter = await client.request("waiter", {"robot/b": {}}, min_runtime=60)
+            lab.node("c", extra="candidate = false\n" + recorder())
+            await recording(lab)
+            lab.nodes["a"].kill()
+            await lab.state(client, lambda state: state.host == "b" and len(state.holds) == 2)
+            await client.end(first)
+            await lab.state(client, lambda state: "waiter" in {held.arc for held in state.holds})
+            await client.end(waiter)
+            await client.end(second)
+            await lab.state(client, lambda state: not state.holds)
+            # The node is shot: its recorder finishes the file all the same, as its input closes.
+            lab.nodes["c"].kill()
+            await until(lambda: finished(the_file(tmp_path / "runs")))
+
+    asyncio.run(story())
+    path = the_file(tmp_path / "runs")
+    twins = {lane(path, f"/rc/robot/{rc}")[0][0]: rc for rc in "bc"}
+    assert set(twins) == {"twin", "twin.2"}
+    label = {rc: name for name, rc in twins.items()}
+    assert lane(path, "/rc/robot/b") == [[label["b"]], ["waiter"], [""]]
+    assert lane(path, "/rc/robot/c") == [[label["c"]], [""]]
+    assert words(path, "waiter") == ["waiting", "running", "done"]
+    told = events(path)
+    # Two hosts tell of a change of leaders, so either may be heard first.
+    led = [text for text in told if " lead" in text]
+    assert led[0] == "a leads"
+    assert sorted(led[1:]) == ["a does not lead any more", "b leads"]
+    assert not any("ended" in text for text in told)
+
+
+def finished(path: Path) -> bool:
+    """Whether the file has its footer: only then can it be opened as a store."""
+    from rerun.chunk import RrdReader
+
+    with suppress(ValueError, RuntimeError, OSError, KeyError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        RrdReader(path).store()
+        return True
+    return False
+
+
+def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=["a"]) as lab:
+            lab.node("a")
+            lab.node("b", "robot/b", extra="candidate = false\n" + recorder())
+            client = await lab.client("crew")
+            await lab.ready(client, "robot/b")
+            await recording(lab)
+            await client.request("survey", {"robot/b": {}}, min_runtime=60)
+            over = asyncio.Event()
+
+            def heard(_key: str, state: RcState) -> None:
+                if [hold.why for hold in state.ended] == ["lease"]:
+                    over.set()
+
+            subscription = client.mesh.subscribe(client.mesh.keys.rc_state("robot/b"), RcState, heard)
+            lab.nodes["a"].kill()
+            async with asyncio.timeout(START):
+                await over.wait()
+            subscription.close()
+            await ended(lab, "b")
+
+    asyncio.run(story())
+    assert lane(the_file(tmp_path / "runs"), "/rc/robot/b")[:3] == [[""], ["survey"], [""]]
+
+
+def run_recorder(lab: Lab, job: bytes) -> subprocess.Popen[bytes]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "zscout.services.recorder"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | lab.env,
+    )
+    lab.others.append(process)
+    assert process.stdin is not None
+    process.stdin.write(job)
+    process.stdin.flush()
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, None])
+def test_the_program_says_where_it_records_and_ends_in_order(
+    tmp_path: Path, number: signal.Signals | None
+) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            job = Job(Recorder(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+            process = run_recorder(lab, encode_job(job))
+            assert process.stdout is not None
+            assert process.stdin is not None
+            told = msgspec.json.decode(await asyncio.to_thread(process.stdout.readline), type=Recording)
+            assert told.url is not None
+            socket.create_connection(("127.0.0.1", int(told.url.split(":")[2].split("/")[0])), 5).close()
+            name = Path(told.file).name
+            assert name.startswith(f"{lab.fleet.name}-{time.strftime('%Y')}")
+            if number is None:
+                process.stdin.close()
+            else:
+                process.send_signal(number)
+            assert await asyncio.to_thread(process.wait, START) == 0
+            assert Path(told.file) == the_file(tmp_path / "new" / "runs")
+
+    asyncio.run(story())
+
+
+def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            with socket.create_server(("127.0.0.1", 0)) as other:
+                port = other.getsockname()[1]
+                jobs = {
+                    f"can't listen on 127.0.0.1, port {port}": encode_job(
+                        Job(Recorder(tmp_path / "runs", "127.0.0.1", port), lab.fleet, "a")
+                    ),
+                    "recordings can't be written to": encode_job(
+                        Job(Recorder(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+                    ),
+                    "no job for a recorder": b'{"recorder": 1}\n',
+                }
+                for line, job in jobs.items():
+                    process = run_recorder(lab, job)
+                    _, error = await asyncio.to_thread(process.communicate, None, START)
+                    assert process.returncode == 2
+                    assert line in error.decode()
+                    assert len(error.decode().strip().splitlines()) == 1
+        assert list((tmp_path / "runs").iterdir()) == []
+
+    asyncio.run(story())
+
+
+def test_only_the_newest_recordings_are_kept(tmp_path: Path) -> None:
+    made = [new_recording(tmp_path, "lab") for _ in range(5)]
+    assert len(set(made)) == 5
+    for age, path in enumerate(reversed(made)):
+        os.utime(path, ns=(0, 10**18 - age))
+    others = [tmp_path / "lab-2-20250101-000000.rrd", tmp_path / "lab.rrd", tmp_path / "notes.txt"]
+    for path in others:
+        path.touch()
+        os.utime(path, ns=(0, 0))
+    assert set(prune(tmp_path, "lab", keep=2)) == set(made[:3])
+    assert set(tmp_path.iterdir()) == {*made[3:], *others}
+
+
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(BadInput, match=r"file/runs \(Not a directory\); give another folder"):
+        new_recording(tmp_path / "file" / "runs", "lab")
+
+
+def test_a_recorder_joins_beside_its_node() -> None:
+    mesh = Mesh(
+        listen=("tcp/0.0.0.0:7447", "tls/[::]:7448#x=y", "tcp/10.0.0.1:0"), connect=("tcp/10.0.0.2:7447",)
+    )
+    own = beside(mesh)
+    assert own.listen == ("tcp/0.0.0.0:0", "tls/[::]:0#x=y", "tcp/10.0.0.1:0")
+    assert own.connect == ("tcp/10.0.0.2:7447", "tcp/127.0.0.1:7447", "tls/[::1]:7448#x=y")
+    assert beside(Mesh()) == Mesh()

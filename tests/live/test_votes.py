@@ -1,0 +1,146 @@
+"""Sharable RCs vote, live: capacities, rules that change, and a voter that does not answer."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.live.bench import ECHO, SharedBench, Stand, answer, running, until
+from tests.live.lab import Lab
+from zscout import clock
+from zscout.behaviors.client import Client
+from zscout.behaviors.request import OpenArc
+from zscout.messages import ProposedHolder
+from zscout.scheduling.model import SECOND
+
+pytestmark = pytest.mark.live
+
+
+class Picky(SharedBench):
+    """Carries `most` holders, and keeps what it was asked."""
+
+    most = 1
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[list[str]] = []
+
+    def vote(self, holders: list[ProposedHolder]) -> str:
+        self.asked.append(sorted(holder.arc for holder in holders))
+        return f"it carries {self.most}" if len(holders) > self.most else ""
+
+
+async def ask(client: Client, name: str, rate: str, *, priority: int = 0, runtime: float = 600) -> OpenArc:
+    needs = {"radio/rf": {"rate": rate}}
+    return await client.request(name, needs, priority=priority, min_runtime=runtime)
+
+
+def test_a_capacity_is_filled_and_never_exceeded(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a")
+            lab.node("c", "radio/rf:rate=0.3", extra="candidate = false")
+            client = await lab.client()
+            await lab.ready(client, "radio/rf")
+
+            async def holds() -> list[str]:
+                return sorted(holder.arc for holder in (await lab.rc(client, "radio/rf")).holders)
+
+            one, two = await ask(client, "one", "0.1"), await ask(client, "two", "0.2")
+            # One tenth and two tenths are three tenths, and not a bit more.
+            assert (one.state, two.state) == ("running", "running")
+            three = await ask(client, "three", "0.1")
+            assert three.state == "queued"
+            assert three.reason == (
+                "radio/rf refuses: rate 0.4 would exceed its capacity 0.3" if False else three.reason
+            )
+            assert three.reason.startswith("radio/rf refuses: ")
+            assert "rate" in three.reason
+            assert (await ask(client, "too-much", "0.31", priority=9)).state == "queued"
+            # What asks for nothing that is scarce fits beside them.
+            assert (await ask(client, "idle", "0")).state == "running"
+            assert await holds() == ["idle", "one", "two"]
+
+            # An operator takes what is needed and no more: in rank order, whoever fits beside it stays.
+            assert (await ask(client, "operator", "0.2", priority=10)).state == "running"
+            assert (one.state, two.state) == ("running", "queued")
+            assert await holds() == ["idle", "one", "operator"]
+            assert (two.outcome, two.by is not None) == ("preempted", True)
+
+            await client.end(one)
+            await until(lambda: three.state == "running")
+            assert two.state == "queued"
+            assert await holds() == ["idle", "operator", "three"]
+
+    asyncio.run(story())
+
+
+def test_answers_stand_until_the_rules_change(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/a")
+            client = await lab.client()
+            async with Stand(lab) as stand:
+                picky = Picky()
+                rc = await stand.rc("video/v", picky)
+                await lab.ready(client, "video/v", "robot/a")
+                await running(client, "one", "video/v")
+                two = await client.request("two", {"video/v": {}}, min_runtime=600)
+                assert (two.state, two.reason) == ("queued", "video/v refuses: it carries 1")
+                assert picky.asked == [["one"], ["one", "two"]]
+                # Passes run on, for others; what was answered is not asked again.
+                for _ in range(3):
+                    arc, _ = await running(client, "other", "robot/a")
+                    await client.end(arc)
+                assert picky.asked == [["one"], ["one", "two"]]
+                picky.most = 2
+                rc.rules_changed()
+                await until(lambda: two.state == "running")
+                assert picky.asked == [["one"], ["one", "two"], ["one", "two"]]
+
+    asyncio.run(story())
+
+
+def test_a_voter_that_does_not_answer_stops_nobody_else(tmp_path: Path) -> None:
+    async def story() -> None:
+        # With so long a lease nobody takes the frozen node for gone while this lasts.
+        async with Lab(tmp_path, lease=10, extra="[timing]\nhold_lease = 20\n") as lab:
+            lab.node("a", "robot/a", "robot/b")
+            lab.node("v", "radio/rf:rate=1", extra="candidate = false")
+            client = await lab.client()
+            await lab.ready(client, "robot/a", "robot/b", "radio/rf")
+            worker, grant = await running(client, "worker", "robot/a")
+            frozen = lab.signal("v", signal.SIGSTOP)
+
+            # It would take robot/a from the worker, if only the radio answered.
+            needs = {"robot/a": {}, "radio/rf": {"rate": 1}}
+            boss = await client.request("boss", needs, priority=5, min_runtime=600)
+            assert (boss.state, boss.reason) == ("queued", "radio/rf does not answer")
+            told = (clock.now() - frozen) / SECOND
+            took = []
+            for number in range(10):
+                began = clock.now()
+                arc, _ = await running(client, f"other-{number}", "robot/b")
+                took.append((clock.now() - began) / SECOND)
+                await client.end(arc)
+            print(
+                f"told that a voter is silent after {told:.2f} s; grants beside it: {max(took):.3f} s at most"
+            )
+            assert worker.grant == grant
+            assert await answer(client.command("robot/a", grant, ECHO)) == "done"
+            state = await lab.state(client, lambda state: len(state.queue) == 1)
+            assert state.queue[0].reason == "radio/rf does not answer"
+            # A lower rank may have what the boss would take: it waits for the radio, not for robot/a.
+            await client.end(worker)
+            late, late_grant = await running(client, "late", "robot/a", priority=1)
+
+            lab.signal("v", signal.SIGCONT)
+            await until(lambda: boss.state == "running")
+            assert (late.state, late.outcome) == ("queued", "preempted")
+            assert await answer(client.command("robot/a", late_grant, ECHO)) == "ended"
+            assert [h.arc for h in (await lab.rc(client, "radio/rf")).holders] == ["boss"]
+
+    asyncio.run(story())

@@ -1,0 +1,110 @@
+"""What people write on the command line, read strictly: durations, and needs with their parameters."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from decimal import Decimal
+from typing import Any, Final
+
+import click
+
+from zscout import amounts
+from zscout.keyexpr import BadName, check_name, check_rc
+from zscout.messages import MAX_NEEDS, MAX_PARAMS
+from zscout.strict import BadInput, quoted
+
+Needs = dict[str, dict[str, Decimal]]
+
+_NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
+_UNITS: Final = {
+    "": Decimal(1),
+    "s": Decimal(1),
+    "ms": Decimal("0.001"),
+    "m": Decimal(60),
+    "h": Decimal(3600),
+}
+
+
+class Duration(click.ParamType[Decimal]):
+    """A duration in seconds from `5`, `1.5`, `300ms`, `2m` or `1h`."""
+
+    name = "duration"
+
+    def __init__(self, *, zero: bool = False) -> None:
+        self._zero = zero
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Decimal:
+        if isinstance(value, Decimal):
+            return value
+        what = param.opts[0] if param is not None else "duration"
+        return parse_duration(str(value), what, zero=self._zero)
+
+
+class Need(click.ParamType[tuple[str, dict[str, Decimal]]]):
+    """An RC and how it will be used."""
+
+    name = "need"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, dict[str, Decimal]]:
+        return value if isinstance(value, tuple) else parse_need(str(value))
+
+
+def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
+    """Seconds from `5`, `1.5`, `300ms`, `2m` or `1h`. Raises BadInput."""
+    remedy = "write a number of seconds, or with a unit: 1.5, 300ms, 2m, 1h"
+    number = text.rstrip("hms")
+    unit = text[len(number) :]
+    if _NUMBER.fullmatch(number) is None or unit not in _UNITS:
+        raise BadInput(f"{what}: {quoted(text)} is not a duration; {remedy}")
+    seconds = Decimal(number) * _UNITS[unit]
+    if zero and seconds == 0:
+        return seconds
+    try:
+        amounts.duration(seconds, what)
+    except ValueError as error:
+        raise BadInput(f"{error}; {remedy}") from None
+    return seconds
+
+
+def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
+    """`robot/scout33`, or with bandwidth parameters `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
+    rc, colon, rest = text.partition(":")
+    try:
+        check_rc(rc)
+    except BadName as error:
+        raise BadInput(f"need {quoted(text)}: {error}") from None
+    params: dict[str, Decimal] = {}
+    for part in rest.split(",") if colon else []:
+        name, _, number = part.partition("=")
+        remedy = f"write parameter=number, as in {rc}:command_rate=5"
+        try:
+            check_name(name, "parameter")
+        except BadName as error:
+            raise BadInput(f"need {quoted(text)}: {error}; {remedy}") from None
+        if name in params:
+            raise BadInput(f"need {quoted(text)}: {name} is given twice; give it once")
+        if _NUMBER.fullmatch(number) is None:
+            raise BadInput(f"need {quoted(text)}: {name} is {quoted(number)}; {remedy}")
+        params[name] = Decimal(number)
+    if len(params) > MAX_PARAMS:
+        raise BadInput(f"need {quoted(text)}: {len(params)} parameters; at most {MAX_PARAMS} are allowed")
+    try:
+        amounts.exact_amounts(params)
+    except ValueError as error:
+        raise BadInput(f"need {quoted(text)}: {error}") from None
+    return rc, params
+
+
+def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
+    """The needs of one ARC. Raises BadInput where there are too many, or one RC is named twice."""
+    needs: Needs = {}
+    for rc, params in pairs:
+        if rc in needs:
+            raise BadInput(f"{rc} is named twice; name each RC once, all its parameters after one colon")
+        needs[rc] = params
+    if len(needs) > MAX_NEEDS:
+        raise BadInput(f"{len(needs)} RCs; at most {MAX_NEEDS} are allowed in one request")
+    return needs

@@ -1,0 +1,282 @@
+"""What the subcommands share: running, joining the mesh, output for people and programs.
+
+Zenoh and Rich are imported by the functions that need them: most of a short command's time is imports.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from contextlib import asynccontextmanager
+from decimal import Decimal
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, Final, TypeVar
+
+import click
+import msgspec
+
+from zscout.config import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
+from zscout.keyexpr import Role, Token, new_instance
+from zscout.messages import RcmState
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from zscout.behaviors.client import Client
+
+LOOK_FOR_RCM: Final = 2.0
+"""Seconds in which a mesh that has an RCM shows it."""
+LOOK_FOR_TAKEOVER: Final = 5.0
+"""The same where a candidate is seen: it may be about to take the lead."""
+STATE_TRIES: Final = 3
+
+T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
+
+_UNITS: Final = {
+    "": Decimal(1),
+    "s": Decimal(1),
+    "ms": Decimal("0.001"),
+    "m": Decimal(60),
+    "h": Decimal(3600),
+}
+
+
+class Failed(Exception):
+    """A command could not do what was asked: one line, with the remedy, and the exit code."""
+
+    exit_code = 1
+
+    def __init__(self, line: str, exit_code: int | None = None) -> None:
+        super().__init__(line)
+        if exit_code is not None:
+            self.exit_code = exit_code
+
+
+class NobodyThere(Failed):
+    """No RCM is on the mesh."""
+
+    exit_code = 3
+
+
+class Interrupted(Exception):
+    """Ended by a signal, after everything was cleared up."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.exit_code = 128 + number
+
+
+# Running
+
+
+def run(main: Coroutine[Any, Any, T]) -> T:
+    """Runs a command's coroutine. SIGINT, SIGTERM and SIGHUP cancel it, so that it clears up; a second one
+    cancels the clearing up. Raises Interrupted then."""
+    got: list[int] = []
+
+    async def guarded() -> T:
+        loop = asyncio.get_running_loop()
+        task = asyncio.ensure_future(main)
+
+        def stop(number: int) -> None:
+            got.append(number)
+            task.cancel()
+
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # What a shell or nohup made this process ignore stays ignored.
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                loop.add_signal_handler(number, stop, number)
+        return await task
+
+    try:
+        return asyncio.run(guarded())
+    except asyncio.CancelledError:
+        if not got:
+            raise
+        raise Interrupted(got[0]) from None
+
+
+# Joining the mesh
+
+
+def fleet_file() -> Path | None:
+    """The fleet file: `--fleet`, else $ZSCOUT_FLEET; None: the default fleet."""
+    context = click.get_current_context(silent=True)
+    given = context.find_root().obj if context is not None else None
+    if isinstance(given, Path):
+        return given
+    named = os.environ.get(FLEET_VARIABLE)
+    return Path(named) if named else None
+
+
+def the_fleet() -> Fleet:
+    """The fleet that this call of zscout is about. Raises BadInput."""
+    context = click.get_current_context(silent=True)
+    given = context.find_root().obj if context is not None else None
+    return load_fleet(given) if isinstance(given, Path) else fleet_from_env()
+
+
+@asynccontextmanager
+async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = True) -> AsyncIterator[Client]:
+    """A client named `<role>-<random>` on the mesh of `fleet` (default: `the_fleet()`), closed at the end.
+
+    Raises MeshError, BadInput, and with `need_rcm` NobodyThere where no RCM is seen in time."""
+    from zscout.behaviors.client import Client
+
+    async with await Client.connect(f"{role}-{new_instance()}", fleet=fleet or the_fleet()) as client:
+        if need_rcm:
+            await see_rcm(client)
+        yield client
+
+
+async def see_rcm(client: Client) -> None:
+    """Returns as soon as an RCM is seen. Raises NobodyThere."""
+    mesh, seen = client.mesh, asyncio.Event()
+    candidates: set[Token] = set()
+
+    def on_rcm(_: Token, alive: bool) -> None:
+        if alive:
+            seen.set()
+
+    def on_candidate(token: Token, alive: bool) -> None:
+        (candidates.add if alive else candidates.discard)(token)
+
+    watches = [
+        mesh.watch(mesh.keys.alive_any(Role.RCM), on_rcm),
+        mesh.watch(mesh.keys.alive_any(Role.CANDIDATE), on_candidate),
+    ]
+    try:
+        if await _within(LOOK_FOR_RCM, seen):
+            return
+        if candidates and await _within(LOOK_FOR_TAKEOVER - LOOK_FOR_RCM, seen):
+            return
+    finally:
+        for watch in watches:
+            watch.close()
+    fleet, links = client.fleet.name, mesh.links()
+    if candidates:
+        names = ", ".join(sorted(token.host for token in candidates)[:5])
+        raise NobodyThere(
+            f"no RCM is on the mesh of fleet {fleet}, though {names} could lead; see the log of zscout-node"
+        )
+    who = f"{links} links to other programs" if links else "no other program either"
+    raise NobodyThere(
+        f"no RCM is on the mesh of fleet {fleet} ({who}); start zscout-node on a host, or check the fleet's "
+        "name, `interface` and `connect` in its file (--fleet)"
+    )
+
+
+async def state_of(client: Client, arc: str | None = None) -> RcmState:
+    """The RCM's state, with the story of `arc`. Raises NobodyThere where no RCM answers."""
+    for _ in range(STATE_TRIES):
+        state = await client.state(arc)
+        if state is not None:
+            return state
+    raise NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again, or see its log")
+
+
+async def _within(seconds: float, event: asyncio.Event) -> bool:
+    try:
+        async with asyncio.timeout(seconds):
+            await event.wait()
+    except TimeoutError:
+        return False
+    return True
+
+
+# Output
+
+_JSON: Final = msgspec.json.Encoder(decimal_format="number")
+
+
+def print_json(value: Any, stream: IO[str] | None = None) -> None:
+    """One JSON value (structs and Decimals included) on one line, at once."""
+    print_line(_JSON.encode(value).decode(), stream)
+
+
+def print_line(text: str, stream: IO[str] | None = None) -> None:
+    """One plain line, at once, so that a reader of the pipe sees it."""
+    stream = stream or sys.stdout
+    stream.write(text + "\n")
+    stream.flush()
+
+
+def at_terminal(stream: IO[str] | None = None) -> bool:
+    """Whether people look at the stream (default stdout) and it can be drawn on."""
+    return (stream or sys.stdout).isatty() and os.environ.get("TERM") != "dumb"
+
+
+def console(*, stderr: bool = False) -> Console:
+    """A Rich console without guesses: no markup, no highlighting; texts come from other hosts."""
+    from rich.console import Console
+
+    return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+
+
+def print_table(
+    columns: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", stream: IO[str] | None = None
+) -> None:
+    """A table: coloured at a terminal, aligned plain lines elsewhere. Cells are made safe to print."""
+    stream = stream or sys.stdout
+    cells = [[clean(cell) for cell in row] for row in rows]
+    if not at_terminal(stream):
+        for line in plain_table(columns, cells, title):
+            print_line(line, stream)
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title=title or None, title_justify="left", box=None, header_style="bold", padding=(0, 2, 0, 0)
+    )
+    for column in columns:
+        table.add_column(column)
+    for row in cells:
+        table.add_row(*(Text(cell) for cell in row))
+    console(stderr=stream is sys.stderr).print(table)
+
+
+def plain_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> list[str]:
+    """The lines of a table without colours: two spaces between columns."""
+    widths = [max(len(line[at]) for line in (columns, *rows)) for at in range(len(columns))]
+    lines = [title] if title else []
+    for row in (columns, *rows):
+        padded = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        lines += ["  ".join(padded).rstrip()]
+    return lines
+
+
+def clean(text: str) -> str:
+    """Words from another host, on one line, unable to draw on the terminal."""
+    return "".join(char if char.isprintable() else " " for char in text)
+
+
+def span(seconds: float) -> str:
+    """A span of time as people read it: `0.4 s`, `12 s`, `3 min 5 s`, `2 h 4 min`, `3 d 2 h`."""
+    seconds = max(0.0, seconds)
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    for big, small, big_unit, small_unit in (
+        (86_400, 3600, "d", "h"),
+        (3600, 60, "h", "min"),
+        (60, 1, "min", "s"),
+    ):
+        if whole >= big:
+            rest = whole % big // small
+            return f"{whole // big} {big_unit}" + (f" {rest} {small_unit}" if rest else "")
+    return f"{whole} s"
+
+
+def json_option(help: str = "Print JSON.") -> Callable[[F], F]:  # noqa: A002 - click's word
+    """The `--json` option; the parameter is `as_json`."""
+    return click.option("--json", "as_json", is_flag=True, help=help)
+
+
+def amount_text(params: Mapping[str, Decimal]) -> str:
+    """Bandwidth parameters as people write them: `command_rate=5,other=1`."""
+    return ",".join(f"{name}={value.normalize():f}" for name, value in sorted(params.items()))

@@ -1,0 +1,44 @@
+"""Becomes the command of `zscout request`: run as a program, in a process group of its own already.
+
+    python -I -S launch.py PARENT TTY COMMAND [ARG]...
+
+Asks the kernel to end it when its parent (PARENT, a pid) dies, so that no command outlives its grant; takes
+the terminal (TTY, an open descriptor, or -1); then executes COMMAND. It imports nothing of zscout.
+"""
+
+import contextlib
+import ctypes
+import os
+import signal
+import sys
+
+PR_SET_PDEATHSIG = 1
+NOT_EXECUTABLE, NOT_FOUND = 126, 127
+
+
+def main() -> None:
+    # What Python changed at its start must not be inherited.
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent, tty, command = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != parent:
+        sys.exit(128 + signal.SIGTERM)
+    if tty >= 0:
+        # Its group is still a background one: it would be stopped for touching the terminal.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTOU})
+        with contextlib.suppress(OSError):
+            os.tcsetpgrp(tty, os.getpgrp())
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTTOU})
+        os.close(tty)
+    try:
+        os.execvp(command[0], command)  # noqa: S606 - this is what it is for
+    except OSError as error:
+        sys.stderr.write(f"zscout: {command[0]} can't be run: {error.strerror}; check the path\n")
+        sys.exit(NOT_FOUND if isinstance(error, FileNotFoundError) else NOT_EXECUTABLE)
+
+
+if __name__ == "__main__":
+    main()

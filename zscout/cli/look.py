@@ -1,0 +1,118 @@
+"""What a subcommand sees of its fleet: who is alive, how loaded the hosts are, what the RCM knows."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from zscout import clock
+from zscout.keyexpr import Role, Sender, Token
+from zscout.messages import LoadReport, RcmState
+from zscout.scheduling.model import SECOND, Ns
+
+if TYPE_CHECKING:
+    from zscout.behaviors.client import Client
+    from zscout.mesh import Declared
+
+FIND_RCM: Final = 2.0
+"""Seconds to look for an RCM."""
+FIND_LOADS: Final = 1.2
+"""Seconds to wait for load reports: they come once a second."""
+STALE: Final = 3 * SECOND
+"""Age in ns past which a load report says little."""
+GONE: Final = 60 * SECOND
+"""How long, in ns, a host that went away is remembered."""
+
+
+@dataclass(slots=True)
+class Host:
+    """A host as the mesh shows it. `load` is None until a report came, `reported` when the last one did."""
+
+    tokens: set[Token] = field(default_factory=set)
+    load: LoadReport | None = None
+    reported: Ns = 0
+    gone: Ns | None = None
+    """When its last token went."""
+
+    def has(self, role: str) -> bool:
+        return any(token.role == role for token in self.tokens)
+
+
+class Look:
+    """What a client sees of its fleet from now on: who is alive, loads, and the RCM's state when asked."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self.hosts: dict[str, Host] = {}
+        self.changed = asyncio.Event()
+        self._settled = False
+        keys, mesh = client.mesh.keys, client.mesh
+        self._declared: list[Declared] = [
+            mesh.watch(keys.alive_any(), self._on_token),
+            mesh.subscribe(keys.load_any, LoadReport, self._on_load),
+        ]
+
+    def close(self) -> None:
+        for declared in self._declared:
+            declared.close()
+
+    def _on_token(self, token: Token, alive: bool) -> None:
+        if Sender(token.host, token.name) == self.client.mesh.me:
+            return
+        host = self.hosts.setdefault(token.host, Host())
+        (host.tokens.add if alive else host.tokens.discard)(token)
+        host.gone = None if host.tokens else clock.now()
+        self.changed.set()
+
+    def _on_load(self, key: str, load: LoadReport) -> None:
+        host = self.hosts.get(self.client.mesh.keys.host_of(key))
+        if host is not None:
+            host.load, host.reported = load, clock.now()
+            self.changed.set()
+
+    def forget_the_gone(self) -> None:
+        now = clock.now()
+        self.hosts = {
+            name: host for name, host in self.hosts.items() if host.gone is None or now - host.gone < GONE
+        }
+
+    def tokens(self, role: str) -> list[Token]:
+        return sorted(token for host in self.hosts.values() for token in host.tokens if token.role == role)
+
+    def stale(self, host: Host) -> bool:
+        """Whether a host that should report its load has not done so lately."""
+        if not host.has(Role.LOAD) or (host.load is None and not self._settled):
+            return False
+        return host.load is None or clock.now() - host.reported > STALE
+
+    async def until(self, true: Callable[[], bool], seconds: float) -> bool:
+        """Waits until `true()`, at most so long; tells which."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while not true():
+                    self.changed.clear()
+                    await self.changed.wait()
+        return true()
+
+    async def settled(self, *, loads: bool = True) -> RcmState | None:
+        """The RCM's state, once its RCs are seen, and hosts with their `loads`; None: no RCM."""
+        if not await self.until(lambda: bool(self.tokens(Role.RCM)), FIND_RCM):
+            return None
+        state = await self.client.state()
+        if state is None:
+            return None
+        rcs = {view.rc for view in state.rcs if view.present}
+        clients = {hold.client for hold in state.holds}
+
+        def complete() -> bool:
+            silent = any(host.load is None for host in self.hosts.values() if host.has(Role.LOAD))
+            seen = rcs <= {token.name for token in self.tokens(Role.RC)}
+            seen &= clients <= {f"{token.host}/{token.name}" for token in self.tokens(Role.CLIENT)}
+            return seen and not (loads and silent)
+
+        await self.until(complete, FIND_LOADS)
+        self._settled = loads
+        return (await self.client.state() if loads else None) or state

@@ -1,0 +1,174 @@
+"""The `zscout` command: one group whose subcommands are imported when they are used.
+
+The table below is all that `zscout --help` and completion need, so that neither loads Zenoh, Rich or Rerun.
+Every error ends here as one line on stderr and an exit code:
+
+0 done, 1 could not (refused, lost), 2 bad input, 3 no RCM on the mesh, 128 + n by signal n (130: Ctrl-C).
+`zscout request -- COMMAND` has codes of its own; see its help.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from click.shell_completion import CompletionItem
+
+from zscout import __version__
+
+COMMANDS: Final[dict[str, tuple[str, str]]] = {
+    "request": ("zscout.cli.request", "Wait for devices; hold them, or run a command that needs them."),
+    "take": ("zscout.cli.take", "Take devices at an operator's priority, preempting who holds them."),
+    "release": ("zscout.cli.give_back", "End the hold of a running ARC."),
+    "cancel": ("zscout.cli.give_back", "End an ARC, running or waiting."),
+    "status": ("zscout.cli.status", "Show devices, holders, the queue and the hosts."),
+    "why": ("zscout.cli.why", "Tell the story of an ARC: what it waits for, and who is in its way."),
+    "keys": ("zscout.cli.keys", "List what is alive on the mesh, and the keys it serves."),
+    "view": ("zscout.cli.view", "Watch the fleet live on a timeline, or open a recording."),
+    "replay": ("zscout.cli.replay", "Schedule a workload file under virtual time."),
+    "demo": ("zscout.cli.demo", "Run the paper's experiment on a live mesh on this machine."),
+    "completion": ("zscout.cli.completion", "Print the completion script for bash, zsh or fish."),
+}
+"""Name: where the click command of that name lives, and its line in the help."""
+
+OK, COULD_NOT, BAD_INPUT, NOBODY, INTERRUPTED = 0, 1, 2, 3, 130
+
+
+class LazyGroup(click.Group):
+    """The commands of `COMMANDS`. An int that a command returns is the exit code."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = getattr(import_module(COMMANDS[cmd_name][0]), cmd_name)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-"):
+            near = difflib.get_close_matches(name[:40], COMMANDS, n=3)
+            hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(COMMANDS)}"
+            raise click.UsageError(f"there is no command {name[:40]!r}; {hint}", ctx)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        names = [name for name in COMMANDS if name.startswith(incomplete)]
+        found = [CompletionItem(name, help=COMMANDS[name][1]) for name in names]
+        return found + click.Command.shell_complete(self, ctx, incomplete)
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        **extra: Any,
+    ) -> Any:
+        try:
+            code = super().main(args, "zscout", complete_var, standalone_mode=False, **extra)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            code = _pipe_closed()
+        except (Exception, KeyboardInterrupt) as error:
+            known = explain(error)
+            if known is None:
+                raise
+            code, line = known
+            if line:
+                click.echo(line, err=True)
+        if not standalone_mode:
+            return code
+        sys.exit(code if isinstance(code, int) else OK)
+
+
+def explain(error: BaseException) -> tuple[int, str] | None:
+    """The exit code and the line for an error that people can mend; None: a bug, to be shown in full."""
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        return BAD_INPUT, error.format_message()
+    if isinstance(error, click.UsageError):
+        path = error.ctx.command_path if error.ctx is not None else "zscout"
+        return BAD_INPUT, f"{path}: {_line(error.format_message()).removesuffix('.')} (see {path} --help)"
+    if isinstance(error, click.ClickException):
+        return error.exit_code, f"zscout: {_line(error.format_message())}"
+    if isinstance(error, (click.Abort, KeyboardInterrupt)):
+        return INTERRUPTED, ""
+    # Only a failing command pays for these imports, and most have made them already.
+    from zscout.cli.common import Failed, Interrupted
+    from zscout.keyexpr import BadName
+    from zscout.strict import BadInput
+
+    if isinstance(error, Interrupted):
+        return error.exit_code, ""
+    if isinstance(error, Failed):
+        return error.exit_code, f"zscout: {_line(str(error))}"
+    if isinstance(error, (BadInput, BadName)):
+        return BAD_INPUT, f"zscout: {_line(str(error))}"
+    from zscout.behaviors.client import CommandRefused, RequestRefused
+    from zscout.mesh import MeshError
+
+    if isinstance(error, (RequestRefused, CommandRefused, MeshError)):
+        return COULD_NOT, f"zscout: {_line(str(error))}"
+    return None
+
+
+def _line(text: str) -> str:
+    """One line that can't draw on the terminal: parts of it come from other hosts."""
+    return "".join(char if char.isprintable() else " " for char in " ".join(text.split()))
+
+
+def _pipe_closed() -> int:
+    # Python flushes stdout once more at exit, and would complain.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return COULD_NOT
+
+
+@click.group(
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.option(
+    "--fleet",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="The fleet file. Default: the one that $ZSCOUT_FLEET names, else a fleet named zscout.",
+)
+@click.option("-v", "--verbose", is_flag=True, help="Log to stderr what the mesh client does.")
+@click.version_option(__version__, "--version", message="%(prog)s %(version)s")
+@click.pass_context
+def main(ctx: click.Context, fleet: Path | None, verbose: bool) -> None:
+    """All the devices a program asked for, or none, over a Zenoh mesh.
+
+    \b
+    Examples:
+      zscout request robot/scout33 radio/rf0:command_rate=5 -- ./survey.py
+      zscout take robot/scout33
+      zscout status --watch
+      zscout why survey
+    """
+    import logging
+
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.ERROR,
+        format="%(asctime)s %(levelname)s %(message)s",
+        stream=sys.stderr,
+    )
+    ctx.obj = fleet
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""The fleet as `zscout status` shows it to people: coloured tables at a terminal, plain lines in a pipe."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from zscout import clock
+from zscout.cli import common
+from zscout.cli.look import Host, Look
+from zscout.keyexpr import Role
+from zscout.messages import HoldView, RcmState
+from zscout.scheduling.model import SECOND
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.text import Text
+
+MAX_ROWS: Final = 500
+"""Of one table at a terminal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of texts; `styles` has Rich's style for each row."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    styles: Sequence[str]
+
+
+def _headline(look: Look, state: RcmState | None) -> str:
+    fleet, links = look.client.fleet.name, look.client.mesh.links()
+    if state is None:
+        return f"Fleet {fleet}: nobody leads; nothing is granted until a node does ({_many(links, 'link')})"
+    return f"Fleet {fleet}: {state.host} leads, term {state.term.counter} ({_many(links, 'link')})"
+
+
+def _tables(look: Look, state: RcmState | None) -> Iterator[Table]:
+    if state is not None:
+        yield _rc_table(look, state)
+        yield _running_table(look, state)
+        yield _waiting_table(state)
+    yield _host_table(look)
+
+
+def _rc_table(look: Look, state: RcmState) -> Table:
+    homes = {token.name: token.host for token in look.tokens(Role.RC)}
+    rows, styles = [], []
+    for view in state.rcs:
+        holders = [hold for hold in state.holds if view.rc in hold.needs]
+        words = "absent" if not view.present else "held" if holders else "free"
+        kind = "shared" if view.sharable else "exclusive"
+        names = ", ".join(_with_params(hold, view.rc) for hold in holders)
+        rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
+        styles.append({"absent": "red", "held": "yellow", "free": "green"}[words])
+    return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles)
+
+
+def _with_params(hold: HoldView, rc: str) -> str:
+    amounts = common.amount_text(hold.needs[rc])
+    return f"{hold.arc} ({amounts})" if amounts else hold.arc
+
+
+def _running_table(look: Look, state: RcmState) -> Table:
+    rows, styles = [], []
+    for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
+        left = common.span(hold.remaining) if hold.remaining > 0 else "over"
+        rows.append(
+            (
+                hold.arc,
+                str(hold.priority),
+                common.span(hold.held),
+                f"{left}, keeps" if hold.keep else left,
+                hold.client,
+                " ".join(sorted(hold.needs)),
+            )
+        )
+        styles.append("bold red" if hold.priority >= look.client.fleet.operator_priority else "")
+    return Table("Running", ("ARC", "PRIORITY", "SINCE", "LEFT", "CLIENT", "RCS"), rows, styles)
+
+
+def _waiting_table(state: RcmState) -> Table:
+    rows = [
+        (
+            str(number),
+            wait.arc,
+            str(wait.priority),
+            common.span(wait.waited),
+            common.span(float(wait.min_runtime)),
+            str(wait.preemptions),
+            wait.client,
+            wait.reason,
+        )
+        for number, wait in enumerate(state.queue, 1)
+    ]
+    title = f"Waiting, and {state.more} more" if state.more else "Waiting"
+    columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "PREEMPTED", "CLIENT", "WHY")
+    return Table(title, columns, rows, [""] * len(rows))
+
+
+def _host_table(look: Look) -> Table:
+    rows, styles = [], []
+    for name, host in sorted(look.hosts.items()):
+        words, style = _condition(look, host)
+        load, cpu, memory = "-", "-", "-"
+        if host.load is not None:
+            load = f"{host.load.load_average[0]:.2f} of {host.load.cores}"
+            cpu = f"{host.load.cpu:.0f} %"
+            memory = f"{host.load.memory_available / 2**30:.1f} of {host.load.memory_total / 2**30:.1f} GiB"
+        rows.append((name, words, load, cpu, memory, _doing(host)))
+        styles.append(style)
+    return Table("Hosts", ("HOST", "STATE", "LOAD", "CPU", "MEMORY FREE", "RUNS"), rows, styles)
+
+
+def _condition(look: Look, host: Host) -> tuple[str, str]:
+    if host.gone is not None:
+        return f"gone for {common.span((clock.now() - host.gone) / SECOND)}", "red"
+    if look.stale(host):
+        return "no load report", "yellow"
+    return ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
+
+
+def _doing(host: Host) -> str:
+    counts = {role: sum(1 for token in host.tokens if token.role == role) for role in (Role.RC, Role.CLIENT)}
+    parts = ["node"] if host.has(Role.NODE) else []
+    parts += ["recorder"] if host.has(Role.RECORDER) else []
+    parts += [_many(counts[Role.RC], "RC")] if counts[Role.RC] else []
+    parts += [_many(counts[Role.CLIENT], "client")] if counts[Role.CLIENT] else []
+    return ", ".join(parts)
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def print_picture(look: Look, state: RcmState | None) -> None:
+    if common.at_terminal():
+        common.console().print(rich_picture(look, state))
+        return
+    common.print_line(_headline(look, state))
+    for table in _tables(look, state):
+        rows = [[common.clean(cell) for cell in row] for row in table.rows]
+        if rows:
+            common.print_line("")
+            for line in common.plain_table(table.columns, rows, table.title):
+                common.print_line(line)
+
+
+def rich_picture(look: Look, state: RcmState | None, *after: Text) -> Group:
+    """The picture for a terminal."""
+    from rich import table as rich_table
+    from rich.console import Group
+    from rich.text import Text
+
+    parts: list[Any] = [Text(_headline(look, state), style="bold" if state is not None else "bold red")]
+    for table in _tables(look, state):
+        if not table.rows:
+            continue
+        shown = rich_table.Table(
+            title=table.title, title_justify="left", title_style="bold cyan", box=None, padding=(0, 2, 0, 0)
+        )
+        for column in table.columns:
+            shown.add_column(column, header_style="dim")
+        for row, style in zip(table.rows[:MAX_ROWS], table.styles, strict=False):
+            shown.add_row(*(Text(common.clean(cell)) for cell in row), style=style)
+        parts += [Text(""), shown]
+        if len(table.rows) > MAX_ROWS:
+            parts.append(Text(f"... {len(table.rows) - MAX_ROWS} more rows: --json has all", style="dim"))
+    return Group(*parts, *after)

@@ -1,0 +1,215 @@
+"""`zscout status`: who holds what, who waits and why, how the hosts are, who leads."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack, contextmanager, suppress
+from typing import Any, Final
+
+import click
+from msgspec import structs
+
+from zscout import clock
+from zscout.cli import common
+from zscout.cli.look import Host, Look
+from zscout.cli.picture import print_picture, rich_picture
+from zscout.keyexpr import Role
+from zscout.messages import Notice, RcmState
+from zscout.scheduling.model import SECOND, Ns
+
+EVERY: Final = 1.0
+"""Seconds between two pictures."""
+HASTE: Final = 0.1
+"""The same where something has changed."""
+PASSING: Final = frozenset({"held", "remaining", "waited", "seq", "links", "load", "age", "gone"})
+"""Fields that change without anything having happened."""
+
+
+@click.command()
+@click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
+@common.json_option("Print one JSON object; with --watch, one on each line.")
+def status(watch: bool, as_json: bool) -> int:
+    """Shows the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
+
+    The queue stands in rank order, each ARC with what it waits for. --watch refreshes once a second; in a
+    pipe it prints a new block when something else than a load or a time has changed. Exit code 3: no RCM.
+
+    \b
+    Examples:
+      zscout status
+      zscout status --json | jq -r '.queue[] | .arc + ": " + .reason'
+      zscout status --watch
+    """
+    if watch:
+        return common.run(_watch(as_json))
+    return common.run(_once(as_json))
+
+
+async def _once(as_json: bool) -> int:
+    async with common.connected("status", need_rcm=False) as client:
+        look = Look(client)
+        state = await look.settled()
+        if as_json:
+            common.print_json(as_object(look, state))
+        else:
+            print_picture(look, state)
+        if state is None:
+            # The words are the same as those of every other command.
+            await common.see_rcm(client)
+            raise common.NobodyThere("the RCM did not answer; try again, or see its log")
+    return 0
+
+
+async def _watch(as_json: bool) -> int:
+    news, stop = asyncio.Event(), asyncio.Event()
+
+    def end() -> None:
+        stop.set()
+        news.set()
+
+    async with AsyncExitStack() as stack:
+        client = await stack.enter_async_context(common.connected("status", need_rcm=False))
+        look = Look(client)
+        stack.callback(look.close)
+        # Whatever becomes of an ARC is told to its client.
+        heard = client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
+        stack.callback(heard.close)
+        if as_json:
+            show = _json_lines(look)
+        elif common.at_terminal():
+            stack.enter_context(_q_ends(end))
+            show = _in_place(stack, look)
+        else:
+            show = _blocks(look)
+        state = await look.settled()
+        while not stop.is_set():
+            look.forget_the_gone()
+            show(state)
+            await _within(EVERY, news)
+            await _within(HASTE, stop)
+            news.clear()
+            state = await client.state()
+    return 0
+
+
+async def _within(seconds: float, event: asyncio.Event) -> None:
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await event.wait()
+
+
+Show = Callable[[RcmState | None], None]
+
+
+def _json_lines(look: Look) -> Show:
+    return lambda state: common.print_json(as_object(look, state))
+
+
+def _blocks(look: Look) -> Show:
+    """Prints a block where something has changed that is not a load or a span of time."""
+    last: list[Any] = [None]
+
+    def show(state: RcmState | None) -> None:
+        lasting = _lasting(as_object(look, state))
+        if lasting != last[0]:
+            if last[0] is not None:
+                common.print_line("")
+            last[0] = lasting
+            print_picture(look, state)
+
+    return show
+
+
+def _lasting(value: Any) -> Any:
+    """A JSON value without what changes all the time."""
+    if isinstance(value, dict):
+        return {key: _lasting(item) for key, item in value.items() if key not in PASSING}
+    return [_lasting(item) for item in value] if isinstance(value, list) else value
+
+
+def _in_place(stack: AsyncExitStack, look: Look) -> Show:
+    from rich.live import Live
+    from rich.text import Text
+
+    live = stack.enter_context(Live(console=common.console(), auto_refresh=False))
+
+    def show(state: RcmState | None) -> None:
+        live.update(rich_picture(look, state, Text("q or Ctrl-C ends", style="dim")), refresh=True)
+
+    return show
+
+
+@contextmanager
+def _q_ends(end: Callable[[], None]) -> Iterator[None]:
+    """Calls `end` when q is pressed, for as long as the context lasts."""
+    if not sys.stdin.isatty():
+        yield
+        return
+    import termios
+    import tty
+
+    loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+
+    def pressed() -> None:
+        typed = os.read(terminal, 1024)
+        if not typed or b"q" in typed.lower():
+            end()
+
+    tty.setcbreak(terminal)
+    loop.add_reader(terminal, pressed)
+    try:
+        yield
+    finally:
+        loop.remove_reader(terminal)
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+# What is shown
+
+
+def as_object(look: Look, state: RcmState | None) -> dict[str, Any]:
+    """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
+    now = clock.now()
+    homes = {token.name: token.host for token in look.tokens(Role.RC)}
+    rcs: list[dict[str, Any]] = []
+    for view in state.rcs if state is not None else []:
+        holders = [hold for hold in state.holds if view.rc in hold.needs] if state is not None else []
+        rcs.append(
+            {
+                "rc": view.rc,
+                "present": view.present,
+                "sharable": view.sharable,
+                "host": homes.get(view.rc),
+                "holders": [{"arc": hold.arc, "id": hold.id, "client": hold.client} for hold in holders],
+            }
+        )
+    return {
+        "fleet": look.client.fleet.name,
+        "links": look.client.mesh.links(),
+        "rcm": None if state is None else {"host": state.host, "term": state.term, "seq": state.seq},
+        "rcs": rcs,
+        "holds": [structs.asdict(hold) for hold in state.holds] if state is not None else [],
+        "queue": [structs.asdict(wait) for wait in state.queue] if state is not None else [],
+        "more": state.more if state is not None else 0,
+        "hosts": [_host_object(look, name, host, now) for name, host in sorted(look.hosts.items())],
+    }
+
+
+def _host_object(look: Look, name: str, host: Host, now: Ns) -> dict[str, Any]:
+    return {
+        "host": name,
+        "leads": host.has(Role.RCM),
+        "node": host.has(Role.NODE),
+        "candidate": host.has(Role.CANDIDATE),
+        "rcs": sorted(token.name for token in host.tokens if token.role == Role.RC),
+        "clients": sorted({token.name for token in host.tokens if token.role == Role.CLIENT}),
+        "alive": host.gone is None,
+        "gone": None if host.gone is None else (now - host.gone) / SECOND,
+        "stale": look.stale(host),
+        "load": None if host.load is None else structs.asdict(host.load),
+        "age": None if host.load is None else (now - host.reported) / SECOND,
+    }

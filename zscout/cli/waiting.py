@@ -1,0 +1,212 @@
+"""How a request goes, told while it goes: a live line at a terminal, plain lines in a pipe, or JSON lines."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Self
+
+from zscout import clock
+from zscout.behaviors.client import Client
+from zscout.behaviors.request import OpenArc
+from zscout.cli.common import at_terminal, clean, console, print_json, print_line, span
+from zscout.messages import HoldView, RcmState
+from zscout.scheduling.model import SECOND
+
+if TYPE_CHECKING:
+    from rich.live import Live
+
+REFRESH = 1.0
+"""Seconds between two looks at who holds what, where somebody watches."""
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """One RC that is asked for, as the RCM sees it."""
+
+    rc: str
+    present: bool
+    sharable: bool
+    holds: list[HoldView]
+
+    def text(self) -> str:
+        """Who has it and since when, in words."""
+        return f"{self.rc}: " + "; ".join(hold_text(hold) for hold in self.holds)
+
+    def as_json(self) -> dict[str, Any]:
+        holders = [hold_json(hold) for hold in self.holds]
+        return {"rc": self.rc, "present": self.present, "sharable": self.sharable, "holders": holders}
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How the last hold came to its end, in the protocol's word and in words."""
+
+    outcome: str = "lost"
+    reason: str = ""
+    by: str | None = None
+
+
+def needs_seen(state: RcmState, rcs: Iterable[str], own: str = "") -> list[Need]:
+    """How each RC stands, holds of the ARC with id `own` left out."""
+    views = {view.rc: view for view in state.rcs}
+    seen = []
+    for rc in sorted(rcs):
+        view = views.get(rc)
+        holds = [hold for hold in state.holds if rc in hold.needs and hold.id != own]
+        seen.append(Need(rc, view is not None and view.present, view is not None and view.sharable, holds))
+    return seen
+
+
+def hold_text(hold: HoldView) -> str:
+    left = "kept" if hold.keep else f"{span(hold.remaining)} left"
+    return clean(f"{hold.arc} (priority {hold.priority}, {hold.client}) for {span(hold.held)}, {left}")
+
+
+def hold_json(hold: HoldView) -> dict[str, Any]:
+    return {
+        "arc": hold.arc,
+        "id": hold.id,
+        "client": hold.client,
+        "priority": hold.priority,
+        "held": round(hold.held, 3),
+        "remaining": round(hold.remaining, 3),
+        "keep": hold.keep,
+    }
+
+
+class Report:
+    """Tells of one request on `stream`. Use as a context manager: the live line is gone afterwards."""
+
+    def __init__(self, name: str, client: str, *, as_json: bool, stream: IO[str]) -> None:
+        self._name, self._client, self._as_json, self._stream = name, client, as_json, stream
+        self._watched = not as_json and at_terminal(stream)
+        self._live: Live | None = None
+        self._said: object = None
+        self._changed = asyncio.Event()
+        self._arc: OpenArc | None = None
+        self.ending = Ending()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.hide()
+
+    # What happened
+
+    def event(self, kind: str, text: str, details: Mapping[str, Any] | None = None) -> None:
+        """Tells one thing that happened: `text` for people (empty: not told), the rest for programs."""
+        if self._as_json:
+            who = {"event": kind, "arc": self._name, "client": self._client}
+            print_json(who | dict(details or {}), self._stream)
+        elif not text:
+            pass
+        elif self._live is not None:
+            self._live.console.print(clean(text), soft_wrap=True)
+        else:
+            print_line(clean(text), self._stream)
+
+    def show(self, *lines: str) -> None:
+        """Draws the live lines anew; nothing where nobody watches."""
+        if not self._watched:
+            return
+        from rich.live import Live
+        from rich.text import Text
+
+        picture = Text("\n".join(clean(line) for line in lines), overflow="ellipsis", no_wrap=True)
+        if self._live is None:
+            self._live = Live(
+                picture,
+                console=console(stderr=self._stream is sys.stderr),
+                transient=True,
+                auto_refresh=False,
+            )
+            self._live.start()
+        self._live.update(picture, refresh=True)
+
+    def hide(self) -> None:
+        """Takes the live lines away: the terminal is another's now."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    # Following
+
+    def news(self, arc: OpenArc) -> None:
+        """A watcher for the client."""
+        self._arc = arc
+        # The next word, that it waits again, may be here before anybody has looked at this one.
+        if arc.outcome is not None and arc.state != "running":
+            self.ending = Ending(arc.outcome, arc.reason, arc.by)
+        self._changed.set()
+
+    async def follow_wait(self, client: Client) -> None:
+        """Tells how the request waits, until cancelled."""
+        while True:
+            self._changed.clear()
+            arc = self._arc
+            if arc is None:
+                self.show(f"{self._name}: asking the RCM")
+            elif arc.state in ("asking", "queued") and arc.reason:
+                state = await client.state() if arc.state == "queued" else None
+                if arc.state in ("asking", "queued"):
+                    self._tell_wait(arc, state)
+            await self._news_or_a_second()
+
+    def _tell_wait(self, arc: OpenArc, state: RcmState | None) -> None:
+        needs = needs_seen(state, arc.needs, arc.id) if state is not None else []
+        # A sharable RC has holders who are in nobody's way, unless the reason names it.
+        in_way = [need for need in needs if need.holds and (not need.sharable or need.rc in arc.reason)]
+        ahead = f", {arc.ahead} ahead" if arc.ahead else ""
+        self.show(
+            f"{arc.name} waits {span(_since(arc))}{ahead}: {arc.reason}",
+            *(f"  {need.text()}" for need in in_way),
+        )
+        now = (arc.state, arc.reason, arc.ahead)
+        if self._watched or self._said == now:
+            return
+        self._said = now
+        who = "".join(f"; {need.text()}" for need in in_way)
+        details = {
+            "id": arc.id,
+            "reason": arc.reason,
+            "ahead": arc.ahead,
+            "needs": [need.as_json() for need in needs],
+        }
+        self.event("waits", f"{arc.name} waits{ahead}: {arc.reason}{who}", details)
+
+    async def follow_hold(self, arc: OpenArc) -> None:
+        """Shows how long a hold without a command goes on, until cancelled."""
+        while True:
+            self._changed.clear()
+            left = (arc.end - clock.now()) / SECOND
+            rest = f"held for {span(_since(arc))}, kept" if arc.keep else f"{span(left)} left"
+            self.show(f"{arc.name} holds {', '.join(sorted(arc.needs))}: {rest}; Ctrl-C gives back")
+            await self._news_or_a_second()
+
+    async def within(self, seconds: float, true: Callable[[], bool]) -> None:
+        """Waits for news until `true`, at most so long."""
+        try:
+            async with asyncio.timeout(seconds):
+                while not true():
+                    self._changed.clear()
+                    await self._changed.wait()
+        except TimeoutError:
+            pass
+
+    async def _news_or_a_second(self) -> None:
+        try:
+            async with asyncio.timeout(REFRESH if self._watched else None):
+                await self._changed.wait()
+        except TimeoutError:
+            pass
+
+
+def _since(arc: OpenArc) -> float:
+    return (clock.now() - arc.since) / SECOND

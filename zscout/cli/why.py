@@ -1,0 +1,200 @@
+"""`zscout why ARC`: its story, what it waits for, and who is in its way."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+from msgspec import structs
+
+from zscout.cli import common
+from zscout.messages import HoldView, RcmState, RcView, StoryLine, WaitView
+from zscout.strict import BadInput, quoted
+
+if TYPE_CHECKING:
+    from zscout.behaviors.client import Client
+
+MAX_NAME: Final = 200
+"""Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
+MAX_TWINS: Final = 20
+"""Open ARCs of one name that are told of."""
+MAX_NAMED: Final = 8
+
+View = HoldView | WaitView
+
+
+@click.command()
+@click.argument("arc")
+@common.json_option("Print one JSON object.")
+def why(arc: str, as_json: bool) -> None:
+    """Tells what became of ARC, and why it waits if it does.
+
+    ARC is its name, its id, or HOST/CLIENT/ID. Of each RC that it needs: who holds it, with which priority,
+    since when, for how long yet. An ARC that has ended is known for as long as the RCM remembers it.
+
+    \b
+    Examples:
+      zscout why survey
+      zscout why 4caaac1a6451 --json | jq .arcs[0].story
+    """
+    if not arc or len(arc) > MAX_NAME or not arc.isprintable():
+        raise BadInput(f"{quoted(arc)} names no ARC; zscout status lists them")
+    found = common.run(_look(arc))
+    if as_json:
+        common.print_json(found)
+        return
+    for number, one in enumerate(found["arcs"]):
+        if number:
+            common.print_line("")
+        for line, style in _words(one):
+            # `secho` leaves the colours out in a pipe.
+            click.secho(common.clean(line), **style)
+
+
+async def _look(asked: str) -> dict[str, Any]:
+    """What `--json` prints. Raises NobodyThere, and Failed where there is no such ARC."""
+    async with common.connected("why") as client:
+        state = await common.state_of(client, asked)
+        views: list[View] = [*state.holds, *state.queue]
+        same = [view for view in views if asked in (view.arc, view.id, _full(view))]
+        if not same and not state.story:
+            raise common.Failed(_unknown(asked, views, state.more))
+        arcs = [await _told(client, view, state) for view in same[:MAX_TWINS]]
+        if not same:
+            arcs = [{"arc": asked, "state": "ended", "story": _story(state.story)}]
+        return {
+            "fleet": client.fleet.name,
+            "asked": asked,
+            "arcs": arcs,
+            "more": max(0, len(same) - MAX_TWINS),
+        }
+
+
+async def _told(client: Client, view: View, state: RcmState) -> dict[str, Any]:
+    """One open ARC, with its own story and not that of others of its name."""
+    story = (await common.state_of(client, _full(view))).story
+    rcs = {rc.rc: rc for rc in state.rcs}
+    told = structs.asdict(view) | {
+        "state": "running" if isinstance(view, HoldView) else "queued",
+        "needs": [_need(rc, view, rcs.get(rc), state) for rc in sorted(view.needs)],
+        "story": _story(story),
+    }
+    if isinstance(view, WaitView):
+        told["ahead"] = state.queue.index(view)
+        told["queued"] = len(state.queue) + state.more
+    return told
+
+
+def _need(name: str, view: View, rc: RcView | None, state: RcmState) -> dict[str, Any]:
+    return {
+        "rc": name,
+        "params": view.needs[name],
+        "present": rc is not None and rc.present,
+        "sharable": rc is not None and rc.sharable,
+        "holders": [
+            {
+                "arc": hold.arc,
+                "id": hold.id,
+                "client": hold.client,
+                "priority": hold.priority,
+                "held": hold.held,
+                "remaining": hold.remaining,
+                "keep": hold.keep,
+                "params": hold.needs[name],
+            }
+            for hold in state.holds
+            if name in hold.needs and _full(hold) != _full(view)
+        ],
+    }
+
+
+def _story(lines: list[StoryLine]) -> list[dict[str, Any]]:
+    return [{"ago": line.ago, "text": line.text} for line in lines]
+
+
+def _full(view: View) -> str:
+    return f"{view.client}/{view.id}"
+
+
+def _unknown(asked: str, views: list[View], more: int) -> str:
+    names = sorted({view.arc for view in views})
+    near = difflib.get_close_matches(asked, names, n=3)
+    if near:
+        return f"no ARC {quoted(asked)} is known; did you mean {' or '.join(near)}?"
+    if not names:
+        return f"no ARC {quoted(asked)} is known, and none is open"
+    rest = len(names) - MAX_NAMED + more
+    return f"no ARC {quoted(asked)} is known; open: {', '.join(names[:MAX_NAMED])}" + (
+        f" and {rest} more" if rest > 0 else ""
+    )
+
+
+# Words
+
+Line = tuple[str, dict[str, Any]]
+_PLAIN: Final[dict[str, Any]] = {}
+_BOLD: Final = {"bold": True}
+_DIM: Final = {"dim": True}
+
+
+def _words(arc: dict[str, Any]) -> Iterator[Line]:
+    if arc["state"] == "ended":
+        yield f"{arc['arc']} is not open any more", _BOLD
+    else:
+        yield from _standing(arc)
+        yield "Holds" if arc["state"] == "running" else "Needs", _BOLD
+        for need in arc["needs"]:
+            yield from _need_words(need)
+    yield "Story", _BOLD
+    spans = [f"{common.span(line['ago'])} ago" for line in arc["story"]]
+    width = max(map(len, spans), default=0)
+    for span, line in zip(spans, arc["story"], strict=True):
+        yield f"  {span:>{width}}  {line['text']}", _PLAIN
+
+
+def _standing(arc: dict[str, Any]) -> Iterator[Line]:
+    who = f"{arc['arc']} (id {arc['id']}, of {arc['client']}, priority {arc['priority']})"
+    runtime = common.span(float(arc["min_runtime"]))
+    if arc["state"] == "running":
+        yield f"{who} has run for {common.span(arc['held'])}", {"bold": True, "fg": "green"}
+        left = f"{common.span(arc['remaining'])} left" if arc["remaining"] > 0 else "nothing left"
+        after = "; it keeps what it has after that" if arc["keep"] else ""
+        yield f"  {left} of its minimum runtime of {runtime}{after}", _PLAIN
+        return
+    yield f"{who} has waited for {common.span(arc['waited'])}", {"bold": True, "fg": "yellow"}
+    yield f"  {arc['reason']}", _PLAIN
+    ahead = arc["ahead"]
+    place = "nobody is ahead of it" if not ahead else f"{ahead} {'is' if ahead == 1 else 'are'} ahead of it"
+    yield f"  {place} in the queue of {arc['queued']}; it wants {runtime}", _PLAIN
+    if arc["preemptions"]:
+        yield f"  it was preempted {_times(arc['preemptions'])}", _PLAIN
+
+
+def _need_words(need: dict[str, Any]) -> Iterator[Line]:
+    amounts = common.amount_text(need["params"])
+    name = f"  {need['rc']}" + (f" ({amounts})" if amounts else "")
+    if not need["present"]:
+        yield f"{name}: not on the mesh", {"fg": "red"}
+    elif not need["holders"]:
+        yield f"{name}: no other ARC holds it", {"fg": "green"}
+    for holder in need["holders"] if need["present"] else ():
+        share = common.amount_text(holder["params"])
+        yield (
+            f"{name}: {'shared with' if need['sharable'] else 'held by'} {holder['arc']}"
+            + (f" ({share})" if share else "")
+            + f" of {holder['client']}, priority {holder['priority']}, for {common.span(holder['held'])}; "
+            + _left(holder),
+            _PLAIN,
+        )
+
+
+def _left(hold: dict[str, Any]) -> str:
+    if hold["remaining"] <= 0:
+        return "its minimum runtime is over"
+    return f"{common.span(hold['remaining'])} left" + (" at least" if hold["keep"] else "")
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
