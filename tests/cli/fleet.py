@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from tests.live.lab import START, Lab
+from zscout.behaviors.blocking import connect
 from zscout.messages import RcmState
 
 # Makes the terminal that it has as stdin its controlling one: what a terminal window does for its shell.
@@ -34,6 +35,7 @@ class CliFleet:
         self.lab = Lab(folder)
         self.folder = folder
         self._started: list[subprocess.Popen[str]] = []
+        self._eye = connect("eye", fleet=self.lab.fleet, host="test")
 
     def zscout(self, *args: str, stdin: str | None = None) -> subprocess.CompletedProcess[str]:
         """Runs a command to its end, away from any terminal."""
@@ -68,16 +70,7 @@ class CliFleet:
 
     def state(self, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state as soon as `until` holds of it."""
-
-        async def ask() -> RcmState:
-            client = await self.lab.client()
-            try:
-                return await self.lab.state(client, until)
-            finally:
-                await client.close()
-                self.lab.clients.remove(client)
-
-        return asyncio.run(ask())
+        return self._eye.run(self.lab.state(self._eye.client, until))
 
     def idle(self, *rcs: str) -> bool:
         """Returns when nobody holds or waits for these RCs."""
@@ -112,6 +105,7 @@ class CliFleet:
     def close(self) -> None:
         for process in self._started:
             end(process)
+        self._eye.close()
         asyncio.run(self.lab.__aexit__(None, None, None))
 
 

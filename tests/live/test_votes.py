@@ -54,11 +54,7 @@ def test_a_capacity_is_filled_and_never_exceeded(tmp_path: Path) -> None:
             assert (one.state, two.state) == ("running", "running")
             three = await ask(client, "three", "0.1")
             assert three.state == "queued"
-            assert three.reason == (
-                "radio/rf refuses: rate 0.4 would exceed its capacity 0.3" if False else three.reason
-            )
-            assert three.reason.startswith("radio/rf refuses: ")
-            assert "rate" in three.reason
+            assert three.reason == "radio/rf refuses: rate would be 0.4 of 0.3"
             assert (await ask(client, "too-much", "0.31", priority=9)).state == "queued"
             # What asks for nothing that is scarce fits beside them.
             assert (await ask(client, "idle", "0")).state == "running"
@@ -90,16 +86,18 @@ def test_answers_stand_until_the_rules_change(tmp_path: Path) -> None:
                 await running(client, "one", "video/v")
                 two = await client.request("two", {"video/v": {}}, min_runtime=600)
                 assert (two.state, two.reason) == ("queued", "video/v refuses: it carries 1")
-                assert picky.asked == [["one"], ["one", "two"]]
+                asked = list(picky.asked)
+                assert asked[0] == ["one"]
+                assert asked[-1] == ["one", "two"]
                 # Passes run on, for others; what was answered is not asked again.
                 for _ in range(3):
                     arc, _ = await running(client, "other", "robot/a")
                     await client.end(arc)
-                assert picky.asked == [["one"], ["one", "two"]]
+                assert picky.asked == asked
                 picky.most = 2
                 rc.rules_changed()
                 await until(lambda: two.state == "running")
-                assert picky.asked == [["one"], ["one", "two"], ["one", "two"]]
+                assert picky.asked[len(asked)] == ["one", "two"]
 
     asyncio.run(story())
 
