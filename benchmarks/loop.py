@@ -1,17 +1,14 @@
-"""The event loop that zscout's own programs run on."""
+"""The event loop that the benchmark's programs run on: that of the node and of zscout's blocking clients."""
 
 from __future__ import annotations
 
-import asyncio
-import os
 from collections.abc import Coroutine
 from typing import Any, TypeVar
+
+import uvloop
 
 T = TypeVar("T")
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    if os.environ.get("BENCH_UV"):
-        import uvloop
-        return uvloop.run(main)
-    return asyncio.run(main)
+    return uvloop.run(main)

@@ -196,6 +196,9 @@ class _Inbox:
     )
     scheduled: bool = False
     closed: bool = False
+    draining: bool = False
+    after: list[Callable[[], None]] = field(default_factory=list)
+    """What is called once the present burst has been handled."""
 
     def offer(self, state: _Declaration | None, call: Callable[..., None], *args: Any) -> bool:
         if self.closed or len(self.items) >= INBOX_DEPTH:
@@ -216,6 +219,7 @@ class _Inbox:
 
     def drain(self) -> None:
         self.scheduled = False
+        self.draining = True
         for _ in range(len(self.items)):
             state, call, args = self.items.popleft()
             if state is not None:
@@ -224,6 +228,13 @@ class _Inbox:
                     continue
             try:
                 call(*args)
+            except Exception:
+                log.exception("a handler failed")
+        self.draining = False
+        after, self.after = self.after, []
+        for then in after:
+            try:
+                then()
             except Exception:
                 log.exception("a handler failed")
         if self.items and not self.scheduled:
@@ -274,6 +285,13 @@ class Mesh:
                 await asyncio.to_thread(self._session.close)
         except (TimeoutError, zenoh.ZError) as error:
             log.warning("the mesh session did not close cleanly: %r", error)
+
+    def after_burst(self, then: Callable[[], None]) -> None:
+        """Calls `then` once all that has arrived together is handled: at once, where nothing arrives."""
+        if self._inbox.draining:
+            self._inbox.after.append(then)
+        else:
+            then()
 
     # Queries
 

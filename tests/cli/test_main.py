@@ -11,6 +11,7 @@ from pathlib import Path
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from tests.cli.fleet import ZSCOUT
 from tests.live.lab import Lab
@@ -66,8 +67,8 @@ def test_an_unknown_command_is_one_line_with_a_hint() -> None:
     ],
 )
 def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
-    done = zscout(*args)
-    assert (done.returncode, done.stdout) == (2, "")
+    done = CliRunner().invoke(main, args)
+    assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("zscout")
     assert words in done.stderr

@@ -84,8 +84,10 @@ def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
 
 
 def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
-    fleet.holder("peer", "robot/b", "--priority", "10", "--min-runtime", "1")
+    peer = fleet.holder("peer", "robot/b", "--priority", "10")
     taker = fleet.start("take", "robot/b", "--no-keep", "--min-runtime", "0.1")
-    lines = read_until(taker, "operator holds robot/b")
+    lines = read_until(taker, "operator waits: needs robot/b (held by peer, priority 10)")
     assert any("operator waits for peer (priority 10, " in line for line in lines)
+    end(peer)
+    read_until(taker, "operator holds robot/b")
     assert taker.wait(START) == 0

@@ -324,3 +324,9 @@ def test_only_so_many_ended_grants_are_remembered() -> None:
         rc.hear(said(seq, holder(seq)), NOW)
     refusals = [rc.check(Grant(TERM, seq), "h/one", NOW) for seq in (2, 2 + REMEMBERED)]
     assert [refusal and refusal.code for refusal in refusals] == ["not_holder", "ended"]
+
+
+def test_an_exclusive_rc_obeys_only_the_newest_of_two_holders() -> None:
+    rc = holding(HELD)
+    change = rc.hear(said(3, ONE, TWO), NOW, sharable=False)
+    assert (grants(rc), change.present) == ([3], True)

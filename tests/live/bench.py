@@ -98,6 +98,11 @@ async def answer(command: Awaitable[Done]) -> str:
     return "done"
 
 
+async def comes_to(arc: OpenArc, state: str, reason: str = "") -> None:
+    """Waits until a request stands so: on a slow machine votes may come late."""
+    await until(lambda: arc.state == state and reason in arc.reason)
+
+
 async def until(condition: Callable[[], bool]) -> None:
     async with asyncio.timeout(START):
         while True:

@@ -132,6 +132,16 @@ class Lab:
                 if reply is not None and reply.message is not None:
                     return reply.message
 
+    async def held_by(self, client: Client, name: str, *arcs: str) -> None:
+        """Waits until an RC names exactly these ARCs as its holders: it may hear of them after the client."""
+        held: list[str] | None = None
+        try:
+            async with asyncio.timeout(START):
+                while held != sorted(arcs):
+                    held = sorted(holder.arc for holder in (await self.rc(client, name)).holders)
+        except TimeoutError:
+            raise AssertionError(f"{name} is held by {held}, not by {sorted(arcs)}") from None
+
     async def state(self, client: Client, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state as soon as `until` holds of it; fails after START seconds."""
         seen: RcmState | None = None

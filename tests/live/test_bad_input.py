@@ -190,6 +190,20 @@ def test_nothing_is_handed_over_to_nobody(stranger: Stranger) -> None:
     stranger.ask("rcm/schedule/t/good", {"op": "release", "id": "mine"})
 
 
+def test_what_is_handed_over_goes_by_the_same_id_at_its_new_client(stranger: Stranger) -> None:
+    token = stranger.token("t/client/next/1")
+    asked = good_ask(id="moving", min_runtime=60)
+    before = stranger.ask("rcm/schedule/t/good", asked)
+    moved = stranger.ask("rcm/schedule/t/good", {"op": "hand_over", "id": "moving", "to": "t/next"})
+    again = stranger.ask("rcm/schedule/t/next", asked)
+    assert again["grant"] == moved["grant"] > before["grant"]
+    assert (again["arc"], again["client"], again["place"]) == ("bad", "t/next", before["place"])
+    released = stranger.ask("rcm/schedule/t/next", {"op": "release", "id": "moving"})
+    assert (released["state"], released["outcome"], released["arc"]) == ("ended", "released", "bad")
+    token.undeclare()
+    stranger.serves()
+
+
 def test_one_client_and_all_together_may_wait_with_so_many(stranger: Stranger) -> None:
     tokens = [stranger.token(f"t/client/many{client}/1") for client in range(4)]
     try:

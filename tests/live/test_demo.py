@@ -15,9 +15,10 @@ from typing import IO
 import psutil
 import pytest
 
-from tests.services.paper_run import OPERATOR_MARK, RCS, TABLE2, colours, events, lanes, rows
+from tests.services.paper_run import RCS, TABLE2, colours, events, lanes, rows
 from zscout.cli.demo_tables import Observed, differences, paper
 from zscout.scheduling.model import SECOND
+from zscout.services.timeline import OPERATOR_MARK
 
 pytestmark = pytest.mark.live
 
@@ -131,7 +132,7 @@ def test_a_place_that_cannot_be_written_is_one_line_at_once(tmp_path: Path) -> N
     _, error = demo.communicate(timeout=PATIENCE)
     assert (demo.returncode, error) == (
         2,
-        "zscout: --out file/demo.rrd: can't be written (Not a directory); give another file\n",
+        "zscout: --out file/demo.rrd: can't be written (its folder is a file); give another file\n",
     )
     assert time.monotonic() - began < PATIENCE / 4
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.live.bench import running, until
 from tests.live.crew import Crew, Stand
 from tests.live.lab import Lab, LeaderWatch
 from zscout import clock
@@ -93,5 +94,28 @@ def test_the_only_rcm_killed_and_started_again_finds_everything(tmp_path: Path) 
             after = await crew.checked(lab, client, Stand(before), since=clock.now())
             assert after.term.counter > before.term.counter
             await asyncio.gather(*(body.finish() for body in crew.bodies))
+
+    asyncio.run(story())
+
+
+def test_what_is_given_up_while_nobody_leads_is_free_under_the_next_rcm(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, extra="[timing]\nhold_lease = 15\n") as lab:
+            lab.node("c", "robot/x", "robot/y", extra=APART)
+            lab.node("a")
+            client = await lab.client("asker")
+            await lab.ready(client, "robot/x", "robot/y")
+            _, stays = await running(client, "stays", "robot/y", min_runtime=0.1, keep=True)
+            arc, _ = await running(client, "kept", "robot/x", min_runtime=0.1, keep=True)
+            lab.signal("a", signal.SIGKILL)
+            await until(lambda: client.leader is None)
+            await client.end(arc)
+            await lab.held_by(client, "robot/x", "kept")
+            lab.nodes["a"].wait()
+            lab.node("a")
+            state = await lab.ready(client, "robot/x", "robot/y")
+            assert [(hold.arc, hold.grant) for hold in state.holds] == [("stays", stays)]
+            await lab.held_by(client, "robot/x")
+            await lab.held_by(client, "robot/y", "stays")
 
     asyncio.run(story())

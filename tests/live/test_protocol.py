@@ -19,6 +19,7 @@ import pytest
 from tests.live.lab import START, Lab
 from zscout import messages
 from zscout.behaviors.arc import hold
+from zscout.keyexpr import Keys, Role, Sender
 from zscout.messages import RcmState
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
@@ -49,6 +50,31 @@ def test_the_document_names_every_error_code_and_outcome() -> None:
     assert len(codes) > 15
     table = set(re.findall(r"^\| `(\w+)` \|", DOCUMENT[DOCUMENT.index("## Errors") :], re.MULTILINE))
     assert codes <= table, f"not in the document: {sorted(codes - table)}"
+
+
+def test_the_document_names_every_key_and_role() -> None:
+    keys, sender = Keys("fleet"), Sender("H", "C")
+    built = [
+        keys.schedule(sender),
+        keys.grants,
+        keys.rcm_state,
+        keys.vote("K/N"),
+        keys.command("K/N", sender),
+    ]
+    built += [
+        keys.rc_state("K/N"),
+        keys.frame("K/N"),
+        keys.load("H"),
+        keys.notice(sender),
+        keys.requests(sender),
+    ]
+    words = {"fleet": "<fleet>", "H": "<host>", "C": "<client>", "K": "<kind>", "N": "<name>"}
+    for key in built:
+        told = "/".join(words.get(chunk, chunk) for chunk in key.split("/"))
+        assert f"| `{told}` |" in DOCUMENT
+    roles = {value for name, value in vars(Role).items() if name.isupper()}
+    tokens = DOCUMENT[DOCUMENT.index("### Tokens") : DOCUMENT.index("## Order")]
+    assert roles == set(re.findall(r"^\| `(\w+)` \|", tokens, re.MULTILINE)) - {"role"}
 
 
 @pytest.mark.parametrize(("name", "text"), EXAMPLES, ids=[name for name, _ in EXAMPLES])

@@ -162,11 +162,13 @@ def test_a_failing_device_ends_the_whole_gang_which_waits_for_it(tmp_path: Path)
 
                 rc.fail("smoke comes out of it")
                 await until(lambda: arc.state == "queued")
-                assert (arc.outcome, arc.place) in (("lost", place), (None, place))
+                assert arc.ending is not None
+                assert (arc.ending.outcome, arc.place) == ("lost", place)
+                assert "smoke comes out of it" in arc.ending.reason
                 assert bench.calls == ["begin gang", "safe"]
                 waits = await lab.state(client, lambda state: [wait.arc for wait in state.queue] == ["gang"])
                 assert waits.queue[0].reason == "robot/bench not on the mesh"
-                assert not (await lab.rc(client, "robot/a")).holders
+                await lab.held_by(client, "robot/a")
                 for name in ("robot/a", "robot/bench"):
                     assert await answer(client.command(name, grant, ECHO)) == "ended"
                 # What the gang does not hold any more is there for others.
@@ -250,7 +252,7 @@ def test_holds_end_at_rc_and_client_when_no_rcm_is_heard_for_the_hold_lease(tmp_
                 }
                 await until(lambda: bench.calls == ["begin gang", "safe"] and kept.grant is None)
                 for name, grant in (("robot/x", grants[0]), ("robot/y", kept_grant)):
-                    assert not (await lab.rc(client, name)).holders
+                    await lab.held_by(client, name)
                     assert await answer(client.command(name, grant, ECHO)) == "ended"
 
                 # What is still wanted is granted anew as soon as somebody leads.

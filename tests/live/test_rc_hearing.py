@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.live.bench import ECHO, Bench, Stand, answer, until
-from tests.live.lab import Lab
+from tests.live.lab import START, Lab
+from zscout.drivers import base
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Request
 from zscout.messages import Grants, HoldView, RcmState, StateAsk
@@ -42,7 +43,9 @@ def said(seq: int, prev: int) -> Grants:
     return Grants(term=TERM, seq=seq, prev=prev, every=0.5, rcs={"robot/other": []})
 
 
-def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path) -> None:
+def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(base, "REREAD_TIMEOUT", START)
+
     async def story() -> None:
         async with Lab(tmp_path) as lab:
             client = await lab.client()
@@ -73,6 +76,43 @@ def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path) -> None:
                 waiting[0].answer(RcmState(TERM, 3, "test"))
                 await until(lambda: set(rc.holding.held) == {Grant(TERM, 5)})
                 assert await answer(client.command("robot/x", Grant(TERM, 5), ECHO)) == "done"
+
+    asyncio.run(story())
+
+
+def test_a_question_that_nobody_answered_is_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(base, "REREAD_TIMEOUT", 0.1)
+
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            client = await lab.client()
+            mesh, keys = client.mesh, client.mesh.keys
+            waiting: list[Request[StateAsk]] = []
+            answers = False
+
+            def on_asked(request: Request[StateAsk]) -> None:
+                if answers:
+                    request.answer(RcmState(TERM, 7, "test", [view(str(mesh.me), 5)]))
+                else:
+                    waiting.append(request)
+
+            async with Stand(lab) as stand:
+                rc = await stand.rc("robot/x", Bench())
+                mesh.serve(keys.rcm_state, StateAsk, on_asked)
+                publisher = mesh.publisher(keys.grants, Grants)
+                mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
+                while len(waiting) < 2:
+                    # A gap, and then a heartbeat: what was missed is still not known.
+                    publisher.put(said(7, 6 if rc.holding.seq < 7 else 7))
+                    await asyncio.sleep(0.02)
+                assert not rc.holding.held
+                answers = True
+                while not rc.holding.held:
+                    publisher.put(said(7, 7))
+                    await asyncio.sleep(0.02)
+                assert set(rc.holding.held) == {Grant(TERM, 5)}
 
     asyncio.run(story())
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.live.bench import ECHO, SharedBench, Stand, answer, running, until
+from tests.live.bench import ECHO, SharedBench, Stand, answer, comes_to, running
 from tests.live.lab import Lab
 from zscout import clock
 from zscout.behaviors.client import Client
@@ -46,30 +46,30 @@ def test_a_capacity_is_filled_and_never_exceeded(tmp_path: Path) -> None:
             client = await lab.client()
             await lab.ready(client, "radio/rf")
 
-            async def holds() -> list[str]:
-                return sorted(holder.arc for holder in (await lab.rc(client, "radio/rf")).holders)
-
             one, two = await ask(client, "one", "0.1"), await ask(client, "two", "0.2")
             # One tenth and two tenths are three tenths, and not a bit more.
-            assert (one.state, two.state) == ("running", "running")
+            await comes_to(one, "running")
+            await comes_to(two, "running")
             three = await ask(client, "three", "0.1")
-            assert three.state == "queued"
-            assert three.reason == "radio/rf refuses: rate would be 0.4 of 0.3"
-            assert (await ask(client, "too-much", "0.31", priority=9)).state == "queued"
+            await comes_to(three, "queued", "radio/rf refuses: rate would be 0.4 of 0.3")
+            much = await ask(client, "too-much", "0.31", priority=9)
+            await comes_to(much, "queued", "radio/rf refuses: rate would be 0.31 of 0.3")
             # What asks for nothing that is scarce fits beside them.
-            assert (await ask(client, "idle", "0")).state == "running"
-            assert await holds() == ["idle", "one", "two"]
+            await comes_to(await ask(client, "idle", "0"), "running")
+            await lab.held_by(client, "radio/rf", "idle", "one", "two")
 
             # An operator takes what is needed and no more: in rank order, whoever fits beside it stays.
-            assert (await ask(client, "operator", "0.2", priority=10)).state == "running"
-            assert (one.state, two.state) == ("running", "queued")
-            assert await holds() == ["idle", "one", "operator"]
-            assert (two.outcome, two.by is not None) == ("preempted", True)
+            await comes_to(await ask(client, "operator", "0.2", priority=10), "running")
+            await comes_to(two, "queued")
+            assert one.state == "running"
+            await lab.held_by(client, "radio/rf", "idle", "one", "operator")
+            assert two.ending is not None
+            assert two.ending.outcome == "preempted"
 
             await client.end(one)
-            await until(lambda: three.state == "running")
+            await comes_to(three, "running")
             assert two.state == "queued"
-            assert await holds() == ["idle", "operator", "three"]
+            await lab.held_by(client, "radio/rf", "idle", "operator", "three")
 
     asyncio.run(story())
 
@@ -85,7 +85,7 @@ def test_answers_stand_until_the_rules_change(tmp_path: Path) -> None:
                 await lab.ready(client, "video/v", "robot/a")
                 await running(client, "one", "video/v")
                 two = await client.request("two", {"video/v": {}}, min_runtime=600)
-                assert (two.state, two.reason) == ("queued", "video/v refuses: it carries 1")
+                await comes_to(two, "queued", "video/v refuses: it carries 1")
                 asked = list(picky.asked)
                 assert asked[0] == ["one"]
                 assert asked[-1] == ["one", "two"]
@@ -96,7 +96,7 @@ def test_answers_stand_until_the_rules_change(tmp_path: Path) -> None:
                 assert picky.asked == asked
                 picky.most = 2
                 rc.rules_changed()
-                await until(lambda: two.state == "running")
+                await comes_to(two, "running")
                 assert picky.asked[len(asked)] == ["one", "two"]
 
     asyncio.run(story())
@@ -136,9 +136,11 @@ def test_a_voter_that_does_not_answer_stops_nobody_else(tmp_path: Path) -> None:
             late, late_grant = await running(client, "late", "robot/a", priority=1)
 
             lab.signal("v", signal.SIGCONT)
-            await until(lambda: boss.state == "running")
-            assert (late.state, late.outcome) == ("queued", "preempted")
+            await comes_to(boss, "running")
+            await comes_to(late, "queued")
+            assert late.ending is not None
+            assert late.ending.outcome == "preempted"
             assert await answer(client.command("robot/a", late_grant, ECHO)) == "ended"
-            assert [h.arc for h in (await lab.rc(client, "radio/rf")).holders] == ["boss"]
+            await lab.held_by(client, "radio/rf", "boss")
 
     asyncio.run(story())

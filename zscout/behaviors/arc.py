@@ -22,7 +22,7 @@ from typing import Any
 
 from zscout import clock
 from zscout.behaviors.client import Client
-from zscout.behaviors.request import Needs, OpenArc
+from zscout.behaviors.request import Ending, Needs, OpenArc
 from zscout.messages import Done
 from zscout.scheduling.model import SECOND, Grant
 
@@ -31,9 +31,10 @@ class Revoked(Exception):
     """The hold was taken away; `outcome` is the protocol's word, the message the reason."""
 
     def __init__(self, arc: OpenArc) -> None:
-        super().__init__(arc.reason or arc.outcome or "the hold is over")
-        self.outcome = arc.outcome or "lost"
-        self.by = arc.by
+        ending = arc.ending or Ending(arc.outcome or "lost", arc.reason, arc.by)
+        super().__init__(ending.reason or ending.outcome)
+        self.outcome = ending.outcome
+        self.by = ending.by
 
 
 class Held:

@@ -15,6 +15,8 @@ from collections.abc import Coroutine, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Self, TypeVar
 
+import uvloop
+
 from zscout.behaviors.arc import Held, Revoked
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import Needs
@@ -67,7 +69,7 @@ class Lab:
     def __init__(
         self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None
     ) -> None:
-        self._loop = asyncio.new_event_loop()
+        self._loop = uvloop.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="zscout", daemon=True)
         self._thread.start()
         try:

@@ -5,12 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import Any
+from typing import Any, NamedTuple
 
 from zscout.messages import Amounts, Ask, Notice, OpenRequest
 from zscout.scheduling.model import NO_TERM, SECOND, Grant, Ns, Place, Term
 
 Needs = Mapping[str, Mapping[str, Any]]
+
+
+class Ending(NamedTuple):
+    """How a hold ended: the protocol's word, the reason in words, and the ARC that it was taken for."""
+
+    outcome: str
+    reason: str
+    by: str | None = None
 
 
 @dataclass(slots=True)
@@ -37,6 +45,8 @@ class OpenArc:
     """When the minimum runtime of the present hold is over, on this host's clock."""
     since: Ns = 0
     """When `state` began."""
+    ending: Ending | None = None
+    """How the last hold ended; `outcome` and `reason` are of the newest word, whatever it is about."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
 
     @property
@@ -50,6 +60,10 @@ class OpenArc:
         self.last = (notice.term, notice.step)
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
+        if notice.state != "running":
+            self._close(Ending(notice.outcome or "lost", notice.reason, notice.by))
+        elif notice.grant != self.grant:
+            self._close(Ending("lost", "it was granted anew"))
         self.state = notice.state
         self.reason = notice.reason
         self.outcome, self.by = notice.outcome, notice.by
@@ -59,17 +73,21 @@ class OpenArc:
         if notice.state == "running":
             self.grant = notice.grant
             self.end = now + round((notice.remaining or 0.0) * SECOND)
-        else:
-            self.grant = None
         return True
+
+    def _close(self, ending: Ending) -> None:
+        if self.grant is not None:
+            self.grant, self.ending = None, ending
 
     def lose(self, reason: str, now: Ns) -> None:
         """The hold is over by the client's own judgement; the request is asked again."""
-        self.state, self.reason, self.outcome, self.grant, self.since = "asking", reason, "lost", None, now
+        self._close(Ending("lost", reason))
+        self.state, self.reason, self.outcome, self.since = "asking", reason, "lost", now
 
     def finish(self, outcome: str, reason: str, now: Ns) -> None:
         """The request is over by the client's own judgement."""
-        self.state, self.outcome, self.reason, self.grant, self.since = "ended", outcome, reason, None, now
+        self._close(Ending(outcome, reason))
+        self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
 
     def ask(self) -> Ask:
         return Ask(

@@ -117,7 +117,8 @@ def _recording(out: Path | None) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.open("ab").close()
         except OSError as error:
-            raise BadInput(f"--out {path}: can't be written ({error.strerror}); give another file") from None
+            why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
+            raise BadInput(f"--out {path}: can't be written ({why}); give another file") from None
     try:
         yield path
     finally:

@@ -30,13 +30,16 @@ def keys(as_json: bool) -> None:
 async def _list(as_json: bool) -> None:
     async with common.connected("keys", need_rcm=False) as client:
         look = Look(client)
-        state = await look.settled(loads=False)
+        sharable: set[str] | None = None
+        try:
+            state = await look.settled(loads=False)
+            sharable = {view.rc for view in state.rcs if view.sharable}
+        except common.NobodyThere:
+            if not look.hosts:
+                raise
         look.close()
-        sharable = None if state is None else {view.rc for view in state.rcs if view.sharable}
         tokens = sorted(token for host in look.hosts.values() for token in host.tokens)
         own, links = client.mesh.keys, client.mesh.links()
-        if not tokens:
-            await common.see_rcm(client)
         if as_json:
             alive = [
                 {**token._asdict(), "token": own.alive(token), "keys": served(own, token, sharable)}

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from zscout import clock
+from zscout.cli import common
 from zscout.keyexpr import Role, Sender, Token
 from zscout.messages import LoadReport, RcmState
 from zscout.scheduling.model import SECOND, Ns
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from zscout.behaviors.client import Client
     from zscout.mesh import Declared
 
-FIND_RCM: Final = 2.0
-"""Seconds to look for an RCM."""
 FIND_LOADS: Final = 1.2
 """Seconds to wait for load reports: they come once a second."""
 STALE: Final = 3 * SECOND
@@ -97,13 +96,10 @@ class Look:
                     await self.changed.wait()
         return true()
 
-    async def settled(self, *, loads: bool = True) -> RcmState | None:
-        """The RCM's state, once its RCs are seen, and hosts with their `loads`; None: no RCM."""
-        if not await self.until(lambda: bool(self.tokens(Role.RCM)), FIND_RCM):
-            return None
-        state = await self.client.state()
-        if state is None:
-            return None
+    async def settled(self, *, loads: bool = True) -> RcmState:
+        """The RCM's state, once its RCs are seen, and the hosts with their `loads`. Raises NobodyThere."""
+        await common.see_rcm(self.client)
+        state = await common.state_of(self.client)
         rcs = {view.rc for view in state.rcs if view.present}
         clients = {hold.client for hold in state.holds}
 

@@ -31,7 +31,7 @@ PASSING: Final = frozenset({"held", "remaining", "waited", "seq", "links", "load
 @click.command()
 @click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
-def status(watch: bool, as_json: bool) -> int:
+def status(watch: bool, as_json: bool) -> None:
     """Shows the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
 
     The queue stands in rank order, each ARC with what it waits for. --watch refreshes once a second; in a
@@ -43,27 +43,30 @@ def status(watch: bool, as_json: bool) -> int:
       zscout status --json | jq -r '.queue[] | .arc + ": " + .reason'
       zscout status --watch
     """
-    if watch:
-        return common.run(_watch(as_json))
-    return common.run(_once(as_json))
+    common.run(_watch(as_json) if watch else _once(as_json))
 
 
-async def _once(as_json: bool) -> int:
+async def _once(as_json: bool) -> None:
     async with common.connected("status", need_rcm=False) as client:
         look = Look(client)
-        state = await look.settled()
+        state, nobody = await _first(look)
         if as_json:
             common.print_json(as_object(look, state))
         else:
             print_picture(look, state)
-        if state is None:
-            # The words are the same as those of every other command.
-            await common.see_rcm(client)
-            raise common.NobodyThere("the RCM did not answer; try again, or see its log")
-    return 0
+        if nobody is not None:
+            raise nobody
 
 
-async def _watch(as_json: bool) -> int:
+async def _first(look: Look) -> tuple[RcmState | None, common.NobodyThere | None]:
+    """The state, or what is to be said where there is none: hosts and RCs are shown all the same."""
+    try:
+        return await look.settled(), None
+    except common.NobodyThere as nobody:
+        return None, nobody
+
+
+async def _watch(as_json: bool) -> None:
     news, stop = asyncio.Event(), asyncio.Event()
 
     def end() -> None:
@@ -84,7 +87,7 @@ async def _watch(as_json: bool) -> int:
             show = _in_place(stack, look)
         else:
             show = _blocks(look)
-        state = await look.settled()
+        state, _ = await _first(look)
         while not stop.is_set():
             look.forget_the_gone()
             show(state)
@@ -92,7 +95,6 @@ async def _watch(as_json: bool) -> int:
             await _within(HASTE, stop)
             news.clear()
             state = await client.state()
-    return 0
 
 
 async def _within(seconds: float, event: asyncio.Event) -> None:

@@ -97,6 +97,8 @@ class ResourceController:
         self._work: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
         self._tasks: set[asyncio.Task[None]] = set()
         self._reading: asyncio.Task[None] | None = None
+        self._missed = False
+        """Something was missed that has not been read since."""
         self._timer: asyncio.TimerHandle | None = None
         self._stall = stall
 
@@ -157,6 +159,8 @@ class ResourceController:
 
     def _on_grants(self, _key: str, said: Grants) -> None:
         self._apply(self.holding.hear(said, clock.now(), sharable=self.driver.sharable))
+        if self._missed:
+            self._spawn(self._read_state())
 
     def _on_state_asked(self, request: Request[RcAsk]) -> None:
         promise = request.message.promise
@@ -273,8 +277,7 @@ class ResourceController:
             self._work.put_nowait(("change", change))
         if change.outdated or change.present or change.ended:
             self.publish(change.ended)
-        if change.reread:
-            self._spawn(self._read_state())
+        self._missed |= change.reread
         self._set_timer()
 
     async def _read_state(self) -> None:
@@ -299,6 +302,7 @@ class ResourceController:
             self._apply(self.holding.read(newest, clock.now(), sharable=self.driver.sharable))
             # What was published while the answer was on its way may have hidden the very gap it was for.
             if not overtaken:
+                self._missed = False
                 return
 
     def _current(self, reply: Reply[RcmState]) -> bool:

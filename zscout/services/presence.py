@@ -60,6 +60,7 @@ class Presence:
         self._rc_tokens: dict[str, dict[str, Token]] = {}
         self._joined: dict[str, RcState] = {}
         """The RCs that count as there, as they last told of themselves."""
+        self._look_back: asyncio.TimerHandle | None = None
 
     def watch(self) -> list[Declared]:
         keys, mesh = self.mesh.keys, self.mesh
@@ -72,11 +73,16 @@ class Presence:
     def inherit(self, rcs: dict[str, RcState]) -> list[Event]:
         """The RCs that promised to obey before the reign began."""
         self._joined.update(rcs)
+        # One that died before its token was watched would never be seen to go.
+        loop = asyncio.get_running_loop()
+        self._look_back = loop.call_later(self.fleet.mesh.lease, self._lose_unseen)
         return [RcJoined(name, state.sharable) for name, state in rcs.items() if state.health == "ok"]
 
     def stop(self) -> None:
         for timer in self._unseen.values():
             timer.cancel()
+        if self._look_back is not None:
+            self._look_back.cancel()
 
     @property
     def rcs(self) -> set[str]:
@@ -121,12 +127,20 @@ class Presence:
             return
         tokens.pop(token.instance, None)
         if current is not None and current.instance == token.instance:
-            del self._joined[token.name]
-            self.reign.feed(RcLost(token.name))
-            for other in tokens.values():
-                self.reign.spawn(self._join(other))
+            self._rc_lost(token.name)
         if not tokens:
             del self._rc_tokens[token.name]
+
+    def _rc_lost(self, name: str) -> None:
+        del self._joined[name]
+        self.reign.feed(RcLost(name))
+        for other in self._rc_tokens.get(name, {}).values():
+            self.reign.spawn(self._join(other))
+
+    def _lose_unseen(self) -> None:
+        for name, state in list(self._joined.items()):
+            if state.instance not in self._rc_tokens.get(name, {}):
+                self._rc_lost(name)
 
     async def _join(self, token: Token) -> None:
         """Asks a new RC how it stands; it may be granted once it has promised to obey this term."""

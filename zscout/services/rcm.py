@@ -72,6 +72,8 @@ LOG_EVERY = 0.1
 MAX_LOGGED = 50
 """Lines in one entry of the log; the story has them all."""
 MAX_PRIORITY = 1_000_000
+MAX_GATHERED = 64
+"""Operations that are decided together at most."""
 
 
 class Rcm:
@@ -97,7 +99,13 @@ class Rcm:
         """ARCs whose reason to wait has not been published yet."""
         self._unlogged: list[str] = []
         self._answers: dict[ArcId, list[Request[Operation]]] = {}
+        self._gathered: dict[ArcId, Asked | Cancelled | Released] = {}
+        """Operations of the present burst that are not decided yet."""
+        self._given_up: set[ArcId] = set()
+        """ARCs that end in this burst by their own client's will."""
         self._names: dict[ArcId, str] = {}
+        self._moved: dict[ArcId, ArcId] = {}
+        """What was handed over: by the name that its new client has for it, by which this RCM knows it."""
         self._ended: OrderedDict[ArcId, tuple[Ns, Notice]] = OrderedDict()
         self._closed = False
 
@@ -150,8 +158,42 @@ class Rcm:
 
     def feed(self, *events: Event) -> None:
         """Gives the core one instant's events and carries out what follows."""
+        self._decide()
         if not self._closed:
             self._carry_out(self.core.handle(clock.now(), *events))
+
+    def _gather(self, arc: ArcId, event: Asked | Cancelled | Released) -> None:
+        """What was asked in one burst is one instant: one pass decides it, one publication tells it."""
+        if not self._gathered:
+            self.mesh.after_burst(self._decide)
+        self._gathered[arc] = event
+        if len(self._gathered) >= MAX_GATHERED:
+            self._decide()
+
+    def _decide(self) -> None:
+        """Hands over what was gathered: first what ends, then what was asked."""
+        gathered, self._gathered = self._gathered, {}
+        if not gathered or self._closed:
+            return
+        asked = [event for event in gathered.values() if isinstance(event, Asked)]
+        ended = [event for event in gathered.values() if not isinstance(event, Asked)]
+        try:
+            self._carry_out(self.core.handle(clock.now(), *ended, *asked))
+        except Exception:
+            problem = Refused("internal", "the request failed here; see this node's log").problem
+            for arc in gathered:
+                for request in self._answers.pop(arc, ()):
+                    request.refuse(problem)
+            raise
+        finally:
+            self._given_up.clear()
+        for event in ended:
+            self._answer(event.arc)
+        waits = [event.request.arc for event in asked if event.request.arc in self._answers]
+        if waits:
+            # Votes are out: the first word is theirs, if they come.
+            patience = self.fleet.timing.vote_timeout / SECOND + REPLY_SLACK
+            asyncio.get_running_loop().call_later(patience, self._answer_all, waits)
 
     def _on_operation(self, request: Request[Operation]) -> None:
         sender = self.mesh.keys.sender_of(request.key)
@@ -162,30 +204,35 @@ class Rcm:
                 self._ask(request, operation, sender)
             case Cancel() | Release():
                 owner = client_of(operation.client) if operation.client is not None else sender
-                arc = f"{owner}/{operation.id}"
+                arc = self._known_as(owner, operation.id)
+                self._in_order(arc)
+                if owner == sender:
+                    self._given_up.add(arc)
                 by = "its client" if owner == sender else str(sender)
-                self.feed(Cancelled(arc, by) if isinstance(operation, Cancel) else Released(arc, by))
-                request.answer(self._standing(arc, str(owner), operation.id))
+                self._answers.setdefault(arc, []).append(request)
+                self._gather(arc, Cancelled(arc, by) if isinstance(operation, Cancel) else Released(arc, by))
             case HandOver():
                 self._hand_over(request, operation, sender)
 
     def _ask(self, request: Request[Operation], ask: Ask, sender: Sender) -> None:
-        arc = f"{sender}/{ask.id}"
-        known = self.core.floor.arc(arc)
-        if known is None and arc not in self._ended:
+        arc = self._known_as(sender, ask.id)
+        self._in_order(arc)
+        if arc in self._answers:
+            self._answers[arc].append(request)
+        elif self.core.floor.arc(arc) is None and arc not in self._ended:
             wanted = self._checked(ask, sender, arc)
             self._names[arc] = ask.arc
             self.presence.expect(str(sender))
             self._answers[arc] = [request]
             self._tell(arc, ask.arc, f"asked for {', '.join(sorted(ask.needs))} at priority {ask.priority}")
-            self.feed(Asked(wanted, ask.place))
-            if arc in self._answers:
-                wait = self.fleet.timing.vote_timeout / SECOND + REPLY_SLACK
-                asyncio.get_running_loop().call_later(wait, self._answer, arc)
-        elif arc in self._answers:
-            self._answers[arc].append(request)
+            self._gather(arc, Asked(wanted, ask.place))
         else:
             request.answer(self._standing(arc, str(sender), ask.id))
+
+    def _in_order(self, arc: ArcId) -> None:
+        """Operations on one ARC stay in their order: what was gathered of it goes first."""
+        if arc in self._gathered:
+            self._decide()
 
     def _checked(self, ask: Ask, sender: Sender, arc: ArcId) -> ArcRequest:
         """The request, if it may be made at all; raises Refused with what is wrong and how to mend it."""
@@ -194,9 +241,11 @@ class Rcm:
             raise Refused("bad_request", "needs is empty; name at least one RC")
         if len(ask.needs) > limits.max_needs:
             raise Refused("bad_request", f"{len(ask.needs)} needs; at most {limits.max_needs} are allowed")
-        if len(floor.queued) >= limits.max_queued:
-            raise Refused("queue_full", f"{len(floor.queued)} ARCs wait already; ask again later")
-        if sum(1 for _ in self.core.arcs_of(str(sender))) >= limits.max_requests_per_client:
+        coming = [event for event in self._gathered.values() if isinstance(event, Asked)]
+        if len(floor.queued) + len(coming) >= limits.max_queued:
+            raise Refused("queue_full", f"{limits.max_queued} ARCs wait already; ask again later")
+        theirs = sum(1 for event in coming if event.request.client == str(sender))
+        if theirs + len(self.core.arcs_of(str(sender))) >= limits.max_requests_per_client:
             raise Refused("too_many", f"{sender} has {limits.max_requests_per_client} requests open already")
         if not -MAX_PRIORITY <= ask.priority <= MAX_PRIORITY:
             raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
@@ -225,13 +274,15 @@ class Rcm:
             raise Refused("bad_request", str(error)) from None
 
     def _hand_over(self, request: Request[Operation], operation: HandOver, sender: Sender) -> None:
-        arc = f"{sender}/{operation.id}"
+        arc = self._known_as(sender, operation.id)
         to = str(client_of(operation.to))
+        self._in_order(arc)
         running = self.core.floor.running.get(arc)
         if running is None or running.request.client not in (str(sender), to):
             raise Refused("not_running", f"{operation.id} does not run at {sender}")
         if not self.presence.alive(to):
             raise Refused("unknown_client", f"{to} is not on the mesh")
+        self._moved[views.arc_id(to, operation.id)] = arc
         self.feed(HandedOver(arc, to))
         request.answer(self._standing(arc, str(sender), operation.id))
 
@@ -322,7 +373,9 @@ class Rcm:
             grant=effect.grant,
             rcs=list(effect.rcs),
         )
-        self._notify(notice)
+        # An answer tells the client that gave it up; all others read it from the publication.
+        if effect.arc not in self._given_up:
+            self._notify(notice)
         # What was handed over goes on under its own name.
         if self.core.floor.arc(effect.arc) is None:
             self._remember(effect.arc, notice)
@@ -474,9 +527,20 @@ class Rcm:
             request.answer(notice)
         return True
 
+    def _answer_all(self, arcs: list[ArcId]) -> None:
+        for arc in arcs:
+            self._answer(arc)
+
+    def _known_as(self, client: Sender, request_id: str) -> ArcId:
+        """The ARC that a client calls so: its own, or one that was handed over to it."""
+        arc = views.arc_id(str(client), request_id)
+        return arc if self.core.floor.arc(arc) is not None else self._moved.get(arc, arc)
+
     def _remember(self, arc: ArcId, notice: Notice) -> None:
         now = clock.now()
         self._names.pop(arc, None)
+        if self._moved:
+            self._moved = {name: moved for name, moved in self._moved.items() if moved != arc}
         self._ended[arc] = (now + REMEMBER, notice)
         while self._ended and (
             len(self._ended) > MAX_REMEMBERED or next(iter(self._ended.values()))[0] < now

@@ -36,6 +36,8 @@ from zscout.services.timeline import Holder, Timeline
 log = logging.getLogger(__name__)
 
 READ_TIMEOUT = 2.0
+PAUSE = 0.1
+"""Seconds before a leader that did not answer is asked again."""
 LOOK = 1.0
 """Seconds between two looks at whether anything was dropped here."""
 DEPTH = 8_192
@@ -76,12 +78,13 @@ class Recorder:
         self._rcs: dict[str, dict[Grant, Holder]] = {}
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
         self._declared: list[Declared] = []
+        self._leaders: set[Token] = set()
         self._wanted = asyncio.Event()
         self._missed = 0
         self._caught_up = False
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Records until `stop`. Its liveliness token appears once nothing is missed any more."""
+        """Records until `stop`. Its liveliness token appears when an RCM has told it the whole state."""
         keys, mesh = self.mesh.keys, self.mesh
         self._declared = [
             mesh.subscribe(keys.grants, Grants, self._on_grants, depth=DEPTH),
@@ -90,12 +93,7 @@ class Recorder:
             mesh.subscribe(keys.load_any, LoadReport, self._on_load),
             mesh.watch(keys.alive_any(), self._on_token),
         ]
-        await self._read()
-        self._caught_up = True
-        for _, role, name in self._tokens:
-            if role == Role.RC and name not in self._rcs:
-                self._show(self._now(), name, [])
-        self._declared.append(mesh.alive(Token(mesh.me.host, Role.RECORDER, mesh.me.client, new_instance())))
+        self._wanted.set()
         reading = asyncio.create_task(self._keep_reading())
         try:
             await stop.wait()
@@ -202,21 +200,24 @@ class Recorder:
                     continue
                 log.warning("%d publications were missed; the state is read", missed - self._missed)
                 self._missed = missed
-            await self._read()
+            self._wanted.clear()
+            if not await self._read() and self._leaders:
+                await asyncio.sleep(PAUSE)
+                self._wanted.set()
 
-    async def _read(self) -> None:
-        self._wanted.clear()
-        key = self.mesh.keys.rcm_state
+    async def _read(self) -> bool:
+        """Whether the state is known now. Without a leader, the token of the next asks again."""
+        key, me = self.mesh.keys.rcm_state, self.mesh.me
         replies = await self.mesh.ask(key, StateAsk(), RcmState, timeout=READ_TIMEOUT)
         states = [reply.message for reply in replies if reply.message is not None]
         newest = max(states, key=lambda state: (state.term, state.seq), default=None)
-        # Without an answer, or with that of an RCM that was replaced, the next leader's token asks again.
-        if newest is None or newest.term < self.term:
-            return
-        if (newest.term, newest.seq) < (self.term, self.seq):
-            self._wanted.set()
-        else:
-            self._take(newest)
+        if newest is None or (newest.term, newest.seq) < (self.term, self.seq):
+            return False
+        self._take(newest)
+        if not self._caught_up:
+            self._caught_up = True
+            self._declared.append(self.mesh.alive(Token(me.host, Role.RECORDER, me.client, new_instance())))
+        return True
 
     def _take(self, state: RcmState) -> None:
         self.term, self.seq = state.term, state.seq
@@ -268,8 +269,10 @@ class Recorder:
         (instances.add if alive else instances.discard)(token.instance)
         if not instances:
             del self._tokens[token.host, token.role, token.name]
-        if token.role == Role.RCM and alive:
-            self._wanted.set()
+        if token.role == Role.RCM:
+            (self._leaders.add if alive else self._leaders.discard)(token)
+            if alive:
+                self._wanted.set()
         if bool(instances) == before and token.role != Role.RCM:
             return
         at = self._now()

@@ -29,9 +29,8 @@ def new_recording(folder: Path, fleet: str) -> Path:
                 continue
             return path
     except OSError as error:
-        raise BadInput(
-            f"recordings can't be written to {folder} ({error.strerror}); give another folder"
-        ) from None
+        why = "it is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise BadInput(f"recordings can't be written to {folder} ({why}); give another folder") from None
     raise BadInput(f"{folder} has {MAX_A_SECOND} recordings of this second; remove some")
 
 

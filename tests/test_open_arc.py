@@ -1,0 +1,91 @@
+"""A request as its client sees it: which words count, and what is kept of how a hold ended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from decimal import Decimal
+from typing import Any
+
+import msgspec
+import pytest
+
+from zscout.behaviors.arc import Revoked
+from zscout.behaviors.request import OpenArc
+from zscout.messages import Notice
+from zscout.scheduling.model import SECOND, Grant, Place, Term
+
+OLD, TERM = Term(1, "zz"), Term(2, "aa")
+FIRST, SECOND_GRANT = Grant(TERM, 1), Grant(TERM, 9)
+NOW = 1000 * SECOND
+
+
+def arc() -> OpenArc:
+    return OpenArc("id", "survey", {"robot/x": {}}, priority=0, min_runtime=Decimal(5))
+
+
+def notice(step: int, state: Any = "queued", **details: Any) -> Notice:
+    told = Notice("id", "survey", "h/c", state, TERM, step)
+    return msgspec.structs.replace(told, **details)
+
+
+RUNS = notice(2, "running", grant=FIRST, remaining=5.0, place=Place(TERM, 1))
+TAKEN = notice(3, outcome="preempted", reason="preempted by op", by="h/c/op", grant=FIRST)
+WAITS = notice(4, reason="needs robot/x")
+AGAIN = notice(5, "running", grant=SECOND_GRANT, remaining=5.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "state", "grant", "ending"),
+    [
+        ([RUNS], "running", FIRST, None),
+        ([RUNS, TAKEN], "queued", None, ("preempted", "preempted by op", "h/c/op")),
+        # The reason to wait does not hide why the hold was taken away.
+        ([RUNS, TAKEN, WAITS], "queued", None, ("preempted", "preempted by op", "h/c/op")),
+        ([RUNS, TAKEN, WAITS, AGAIN], "running", SECOND_GRANT, ("preempted", "preempted by op", "h/c/op")),
+        ([RUNS, WAITS], "queued", None, ("lost", "needs robot/x", None)),
+        ([RUNS, AGAIN], "running", SECOND_GRANT, ("lost", "it was granted anew", None)),
+        ([RUNS, notice(3, "ended", outcome="completed")], "ended", None, ("completed", "", None)),
+        ([RUNS, notice(1)], "running", FIRST, None),
+        ([RUNS, RUNS], "running", FIRST, None),
+        ([RUNS, notice(99, term=OLD)], "running", FIRST, None),
+        ([RUNS, notice(3, "ended", outcome="released"), AGAIN], "ended", None, ("released", "", None)),
+    ],
+)
+def test_words_of_the_rcm(words: list[Notice], state: str, grant: Grant | None, ending: Any) -> None:
+    known = arc()
+    for number, word in enumerate(words):
+        known.take(word, NOW + number)
+    assert (known.state, known.grant, known.ending) == (state, grant, ending)
+    assert known.told().grant == grant
+    assert known.place == Place(TERM, 1)
+
+
+def test_what_the_client_ends_itself() -> None:
+    lost, given_up = arc(), arc()
+    for known in (lost, given_up):
+        known.take(RUNS, NOW)
+    lost.lose("no RCM was heard", NOW)
+    assert (lost.state, lost.grant, lost.open, lost.ending) == (
+        "asking",
+        None,
+        True,
+        ("lost", "no RCM was heard", None),
+    )
+    given_up.finish("released", "given up", NOW)
+    assert (given_up.open, given_up.ending) == (False, ("released", "given up", None))
+    assert not given_up.take(AGAIN, NOW)
+
+
+def test_a_body_is_told_why_it_ended_whatever_came_after() -> None:
+    known = arc()
+    for word in (RUNS, TAKEN, WAITS):
+        known.take(word, NOW)
+    revoked = Revoked(known)
+    assert (revoked.outcome, revoked.by, str(revoked)) == ("preempted", "h/c/op", "preempted by op")
+
+
+def test_what_was_refused_before_any_hold_is_told_as_well() -> None:
+    known = arc()
+    known.take(notice(1, "ended", outcome="cancelled", reason="cancelled by an operator"), NOW)
+    revoked = Revoked(replace(known))
+    assert (revoked.outcome, str(revoked)) == ("cancelled", "cancelled by an operator")
