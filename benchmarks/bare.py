@@ -1,22 +1,20 @@
 """The bare cost: a plain Zenoh query, with nothing of zscout on the path.
 
-`python -m benchmarks.bare CONFIG KEY BYTES` is the other end: a queryable whose direct callback sends BYTES.
-`--answer TEXT` sends TEXT instead. It says "ready" on stdout, and ends when stdin is closed.
+`python -m benchmarks.bare ADDRESS KEY --bytes N` is the other end, a child process (see child.py): a
+queryable whose direct callback sends N bytes. `--answer TEXT` sends TEXT instead.
 """
 
 from __future__ import annotations
 
 import argparse
 import queue
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import zenoh
 from zenoh.handlers import Callback
 
+from benchmarks.child import ready
 from benchmarks.stats import Samples
 
 KEY = "bench/bare"
@@ -37,12 +35,13 @@ def settings(address: str) -> zenoh.Config:
 class BareQuery:
     """Asks in two ways, and goes on with the one that proves faster."""
 
-    def __init__(self, session: zenoh.Session, payload: bytes) -> None:
-        self._session, self._payload = session, payload
+    def __init__(self, payload: bytes) -> None:
+        self._payload = payload
         self.once = self._blocking
 
-    def choose(self) -> str:
+    def choose(self, session: zenoh.Session) -> str:
         """Waits for the other end, tries both ways, and returns the name of the faster."""
+        self._session = session
         deadline = time.monotonic() + START
         while not self._answered():
             if time.monotonic() > deadline:
@@ -57,7 +56,9 @@ class BareQuery:
         return fastest
 
     def _answered(self) -> bool:
-        return any(reply.ok is not None for reply in self._session.get(KEY, payload=self._payload, timeout=1.0))
+        return any(
+            reply.ok is not None for reply in self._session.get(KEY, payload=self._payload, timeout=1.0)
+        )
 
     def _blocking(self) -> float:
         start = time.perf_counter()
@@ -77,20 +78,6 @@ class BareQuery:
         return took
 
 
-@contextmanager
-def other_end(address: str, key: str, *more: str) -> Iterator[subprocess.Popen[str]]:
-    """Runs the queryable in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.bare", address, key, *more]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert process.stdin is not None and process.stdout is not None
-    try:
-        assert process.stdout.readline().strip() == "ready", "the bare queryable did not start"
-        yield process
-    finally:
-        process.stdin.close()
-        process.wait(10)
-
-
 def _nothing() -> None:
     pass
 
@@ -99,7 +86,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("address")
     parser.add_argument("key")
-    parser.add_argument("bytes", type=int, nargs="?", default=0)
+    parser.add_argument("--bytes", type=int, default=0)
     parser.add_argument("--answer")
     args = parser.parse_args()
     reply = args.answer.encode() if args.answer is not None else b"x" * args.bytes
@@ -111,7 +98,7 @@ def main() -> None:
 
     with zenoh.open(settings(args.address)) as session:
         session.declare_queryable(args.key, Callback(answer, _nothing, indirect=False), complete=False)
-        print("ready", flush=True)
+        ready()
         sys.stdin.read()
 
 

@@ -1,8 +1,8 @@
 """Twenty behaviors that contend for ten RCs, against the same programs asking an empty queryable.
 
 The behaviors run in a few programs of equal size, each with one session on either mesh. Both are asked by
-the very same client code: request, wait for the grant, give back. `python -m benchmarks.crowd` is one program:
-it takes orders as JSON lines on stdin and answers with what it counted, and ends when stdin is closed.
+the very same client code: request, wait for the grant, give back; a cycle counts when it is granted. One
+program is `python -m benchmarks.crowd`, a child process (see child.py) that takes orders as JSON lines.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ import asyncio
 import json
 import random
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
-from benchmarks import bare
+from benchmarks.child import child, ready
 from benchmarks.latency import EXCLUSIVE, HOLD, running
 from benchmarks.loop import run
 from benchmarks.stats import Row
@@ -33,6 +32,7 @@ from zscout.scheduling.model import Grant, Place, Term
 BEHAVIORS = 20
 PROGRAMS = 4
 SEED = 2002
+WARM_UP = 1.0
 MOST = 5
 """RCs in one request."""
 TERM = Term(1, "0123456789ab")
@@ -51,64 +51,32 @@ GRANTED = Notice(
 """What the empty queryable says to everything."""
 
 
-class Program:
-    """One program of the crowd, as the benchmark sees it."""
-
-    def __init__(self, lab: Lab, empty: Lab, number: int, behaviors: int) -> None:
-        self._process = subprocess.Popen(
-            [
-                sys.executable,
-                *("-m", "benchmarks.crowd", str(lab.fleet_file), str(empty.fleet_file)),
-                *(str(number), str(behaviors)),
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    def order(self, what: dict[str, Any]) -> None:
-        assert self._process.stdin is not None
-        print(json.dumps(what), file=self._process.stdin, flush=True)
-
-    async def report(self) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        line = await asyncio.to_thread(self._process.stdout.readline)
-        assert line, "a program of the crowd ended"
-        report: dict[str, Any] = json.loads(line)
-        return report
-
-    def close(self) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(20)
-
-
 async def crowd(
-    lab: Lab, folder: Path, rounds: int, seconds: float, progress: Callable[[str], None], programs: int = PROGRAMS
+    lab: Lab,
+    folder: Path,
+    rounds: int,
+    seconds: float,
+    progress: Callable[[str], None],
+    programs: int = PROGRAMS,
 ) -> list[Row]:
     """Rows for the grants a second, as a share of what the empty queryable answers."""
-    folder.mkdir()
     empty = Lab(folder)
     answer = messages.encode(GRANTED).decode()
     key = Keys(empty.fleet.name).schedule_any
-    members: list[Program] = []
     rates: dict[str, list[float]] = {"rcm": [], "empty": []}
-    with bare.other_end(empty.fleet.mesh.multicast_address, key, "--answer", answer):
-        try:
-            members += [Program(lab, empty, number, BEHAVIORS // programs) for number in range(programs)]
-            for member in members:
-                await member.report()
-            for number in range(-1, rounds):
-                for which, rate in rates.items():
-                    for member in members:
-                        member.order({"which": which, "seconds": seconds if number >= 0 else 1.0})
-                    counts = [(await member.report())["cycles"] for member in members]
-                    if number >= 0:
-                        rate.append(sum(counts) / seconds)
-                progress(f"crowd: round {max(number + 1, 0)} of {rounds}")
-        finally:
-            for member in members:
-                member.close()
+    with ExitStack() as stack:
+        stack.enter_context(child("bare", empty.fleet.mesh.multicast_address, key, "--answer", answer))
+        files = str(lab.fleet_file), str(empty.fleet_file)
+        size = str(BEHAVIORS // programs)
+        members = [stack.enter_context(child("crowd", *files, str(n), size)) for n in range(programs)]
+        for number in range(-1, rounds):
+            for which, rate in rates.items():
+                for member in members:
+                    member.order({"which": which, "seconds": seconds if number >= 0 else WARM_UP})
+                counts = [await asyncio.to_thread(member.report) for member in members]
+                if number >= 0:
+                    rate.append(sum(counts) / seconds)
+            progress(f"crowd: round {max(number + 1, 0)} of {rounds}")
     granted, answered = statistics.median(rates["rcm"]), statistics.median(rates["empty"])
     name = f"{BEHAVIORS} behaviors, {len(EXCLUSIVE)} RCs, {programs} programs"
     return [
@@ -143,17 +111,17 @@ async def program(fleet_file: Path, empty_file: Path, number: int, behaviors: in
         which: await Client.connect(f"crowd-{number}", fleet=load_fleet(file), host="test")
         for which, file in (("rcm", fleet_file), ("empty", empty_file))
     }
-    rngs = [random.Random(SEED + number * behaviors + which) for which in range(behaviors)]
+    rngs = [random.Random(SEED + number * behaviors + which) for which in range(behaviors)]  # noqa: S311
     for client in clients.values():
         # Once each is answered, all are linked.
         await client.end(await client.request("hello", {EXCLUSIVE[number]: {}}, min_runtime=HOLD))
-    print(json.dumps({"ready": True}), flush=True)
+    ready()
     while line := await asyncio.to_thread(sys.stdin.readline):
         order = json.loads(line)
         until = time.monotonic() + order["seconds"]
         client = clients[order["which"]]
         cycles = await asyncio.gather(*(behave(client, rng, until) for rng in rngs))
-        print(json.dumps({"cycles": sum(cycles)}), flush=True)
+        print(json.dumps(sum(cycles)), flush=True)
     for client in clients.values():
         await client.close()
 

@@ -1,6 +1,6 @@
-"""The other end of the asyncio face: `Mesh.serve` that answers at once. Ends when stdin is closed.
+"""The other end of the asyncio face: `Mesh.serve` that answers at once.
 
-`python -m benchmarks.face FLEET_FILE`
+`python -m benchmarks.face FLEET_FILE` is a child process (see child.py).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import asyncio
 import sys
 from pathlib import Path
 
+from benchmarks.child import ready
 from benchmarks.loop import run
 from zscout.config import load_fleet
 from zscout.keyexpr import Keys, Sender
@@ -46,7 +47,7 @@ async def serve(fleet_file: Path) -> None:
 
     async with await Mesh.open(fleet.name, Sender("bench", "face"), fleet.mesh) as mesh:
         mesh.serve(key(mesh.keys), StateAsk, answer)
-        print("ready", flush=True)
+        ready()
         await asyncio.to_thread(sys.stdin.read)
 
 

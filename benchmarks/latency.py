@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -12,13 +10,13 @@ from pathlib import Path
 import zenoh
 
 from benchmarks import bare, face
+from benchmarks.child import child
 from benchmarks.stats import Row, Samples, of_latency
 from tests.live.lab import Lab
 from zscout import messages
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import Needs, OpenArc
 from zscout.messages import Ask, Notice, StateAsk
-from zscout.scheduling.model import Place
 
 EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
 SHARABLE = ["radio/rf0", "video/ch1"]
@@ -56,29 +54,26 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
     ask = len(messages.encode(Ask("0123456789ab", "bench", {EXCLUSIVE[0]: {}}, 0, 60)))  # type: ignore[arg-type]
     address = lab.fleet.mesh.multicast_address.replace("224.0.0.224", "224.0.0.225")
 
+    bare_query = bare.BareQuery(b"x" * ask)
+
+    def space() -> None:
+        for _ in range(SPACERS):
+            bare_query.once()
+
     async def face_query() -> float:
         start = time.perf_counter()
-        reply = await client.mesh.ask_one(face.key(client.mesh.keys), StateAsk(arc="x" * ask), Notice, timeout=5)
+        reply = await client.mesh.ask_one(
+            face.key(client.mesh.keys), StateAsk(arc="x" * ask), Notice, timeout=5
+        )
         took = time.perf_counter() - start
-        assert reply is not None and reply.message is not None, "the face did not answer"
+        assert reply is not None, "the face did not answer"
         return took
 
-    def grant(needs: Needs) -> Callable[[], Awaitable[float]]:
+    def grant(needs: Needs, *, confirm: bool = False) -> Callable[[], Awaitable[float]]:
         async def measured() -> float:
             start = time.perf_counter()
             arc = await client.request("bench", needs, min_runtime=HOLD)
-            await running(client, arc)
-            took = time.perf_counter() - start
-            await client.end(arc)
-            return took
-
-        return measured
-
-    def confirmed(needs: Needs) -> Callable[[], Awaitable[float]]:
-        async def measured() -> float:
-            start = time.perf_counter()
-            arc = await client.request("bench", needs, min_runtime=HOLD)
-            await client.granted(arc)
+            await (client.granted(arc) if confirm else running(client, arc))
             took = time.perf_counter() - start
             await client.end(arc)
             return took
@@ -90,8 +85,7 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
         await running(client, holder)
         waiter = await second.request("waiter", one, min_runtime=HOLD)
         assert waiter.state == "queued"
-        for _ in range(SPACERS):
-            query.once()
+        space()
         start = time.perf_counter()
         released = asyncio.create_task(client.end(holder))
         await running(second, waiter)
@@ -105,9 +99,9 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
         "grant, 1 RC": grant(one),
         "grant, 5 RCs": grant(five),
         "grant, 2 votes": grant(votes),
-        "grant and confirmation, 1 RC": confirmed(one),
-        "grant and confirmation, 5 RCs": confirmed(five),
-        "grant and confirmation, 2 votes": confirmed(votes),
+        "grant and confirmation, 1 RC": grant(one, confirm=True),
+        "grant and confirmation, 5 RCs": grant(five, confirm=True),
+        "grant and confirmation, 2 votes": grant(votes, confirm=True),
         "release to next grant": next_waiter,
     }
     aims = {
@@ -118,36 +112,26 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
     }
     samples = {name: Samples() for name in measured}
     bare_samples = Samples()
-    other = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.face", str(lab.fleet_file)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert other.stdin is not None and other.stdout is not None
-    try:
-        assert other.stdout.readline().strip() == "ready"
+    size = len(messages.encode(face.NOTICE))
+    with (
+        child("face", str(lab.fleet_file)),
+        child("bare", address, bare.KEY, "--bytes", str(size)),
+        zenoh.open(bare.settings(address)) as session,
+    ):
         while await client.mesh.ask_one(face.key(client.mesh.keys), None, Notice, timeout=1) is None:
-            pass
-        size = len(messages.encode(face.NOTICE))
-        with bare.other_end(address, bare.KEY, str(size)), zenoh.open(bare.settings(address)) as session:
-            query = bare.BareQuery(session, b"x" * ask)
-            way = query.choose()
-            progress(f"bare query: {way}, {ask} bytes out, {size} back")
-            for number in range(-rounds // 10, rounds):
-                for name, measure in measured.items():
-                    for _ in range(SPACERS):
-                        query.once()
-                    reference = query.once()
-                    took = await measure()
-                    if number >= 0:
-                        samples[name].add(took)
-                        bare_samples.add(reference)
-                if number % 100 == 0:
-                    progress(f"latencies: round {number} of {rounds}")
-    finally:
-        other.stdin.close()
-        await asyncio.to_thread(other.wait, 10)
+            progress("looking for the asyncio face")
+        way = bare_query.choose(session)
+        progress(f"bare query: {way}, {ask} bytes out, {size} back")
+        for number in range(-rounds // 10, rounds):
+            for name, measure in measured.items():
+                space()
+                reference = bare_query.once()
+                took = await measure()
+                if number >= 0:
+                    samples[name].add(took)
+                    bare_samples.add(reference)
+            if number % 100 == 0:
+                progress(f"latencies: round {max(number, 0)} of {rounds}")
     rows = [of_latency("bare query", bare_samples, bare_samples)]
     rows += [of_latency(name, samples[name], bare_samples, aim=aims.get(name)) for name in measured]
     return rows

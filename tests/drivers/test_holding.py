@@ -109,6 +109,7 @@ HELD = said(2, ONE)
         pytest.param(said(2, ONE), [2], False, False, id="the same once more"),
         pytest.param(said(2, touches=False, prev=2), [2], False, False, id="a heartbeat"),
         pytest.param(said(9, touches=False), [2], False, True, id="a gap"),
+        pytest.param(said(4, touches=False), [2], False, True, id="a gap of one publication"),
         pytest.param(said(9, TWO), [3], False, True, id="a gap, and full lists all the same"),
         pytest.param(said(9, touches=False, prev=9), [2], False, True, id="a heartbeat tells of a gap"),
         pytest.param(said(1, TWO), [2], False, False, id="an older number of this term"),

@@ -1,0 +1,74 @@
+"""`make bench`: what a grant costs, as ratios to a bare Zenoh query of the same run."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks import crowd, latency, process
+from benchmarks.loop import run
+from benchmarks.stats import Row, table
+
+
+def progress(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+async def measure(rounds: int, crowds: int, programs: int) -> list[Row]:
+    with tempfile.TemporaryDirectory(prefix="zscout-bench-") as name:
+        folder = Path(name)
+        async with latency.fleet_of(folder) as lab:
+            latency.start(lab)
+            first = await lab.client("first")
+            await lab.ready(first, *latency.EXCLUSIVE, *latency.SHARABLE)
+            await first.close()
+            lab.clients.clear()
+            progress("idle nodes")
+            rows = await process.idle(lab)
+            progress("zscout --help")
+            rows += process.help_time(rounds=15)
+            rows = await latency.latencies(lab, rounds, progress) + rows
+            (folder / "empty").mkdir()
+            rows += await crowd.crowd(lab, folder / "empty", crowds, 3.0, progress, programs)
+            rows += process.memory_after(lab)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.add_argument("--rounds", type=int, default=500, help="of each latency (default: 500)")
+    parser.add_argument("--crowds", type=int, default=5, help="rounds of the crowd (default: 5)")
+    parser.add_argument("--programs", type=int, default=4, help="that the 20 behaviors run in (default: 4)")
+    args = parser.parse_args()
+    if args.rounds < 10 or args.crowds < 1 or crowd.BEHAVIORS % args.programs:
+        parser.error("at least 10 rounds and 1 crowd; programs must divide 20")
+    start = time.monotonic()
+    load = os.getloadavg()[0]
+    rows = run(measure(args.rounds, args.crowds, args.programs))
+    machine = {
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "load_average_at_start": round(load, 2),
+        "load_average_at_end": round(os.getloadavg()[0], 2),
+        "seconds": round(time.monotonic() - start),
+    }
+    if args.json:
+        print(json.dumps({"machine": machine, "rows": [row.as_json() for row in rows]}, indent=2))
+        return
+    print(table(rows))
+    print(
+        f"\n{machine['cores']} cores, Python {machine['python']}; {machine['seconds']} s; load average "
+        f"{machine['load_average_at_start']} before, {machine['load_average_at_end']} after."
+        "\nMedians; the latencies interleaved with bare queries, A B A B. Ratios compare medians of one run."
+    )
+
+
+if __name__ == "__main__":
+    main()
