@@ -18,7 +18,8 @@ import uvloop
 
 from zscout import __version__
 from zscout.config import Node, RcSpec, default_node, load_node
-from zscout.drivers.base import CapacityDriver, Driver, ExclusiveDriver, ResourceController
+from zscout.drivers.base import Driver, ResourceController
+from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError
 from zscout.scheduling.model import SECOND

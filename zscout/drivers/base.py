@@ -10,12 +10,9 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Coroutine, Mapping
-from decimal import Decimal
-from fractions import Fraction
 from typing import Any
 
 from zscout import clock
-from zscout.amounts import exact_amounts
 from zscout.drivers.holding import Change, Holding
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declared, Mesh, Refused, Reply, Request
@@ -36,7 +33,6 @@ from zscout.messages import (
     absurd,
 )
 from zscout.scheduling.model import SECOND, Ns
-from zscout.scheduling.workload import excess
 from zscout.stall import StallWatch
 
 log = logging.getLogger(__name__)
@@ -335,33 +331,3 @@ def _handed_over(change: Change) -> bool:
     before = {holder.place: holder.client for holder in change.stopped}
     after = {holder.place: holder.client for holder in change.began}
     return before.keys() == after.keys() and all(after[place] != client for place, client in before.items())
-
-
-class ExclusiveDriver(Driver):
-    """A device that needs no driver of its own to be shared: it is held, and nothing more."""
-
-    def __init__(self, *, activation: float = 0.0) -> None:
-        self.activation = activation
-
-    async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        """Knows `echo`, which returns its `value`."""
-        if do.get("name") == "echo":
-            return do.get("value")
-        return await super().command(holder, do)
-
-
-class CapacityDriver(ExclusiveDriver):
-    """A sharable device that carries holders as long as no bandwidth parameter's sum exceeds its bound."""
-
-    sharable = True
-
-    def __init__(self, capacity: Mapping[str, Fraction], *, activation: float = 0.0) -> None:
-        super().__init__(activation=activation)
-        self._capacity = dict(capacity)
-
-    def vote(self, holders: list[ProposedHolder]) -> str:
-        wanted = ((holder.id, exact_amounts(holder.params)) for holder in holders)
-        return excess(self._capacity, wanted)
-
-    def capacity(self) -> Amounts:
-        return {name: Decimal(repr(float(bound))) for name, bound in self._capacity.items()}
