@@ -124,9 +124,10 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
         progress(f"bare query: {way}, {ask} bytes out, {size} back")
         for number in range(-rounds // 10, rounds):
             for name, measure in measured.items():
-                space()
-                reference = bare_query.once()
-                took = await measure()
+                for _ in range(2):
+                    reference = bare_query.once()
+                for _ in range(2):
+                    took = await measure()
                 if number >= 0:
                     samples[name].add(took)
                     bare_samples.add(reference)

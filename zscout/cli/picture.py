@@ -19,16 +19,19 @@ if TYPE_CHECKING:
 
 MAX_ROWS: Final = 500
 """Of one table at a terminal."""
+NARROW: Final = 110
+"""Columns of a terminal below which tables leave out what matters least."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts; `styles` has Rich's style for each row."""
+    """Rows of texts; `styles` has Rich's style for each, `spare` the columns that a narrow terminal omits."""
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     styles: Sequence[str]
+    spare: tuple[str, ...] = ()
 
 
 def _headline(look: Look, state: RcmState | None) -> str:
@@ -79,7 +82,7 @@ def _running_table(look: Look, state: RcmState) -> Table:
             )
         )
         styles.append("bold red" if hold.priority >= look.client.fleet.operator_priority else "")
-    return Table("Running", ("ARC", "PRIORITY", "SINCE", "LEFT", "CLIENT", "RCS"), rows, styles)
+    return Table("Running", ("ARC", "PRIORITY", "SINCE", "LEFT", "CLIENT", "RCS"), rows, styles, ("CLIENT",))
 
 
 def _waiting_table(state: RcmState) -> Table:
@@ -98,7 +101,7 @@ def _waiting_table(state: RcmState) -> Table:
     ]
     title = f"Waiting, and {state.more} more" if state.more else "Waiting"
     columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "PREEMPTED", "CLIENT", "WHY")
-    return Table(title, columns, rows, [""] * len(rows))
+    return Table(title, columns, rows, [""] * len(rows), ("RUNTIME", "PREEMPTED", "CLIENT"))
 
 
 def _host_table(look: Look) -> Table:
@@ -155,6 +158,7 @@ def rich_picture(look: Look, state: RcmState | None, *after: Text) -> Group:
     from rich.console import Group
     from rich.text import Text
 
+    narrow = common.console().width < NARROW
     parts: list[Any] = [Text(_headline(look, state), style="bold" if state is not None else "bold red")]
     for table in _tables(look, state):
         if not table.rows:
@@ -162,10 +166,11 @@ def rich_picture(look: Look, state: RcmState | None, *after: Text) -> Group:
         shown = rich_table.Table(
             title=table.title, title_justify="left", title_style="bold cyan", box=None, padding=(0, 2, 0, 0)
         )
-        for column in table.columns:
-            shown.add_column(column, header_style="dim")
+        kept = [at for at, name in enumerate(table.columns) if not (narrow and name in table.spare)]
+        for at in kept:
+            shown.add_column(table.columns[at], header_style="dim", overflow="fold")
         for row, style in zip(table.rows[:MAX_ROWS], table.styles, strict=False):
-            shown.add_row(*(Text(common.clean(cell)) for cell in row), style=style)
+            shown.add_row(*(Text(common.clean(row[at])) for at in kept), style=style)
         parts += [Text(""), shown]
         if len(table.rows) > MAX_ROWS:
             parts.append(Text(f"... {len(table.rows) - MAX_ROWS} more rows: --json has all", style="dim"))
