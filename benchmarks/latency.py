@@ -20,9 +20,9 @@ from zscout.messages import Ask, Notice, StateAsk
 
 EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
 SHARABLE = ["radio/rf0", "video/ch1"]
-SPACERS = 3
-"""Bare queries that do not count between two measurements, so that nothing pays for what the one before it
-left behind, and all find the processors awake."""
+HOT = 3
+"""Times that each thing is done in a row, of which the last counts: an idle processor and cold caches cost
+more than anything that is measured here, and most where many processes take part."""
 HOLD = 60.0
 
 
@@ -56,10 +56,6 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
 
     bare_query = bare.BareQuery(b"x" * ask)
 
-    def space() -> None:
-        for _ in range(SPACERS):
-            bare_query.once()
-
     async def face_query() -> float:
         start = time.perf_counter()
         reply = await client.mesh.ask_one(
@@ -85,7 +81,6 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
         await running(client, holder)
         waiter = await second.request("waiter", one, min_runtime=HOLD)
         assert waiter.state == "queued"
-        space()
         start = time.perf_counter()
         released = asyncio.create_task(client.end(holder))
         await running(second, waiter)
@@ -124,9 +119,9 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
         progress(f"bare query: {way}, {ask} bytes out, {size} back")
         for number in range(-rounds // 10, rounds):
             for name, measure in measured.items():
-                for _ in range(2):
+                for _ in range(HOT):
                     reference = bare_query.once()
-                for _ in range(2):
+                for _ in range(HOT):
                     took = await measure()
                 if number >= 0:
                     samples[name].add(took)

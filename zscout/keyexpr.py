@@ -9,17 +9,21 @@ from __future__ import annotations
 import re
 import secrets
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 MAX_NAME = 64
 NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
 ROOT = "zscout"
+REMEMBERED = 4_096
+"""Valid names that are not looked at again."""
 
 
 class BadName(ValueError):
     """A name or a key that can't stand in the key space; the message says which and why."""
 
 
+@lru_cache(REMEMBERED)
 def check_name(name: str, what: str = "name") -> str:
     """`name` itself if it may stand in a key; raises BadName otherwise."""
     if NAME.fullmatch(name) is None:
@@ -27,6 +31,7 @@ def check_name(name: str, what: str = "name") -> str:
     return name
 
 
+@lru_cache(REMEMBERED)
 def check_rc(name: str) -> str:
     """`kind/name` itself if it names an RC; raises BadName otherwise."""
     kind, slash, rest = name.partition("/")

@@ -39,6 +39,8 @@ log = logging.getLogger(__name__)
 
 INBOX_DEPTH = 20_000
 """Items of all kinds that may wait for the event loop."""
+BURST = 256
+"""Items that are handled in one go at most, those included that arrive meanwhile."""
 QUEUE_DEPTH = 1_024
 """Items of one declaration that may wait for the event loop."""
 BLOCK_US = 100_000
@@ -218,28 +220,28 @@ class _Inbox:
         return True
 
     def drain(self) -> None:
-        self.scheduled = False
         self.draining = True
-        for _ in range(len(self.items)):
-            state, call, args = self.items.popleft()
-            if state is not None:
-                state.pending -= 1
-                if state.closed:
-                    continue
-            try:
-                call(*args)
-            except Exception:
-                log.exception("a handler failed")
-        self.draining = False
-        after, self.after = self.after, []
-        for then in after:
-            try:
-                then()
-            except Exception:
-                log.exception("a handler failed")
-        if self.items and not self.scheduled:
-            self.scheduled = True
-            self.loop.call_soon(self.drain)
+        try:
+            for _ in range(BURST):
+                if not self.items:
+                    break
+                state, call, args = self.items.popleft()
+                if state is not None:
+                    state.pending -= 1
+                    if state.closed:
+                        continue
+                _guarded(call, *args)
+            self.draining = False
+            after, self.after = self.after, []
+            for then in after:
+                _guarded(then)
+        finally:
+            self.draining = False
+            # In this order: who offers something now either sees that nobody is coming, or is seen.
+            self.scheduled = False
+            if self.items:
+                self.scheduled = True
+                self.loop.call_soon(self.drain)
 
 
 class Mesh:
@@ -652,6 +654,13 @@ def _reply_problem(query: zenoh.Query, problem: Problem) -> None:
         query.reply_err(messages.encode(problem), encoding=_encoding(Problem))
     except zenoh.ZError as error:
         log.debug("an error answer was not sent: %s", error)
+
+
+def _guarded(call: Callable[..., None], *args: Any) -> None:
+    try:
+        call(*args)
+    except Exception:
+        log.exception("a handler failed")
 
 
 def _drop(query: zenoh.Query) -> None:
