@@ -25,7 +25,7 @@ demo: $(READY)
 	$(BIN)/zscout demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 lint: $(READY)
 	$(BIN)/ruff format --check .

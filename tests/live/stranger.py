@@ -51,7 +51,10 @@ class Stranger:
             if reply.ok is not None:
                 found.append(("ok", json.loads(reply.ok.payload.to_bytes())))
             elif reply.err is not None:
-                found.append(("err", json.loads(reply.err.payload.to_bytes())))
+                payload = reply.err.payload.to_bytes()
+                # Zenoh's own word for "unknown": a queryable that is taken back may leave a query unanswered.
+                if payload != b"Timeout":
+                    found.append(("err", json.loads(payload)))
         return found
 
     def ask(self, key: str, message: Json) -> Json:

@@ -27,12 +27,16 @@ def test_a_gang_over_two_nodes_is_granted_commanded_and_preempted(tmp_path: Path
                 async with hold(client, "operator", {"robot/b": {}}, priority=10, min_runtime=0.2):
                     await asyncio.Event().wait()
 
-            with pytest.raises(Revoked) as revoked:
+            async def survey() -> None:
+                nonlocal operator
                 async with hold(client, "survey", needs, min_runtime=30) as held:
                     done = await held.command("robot/a", {"name": "echo", "value": [1, 2]})
                     assert done.result == [1, 2]
                     operator = asyncio.create_task(take())
                     await asyncio.Event().wait()
+
+            with pytest.raises(Revoked) as revoked:
+                await survey()
             assert revoked.value.outcome == "preempted"
             assert operator is not None
             await operator

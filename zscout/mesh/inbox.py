@@ -70,8 +70,6 @@ class Inbox:
                 state, call, args = self.items.popleft()
                 if state is not None:
                     state.pending -= 1
-                    if state.closed:
-                        continue
                 guarded(call, *args)
             self.draining = False
             after, self.after = self.after, []

@@ -205,11 +205,17 @@ class Mesh:
         wild = "*" in key
 
         def on_query(query: zenoh.Query) -> None:
-            if not self._inbox.offer(state, handle, query, clock.now()):
+            if state.closed:
+                drop(query)
+            elif not self._inbox.offer(state, handle, query, clock.now()):
                 reply_problem(query, Problem("busy", "too many requests are waiting here; ask again"))
                 drop(query)
 
         def handle(query: zenoh.Query, arrived: Ns) -> None:
+            if state.closed:
+                # Unless it is dropped here and now, its asker waits for the whole of its timeout.
+                drop(query)
+                return
             asked = str(query.key_expr)
             if wild and "*" in asked:
                 reply_problem(query, Problem("bad_key", f"name yourself in the key {key}: no wildcards"))
@@ -311,6 +317,8 @@ class Mesh:
                 state.missed += 1
 
         def handle(sample: zenoh.Sample) -> None:
+            if state.closed:
+                return
             try:
                 message: S = messages.decode(sample.payload.to_bytes(), kind, limit)
             except Malformed as error:

@@ -127,9 +127,8 @@ class Visit:
 
     def obstacle(self, off_limits: int) -> str:
         """Why the ARC can't start whatever becomes of the visits that are open; empty if it may."""
-        absent = self.arc.mask & ~self.floor.present
-        if absent:
-            return f"{_list([rc.name for rc in self.floor.of(absent)])} not on the mesh"
+        if absent := absence(self.floor, self.arc):
+            return absent
         if any(not rc.bit & off_limits for rc, _ in self.firm):
             return "needs " + _list([f"{rc.name} (held by {_who(holder)})" for rc, holder in self.firm])
         if not off_limits:
@@ -162,6 +161,16 @@ class Visit:
                     return verdict
         return Admitted(sorted(victims, key=lambda arc: arc.rank))
 
+    def refusal(self) -> str:
+        """The veto that keeps the ARC out beside those who would stay; empty if none is known."""
+        for rc in self._sharables:
+            answer = self.votes.known(rc.name, self._firm_holders(rc))
+            if answer is None and self.votes.silent(rc.name):
+                return f"{rc.name} does not answer"
+            if answer is not None and not answer.accept:
+                return _veto(rc, answer.reason)
+        return ""
+
     def _firm_holders(self, rc: Rc) -> HolderSet:
         stay = (arc for arc in rc.holders if arc not in self.blockers and arc not in self.candidates)
         return frozenset((*stay, self.arc.id))
@@ -180,6 +189,12 @@ class Visit:
             elif not answer.accept:
                 return Refused(_veto(rc, answer.reason))
         return Open(unknown) if unknown else None
+
+
+def absence(floor: Floor, arc: Arc) -> str:
+    """Which RCs of `arc` are not there, in words; empty if all are."""
+    absent = arc.mask & ~floor.present
+    return f"{_list([rc.name for rc in floor.of(absent)])} not on the mesh" if absent else ""
 
 
 def _who(holder: Arc) -> str:

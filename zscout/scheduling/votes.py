@@ -72,6 +72,10 @@ class Votes:
         """The answer that stands for exactly this set, by itself or by what it implies; None if unknown."""
         return self._ballots.setdefault(rc, Ballot()).known(holders)
 
+    def vetoed(self, rc: RcName) -> list[HolderSet]:
+        """The sets that an RC has vetoed; each rules out every larger one as well."""
+        return list(self._ballots.setdefault(rc, Ballot()).vetoed)
+
     def silent(self, rc: RcName) -> bool:
         return self._ballots.setdefault(rc, Ballot()).silent
 

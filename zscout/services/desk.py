@@ -1,0 +1,183 @@
+"""The RCM's desk: operations come in, and are answered once they are decided.
+
+What arrives in one burst is one instant: one pass decides it and one publication tells it. Operations on one
+ARC stay in their order.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+
+from zscout.config import Fleet
+from zscout.keyexpr import Sender, check_name, client_of
+from zscout.mesh import Mesh, Refused, Request
+from zscout.messages import Ask, Cancel, HandOver, Operation, Release
+from zscout.scheduling.core import Core
+from zscout.scheduling.events import Asked, Cancelled, Event, HandedOver, Released
+from zscout.scheduling.model import SECOND, ArcId
+from zscout.services import views
+from zscout.services.admission import admit
+from zscout.services.notices import Notices
+from zscout.services.presence import Presence
+
+REPLY_SLACK = 0.1
+MAX_GATHERED = 64
+"""Operations that are decided together at most."""
+
+
+class Desk:
+    """Takes operations, gathers bursts, keeps the questions that wait for their answer."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        core: Core,
+        notices: Notices,
+        presence: Presence,
+        decide: Callable[[Sequence[Event]], None],
+    ) -> None:
+        self.mesh, self.fleet, self.core = mesh, fleet, core
+        self.notices, self.presence = notices, presence
+        self._carry_out = decide
+        self._answers: dict[ArcId, list[Request[Operation]]] = {}
+        self._gathered: dict[ArcId, Asked | Cancelled | Released] = {}
+        """Operations of the present burst that are not decided yet."""
+        self._given_up: set[ArcId] = set()
+        """ARCs that end in this burst by their own client's will."""
+        self._moved: dict[ArcId, ArcId] = {}
+        """What was handed over: by the name that its new client has for it, by which this RCM knows it."""
+        self._closed = False
+
+    def close(self) -> None:
+        """Refuses what still waits: another RCM has to be asked."""
+        self._closed = True
+        for requests in self._answers.values():
+            for request in requests:
+                request.refuse(Refused("not_leading", "this RCM stopped leading; ask again").problem)
+
+    def waiting(self, arc: ArcId) -> bool:
+        """Whether somebody waits for the first word about `arc`."""
+        return arc in self._answers
+
+    def given_up(self, arc: ArcId) -> bool:
+        """Whether `arc` ends in this burst by its own client's will."""
+        return arc in self._given_up
+
+    def _gather(self, arc: ArcId, event: Asked | Cancelled | Released) -> None:
+        """What was asked in one burst is one instant: one pass decides it, one publication tells it."""
+        if not self._gathered:
+            self.mesh.after_burst(self.decide)
+        self._gathered[arc] = event
+        if len(self._gathered) >= MAX_GATHERED:
+            self.decide()
+
+    def decide(self) -> None:
+        """Hands over what was gathered: first what ends, then what was asked."""
+        gathered, self._gathered = self._gathered, {}
+        if not gathered or self._closed:
+            return
+        asked = [event for event in gathered.values() if isinstance(event, Asked)]
+        ended = [event for event in gathered.values() if not isinstance(event, Asked)]
+        try:
+            self._carry_out((*ended, *asked))
+        except Exception:
+            problem = Refused("internal", "the request failed here; see this node's log").problem
+            for arc in gathered:
+                for request in self._answers.pop(arc, ()):
+                    request.refuse(problem)
+            raise
+        finally:
+            self._given_up.clear()
+        for event in ended:
+            self.answer(event.arc)
+        waits = [event.request.arc for event in asked if event.request.arc in self._answers]
+        if waits:
+            # Votes are out: the first word is theirs, if they come.
+            patience = self.fleet.timing.vote_timeout / SECOND + REPLY_SLACK
+            asyncio.get_running_loop().call_later(patience, self._answer_all, waits)
+
+    def on_operation(self, request: Request[Operation]) -> None:
+        sender = self.mesh.keys.sender_of(request.key)
+        operation = request.message
+        check_name(operation.id, "id")
+        match operation:
+            case Ask():
+                self._ask(request, operation, sender)
+            case Cancel() | Release():
+                owner = client_of(operation.client) if operation.client is not None else sender
+                arc = self._known_as(owner, operation.id)
+                self._in_order(arc)
+                if owner == sender:
+                    self._given_up.add(arc)
+                by = "its client" if owner == sender else str(sender)
+                self._answers.setdefault(arc, []).append(request)
+                self._gather(arc, Cancelled(arc, by) if isinstance(operation, Cancel) else Released(arc, by))
+            case HandOver():
+                self._hand_over(request, operation, sender)
+
+    def _ask(self, request: Request[Operation], ask: Ask, sender: Sender) -> None:
+        arc = self._known_as(sender, ask.id)
+        self._in_order(arc)
+        if arc in self._answers:
+            self._answers[arc].append(request)
+        elif self.core.floor.arc(arc) is None and not self.notices.ended(arc):
+            self._check_room(str(sender))
+            wanted = admit(ask, sender, arc, self.core, self.fleet.limits)
+            self.notices.call(arc, ask.arc)
+            self.presence.expect(str(sender))
+            self._answers[arc] = [request]
+            needs = ", ".join(sorted(ask.needs))
+            self.notices.tell(arc, ask.arc, f"asked for {needs} at priority {ask.priority}")
+            self._gather(arc, Asked(wanted, ask.place))
+        else:
+            request.answer(self.notices.standing(arc, str(sender), ask.id))
+
+    def _check_room(self, client: str) -> None:
+        """Refuses what is too much at once; what this burst has brought already counts."""
+        limits = self.fleet.limits
+        coming = [event for event in self._gathered.values() if isinstance(event, Asked)]
+        if len(self.core.floor.queued) + len(coming) >= limits.max_queued:
+            raise Refused("queue_full", f"{limits.max_queued} ARCs wait already; ask again later")
+        theirs = sum(1 for event in coming if event.request.client == client)
+        if theirs + len(self.core.arcs_of(client)) >= limits.max_requests_per_client:
+            raise Refused("too_many", f"{client} has {limits.max_requests_per_client} requests open already")
+
+    def _in_order(self, arc: ArcId) -> None:
+        """Operations on one ARC stay in their order: what was gathered of it goes first."""
+        if arc in self._gathered:
+            self.decide()
+
+    def _hand_over(self, request: Request[Operation], operation: HandOver, sender: Sender) -> None:
+        arc = self._known_as(sender, operation.id)
+        to = str(client_of(operation.to))
+        self._in_order(arc)
+        running = self.core.floor.running.get(arc)
+        if running is None or running.request.client not in (str(sender), to):
+            raise Refused("not_running", f"{operation.id} does not run at {sender}")
+        if not self.presence.alive(to):
+            raise Refused("unknown_client", f"{to} is not on the mesh")
+        self._moved = {name: moved for name, moved in self._moved.items() if self.core.floor.arc(moved)}
+        self._moved[views.arc_id(to, operation.id)] = arc
+        self._carry_out((HandedOver(arc, to),))
+        request.answer(self.notices.standing(arc, str(sender), operation.id))
+
+    def answer(self, arc_id: ArcId) -> bool:
+        """Answers those who asked for this ARC and wait for the first word about it."""
+        requests = self._answers.pop(arc_id, None)
+        if requests is None:
+            return False
+        notice = self.notices.standing(arc_id, arc_id.rpartition("/")[0], views.request_id(arc_id))
+        for request in requests:
+            request.answer(notice)
+        return True
+
+    def _answer_all(self, arcs: list[ArcId]) -> None:
+        for arc in arcs:
+            self.answer(arc)
+
+    def _known_as(self, client: Sender, request_id: str) -> ArcId:
+        """The ARC that a client calls so: its own, or one that was handed over to it."""
+        arc = views.arc_id(str(client), request_id)
+        return arc if self.core.floor.arc(arc) is not None else self._moved.get(arc, arc)
