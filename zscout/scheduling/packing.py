@@ -144,7 +144,7 @@ class _Search:
             self.best, self.best_lost, self.chosen = value, lost, chosen
 
     def _lawful(self, chosen: int) -> bool:
-        """Whether nobody who runs is left out though it fits beside the chosen above it and its equals that run."""
+        """Whether nobody is left out who runs and fits beside the chosen above and the equals that run."""
         for number, item in enumerate(self.items):
             if not item.standing or chosen >> number & 1 or not self.barred[number]:
                 continue
