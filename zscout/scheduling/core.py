@@ -15,6 +15,7 @@ from __future__ import annotations
 import heapq
 from dataclasses import replace
 
+from zscout.scheduling import priority
 from zscout.scheduling.effects import (
     Dropped,
     Effect,
@@ -55,14 +56,15 @@ from zscout.scheduling.model import (
     Request,
     Term,
 )
-from zscout.scheduling.priority import run_pass
+from zscout.scheduling.priority import Strategy
 from zscout.scheduling.votes import HolderSet, Votes
 
 
 class Core:
     """All scheduling state of one fleet, and the rules by which it changes."""
 
-    def __init__(self) -> None:
+    def __init__(self, strategy: Strategy = priority.run_pass) -> None:
+        self._pass = strategy
         self.floor = Floor()
         self.votes = Votes()
         self.term: Term = NO_TERM
@@ -91,7 +93,7 @@ class Core:
         for event in events:
             self._apply(event)
         if self.floor.queued:
-            run_pass(self.floor, self.votes, now, self)
+            self._pass(self.floor, self.votes, now, self)
         self._set_wake()
         return self._effects
 

@@ -19,8 +19,9 @@ that arrives simply runs the next pass, and the outcome is that of votes given o
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, ArcId, Ns, Rc
@@ -39,6 +40,10 @@ class Actions(Protocol):
 
     def wait(self, arc: Arc, reason: str, *, settled: bool = True) -> None: ...
     def propose(self, rc: Rc, holders: HolderSet) -> None: ...
+
+
+Strategy: TypeAlias = Callable[[Floor, Votes, Ns, Actions], None]
+"""One pass: reads the floor and the votes, and acts."""
 
 
 @dataclass(frozen=True, slots=True)

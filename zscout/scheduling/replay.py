@@ -6,10 +6,12 @@ import heapq
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from zscout.scheduling import priority
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
 from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
 from zscout.scheduling.model import ArcId, Ns, RcName
+from zscout.scheduling.priority import Strategy
 from zscout.scheduling.workload import Workload, excess
 
 
@@ -35,17 +37,19 @@ class Replay:
 Watcher = Callable[[Ns, Core, list[Effect]], None]
 
 
-def replay(workload: Workload, watch: Watcher | None = None) -> Replay:
+def replay(
+    workload: Workload, watch: Watcher | None = None, *, strategy: Strategy = priority.run_pass
+) -> Replay:
     """Runs the workload to its end. `watch` sees the core after each batch, for tests and recorders.
 
     What is kept past its minimum runtime ends when nothing else is left to come."""
-    return _Player(workload, watch).play()
+    return _Player(workload, watch, strategy).play()
 
 
 class _Player:
-    def __init__(self, workload: Workload, watch: Watcher | None) -> None:
+    def __init__(self, workload: Workload, watch: Watcher | None, strategy: Strategy) -> None:
         self.workload, self.watch = workload, watch
-        self.core = Core()
+        self.core = Core(strategy)
         self.capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
         self.open: dict[ArcId, Granted] = {}
         self.holds: list[HoldRecord] = []
