@@ -77,7 +77,30 @@ class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
     to: str
 
 
-Operation: TypeAlias = Ask | Cancel | Release | HandOver
+class Foresee(Message, frozen=True, tag_field="op", tag="foresee"):
+    """Asks what would come of a request, without making it. Answered with a Foresight."""
+
+    id: str
+    arc: str
+    needs: dict[str, Amounts]
+    priority: int
+    min_runtime: Decimal
+    keep: bool = False
+
+
+class Foresight(Message, frozen=True):
+    """What would come of a request, if nothing else came. `starts_in` is absent where it would not start as
+    things stand, or not within what can be foretold; `reason` then says what it would wait for."""
+
+    id: str
+    arc: str
+    starts_in: Seconds | None = None
+    preempts: list[str] = []
+    """Names of the ARCs that it would preempt at once."""
+    reason: str = ""
+
+
+Operation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
 
 
 class Notice(Message, frozen=True):
@@ -165,6 +188,8 @@ class StateAsk(Message, frozen=True):
 
     arc: str | None = None
     holds_only: bool = False
+    forecast: bool = False
+    """Whether to foretell when who waits will start."""
 
 
 class HoldView(Message, frozen=True):
@@ -196,6 +221,8 @@ class WaitView(Message, frozen=True):
     waited: Seconds
     reason: str
     preemptions: int = 0
+    starts_in: Seconds | None = None
+    """An estimate, where one was asked for: as if nothing else were to come."""
 
 
 class RcView(Message, frozen=True):

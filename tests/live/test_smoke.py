@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
@@ -42,5 +43,38 @@ def test_a_gang_over_two_nodes_is_granted_commanded_and_preempted(tmp_path: Path
             await operator
             state = await lab.state(client, lambda state: not state.holds and not state.queue)
             assert state.host in ("a", "b")
+
+    asyncio.run(story())
+
+
+def test_what_would_come_is_foretold_and_nothing_is_changed_by_asking(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/a")
+            client = await lab.client()
+            await lab.ready(client, "robot/a")
+            running = await client.request("mine", {"robot/a": {}}, min_runtime=60)
+            waiting = await client.request("next", {"robot/a": {}}, min_runtime=5)
+            state = await client.state(forecast=True)
+            assert state is not None
+            [view] = state.queue
+            assert view.starts_in is not None
+            assert 50 < view.starts_in <= 60
+            take = await client.foresee("take", {"robot/a": {}}, priority=10, min_runtime=Decimal(1))
+            assert take is not None
+            assert (take.starts_in, take.preempts) == (0.0, ["mine"])
+            wait = await client.foresee("wait", {"robot/a": {}}, priority=0, min_runtime=Decimal(9))
+            assert wait is not None
+            assert wait.starts_in is not None
+            assert wait.starts_in > view.starts_in + 4
+            assert "robot/a (held by mine" in wait.reason
+            never = await client.foresee("never", {"robot/b": {}}, priority=0, min_runtime=Decimal(1))
+            assert never is not None
+            assert (never.starts_in, never.reason) == (None, "robot/b not on the mesh")
+            after = await client.state()
+            assert after is not None
+            assert [view.arc for view in after.holds] == ["mine"]
+            assert [view.arc for view in after.queue] == ["next"]
+            assert (running.state, waiting.state) == ("running", "queued")
 
     asyncio.run(story())

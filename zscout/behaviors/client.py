@@ -23,6 +23,8 @@ from zscout.messages import (
     ClientRequests,
     Command,
     Done,
+    Foresee,
+    Foresight,
     HandOver,
     Notice,
     Problem,
@@ -242,14 +244,35 @@ class Client:
 
     # Operators' questions
 
-    async def state(self, arc: str | None = None, *, timeout: float = QUERY_TIMEOUT) -> RcmState | None:
-        """How things stand at the RCM, with the story of `arc` if one is named; None if no RCM answered."""
-        asked = StateAsk(arc=arc)
+    async def state(
+        self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT
+    ) -> RcmState | None:
+        """How things stand at the RCM, with the story of `arc` if one is named, and with a `forecast` of
+        when who waits will start; None if no RCM answered."""
+        asked = StateAsk(arc=arc, forecast=forecast)
         replies = await self.mesh.ask(
             self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout, enough=_answered
         )
         states = [reply.message for reply in replies if reply.message is not None]
         return max(states, key=lambda state: state.term, default=None)
+
+    async def foresee(
+        self, name: str, needs: Needs, *, priority: int, min_runtime: Decimal, keep: bool = False
+    ) -> Foresight | None:
+        """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
+        asked = Foresee(
+            id=new_instance(),
+            arc=name,
+            needs=amounts(needs),
+            priority=priority,
+            min_runtime=min_runtime,
+            keep=keep,
+        )
+        key = self.mesh.keys.schedule(self.mesh.me)
+        reply = await self.mesh.ask_one(key, asked, Foresight, timeout=QUERY_TIMEOUT)
+        if reply is not None and reply.problem is not None:
+            raise RequestRefused(reply.problem)
+        return reply.message if reply is not None else None
 
     async def command(
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0

@@ -64,7 +64,7 @@ class Core:
     """All scheduling state of one fleet, and the rules by which it changes."""
 
     def __init__(self, strategy: Strategy = priority.run_pass) -> None:
-        self._pass = strategy
+        self.strategy = strategy
         self.floor = Floor()
         self.votes = Votes()
         self.term: Term = NO_TERM
@@ -93,7 +93,7 @@ class Core:
         for event in events:
             self._apply(event)
         if self.floor.queued:
-            self._pass(self.floor, self.votes, now, self)
+            self.strategy(self.floor, self.votes, now, self)
         self._set_wake()
         return self._effects
 

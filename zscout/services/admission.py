@@ -6,14 +6,14 @@ from zscout.amounts import duration, exact_amounts
 from zscout.config import Limits
 from zscout.keyexpr import BadName, Sender, check_name, check_rc
 from zscout.mesh import Refused
-from zscout.messages import MAX_PARAMS, Ask
+from zscout.messages import MAX_PARAMS, Ask, Foresee
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcId, Request
 
 MAX_PRIORITY = 1_000_000
 
 
-def admit(ask: Ask, sender: Sender, arc: ArcId, core: Core, limits: Limits) -> Request:
+def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: Limits) -> Request:
     """The request, if it may be made. Raises Refused with what is wrong and how to mend it."""
     if not ask.needs:
         raise Refused("bad_request", "needs is empty; name at least one RC")
@@ -21,9 +21,10 @@ def admit(ask: Ask, sender: Sender, arc: ArcId, core: Core, limits: Limits) -> R
         raise Refused("bad_request", f"{len(ask.needs)} needs; at most {limits.max_needs} are allowed")
     if not -MAX_PRIORITY <= ask.priority <= MAX_PRIORITY:
         raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
-    if ask.place is not None and ask.place.term > core.term:
+    place = ask.place if isinstance(ask, Ask) else None
+    if place is not None and place.term > core.term:
         raise Refused("bad_request", "place is of a term that has not been; leave it out")
-    if ask.place is not None and (ask.place.arrival < 1 or not core.given(ask.place)):
+    if place is not None and (place.arrival < 1 or not core.given(place)):
         raise Refused("bad_request", "place was never given; leave it out")
     try:
         check_name(ask.arc, "arc")

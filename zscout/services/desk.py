@@ -9,12 +9,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 
+from zscout import clock
 from zscout.config import Fleet
 from zscout.keyexpr import Sender, check_name, client_of
 from zscout.mesh import Mesh, Refused, Request
-from zscout.messages import Ask, Cancel, HandOver, Operation, Release
+from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Operation, Release
 from zscout.scheduling.core import Core
 from zscout.scheduling.events import Asked, Cancelled, Event, HandedOver, Released
+from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import SECOND, ArcId
 from zscout.services import views
 from zscout.services.admission import admit
@@ -116,6 +118,8 @@ class Desk:
                 self._gather(arc, Cancelled(arc, by) if isinstance(operation, Cancel) else Released(arc, by))
             case HandOver():
                 self._hand_over(request, operation, sender)
+            case Foresee():
+                self._foresee(request, operation, sender)
 
     def _ask(self, request: Request[Operation], ask: Ask, sender: Sender) -> None:
         arc = self._known_as(sender, ask.id)
@@ -162,6 +166,25 @@ class Desk:
         self._moved[views.arc_id(to, operation.id)] = arc
         self._carry_out((HandedOver(arc, to),))
         request.answer(self.notices.standing(arc, str(sender), operation.id))
+
+    def _foresee(self, request: Request[Operation], operation: Foresee, sender: Sender) -> None:
+        self.decide()
+        arc = views.arc_id(str(sender), operation.id)
+        if self.core.floor.arc(arc) is not None:
+            raise Refused("bad_request", f"{operation.id} is a request already; ask how it stands")
+        wanted = admit(operation, sender, arc, self.core, self.fleet.limits)
+        now = clock.now()
+        foretold = forecast(self.core, now, wanted)
+        start = foretold.starts.get(arc)
+        request.answer(
+            Foresight(
+                id=operation.id,
+                arc=operation.arc,
+                starts_in=None if start is None else (start - now) / SECOND,
+                preempts=[self.notices.name(victim) for victim in foretold.preempts],
+                reason=foretold.reason,
+            )
+        )
 
     def answer(self, arc_id: ArcId) -> bool:
         """Answers those who asked for this ARC and wait for the first word about it."""

@@ -29,6 +29,7 @@ from zscout.messages import (
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Dropped, Effect, Granted, Propose, Queued, Revoked, WakeAt
 from zscout.scheduling.events import Event, LeadTaken, Tick, Vote, VoteOverdue
+from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import SECOND, Ns, Term
 from zscout.services import views
 from zscout.services.desk import Desk
@@ -247,13 +248,14 @@ class Rcm:
             request.answer(RcmState(self.term, self._published, self.mesh.me.host, holds))
             return
         queue = sorted(floor.queued.values(), key=lambda arc: arc.rank)
+        starts = forecast(self.core, now).starts if asked.forecast else {}
         request.answer(
             RcmState(
                 term=self.term,
                 seq=self._published,
                 host=self.mesh.me.host,
                 holds=holds,
-                queue=[views.wait_view(arc, now) for arc in queue[:MAX_LISTED]],
+                queue=[views.wait_view(arc, now, starts.get(arc.id)) for arc in queue[:MAX_LISTED]],
                 rcs=views.rc_views(floor),
                 story=self.notices.story.of(asked.arc, now) if asked.arc is not None else [],
                 more=max(0, len(queue) - MAX_LISTED),

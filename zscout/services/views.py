@@ -89,7 +89,7 @@ def hold_view(arc: Arc, hold: Hold, now: Ns) -> HoldView:
     )
 
 
-def wait_view(arc: Arc, now: Ns) -> WaitView:
+def wait_view(arc: Arc, now: Ns, start: Ns | None = None) -> WaitView:
     return WaitView(
         id=request_id(arc.id),
         arc=arc.name,
@@ -101,6 +101,7 @@ def wait_view(arc: Arc, now: Ns) -> WaitView:
         waited=(now - arc.since) / SECOND,
         reason=arc.reason,
         preemptions=arc.preemptions,
+        starts_in=None if start is None else (start - now) / SECOND,
     )
 
 
