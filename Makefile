@@ -3,14 +3,17 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+PEERS := .venv-peers
+PEERS_READY := $(PEERS)/.ready
 
-.PHONY: help setup demo test lint bench lock clean
+.PHONY: help setup demo test lint bench bench-peers lock clean
 
 help:
 	@echo "make demo   Table 1 of the paper on a live mesh, compared with Table 2"
 	@echo "make test   all tests"
 	@echo "make lint   formatting, linting and strict types"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"
+	@echo "make bench-peers   the same work done by Dask, Redis, etcd, labgrid and Ray"
 
 $(READY): requirements/dev.txt pyproject.toml
 	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if v >= (3, 11) else f"zscout needs Python 3.11 or newer, this is {v.major}.{v.minor}; set PYTHON=...")'
@@ -35,9 +38,21 @@ lint: $(READY)
 bench: $(READY)
 	$(BIN)/python -m benchmarks
 
+# What the peers need stands apart from what zscout needs.
+$(PEERS_READY): benchmarks/peers/requirements.txt requirements/dev.txt pyproject.toml
+	$(PYTHON) -m venv $(PEERS)
+	@echo '*' > $(PEERS)/.gitignore
+	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/dev.txt
+	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check -r benchmarks/peers/requirements.txt
+	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
+	@touch $@
+
+bench-peers: $(PEERS_READY)
+	$(PEERS)/bin/python -m benchmarks.peers
+
 # Needs uv; only names, versions and hashes are written.
 lock:
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate --group dev pyproject.toml -o requirements/dev.txt
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(PEERS) .pytest_cache .mypy_cache .ruff_cache .hypothesis

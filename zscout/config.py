@@ -20,6 +20,7 @@ from msgspec import Meta, Struct, structs
 from zscout.endpoints import check_links, check_multicast, ip_of
 from zscout.keyexpr import valid_name
 from zscout.scheduling.model import SECOND, Ns
+from zscout.scheduling.strategies import StrategyName
 from zscout.strict import (
     BadInput,
     Where,
@@ -42,7 +43,6 @@ MAX_ENDPOINTS: Final = 256
 MAX_PARAMETERS: Final = 64
 """Capacities of one RC."""
 
-Strategy = Literal["priority"]
 Driver = Literal["exclusive", "capacity"]
 _Endpoints = Annotated[tuple[str, ...], Meta(max_length=MAX_ENDPOINTS)]
 
@@ -95,7 +95,7 @@ class Fleet(Struct, frozen=True):
     name: str
     candidates: tuple[str, ...]
     """Hosts whose nodes may lead, best first; empty: every node, by name."""
-    strategy: Strategy
+    strategy: StrategyName
     operator_priority: int
     """ARCs of this priority and above are an operator's."""
     mesh: Mesh
@@ -146,7 +146,7 @@ class Node(Struct, frozen=True):
 class _FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     name: str = DEFAULT_FLEET_NAME
     candidates: Annotated[tuple[str, ...], Meta(max_length=MAX_CANDIDATES)] = ()
-    strategy: Strategy = "priority"
+    strategy: StrategyName = "priority"
     operator_priority: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 10
 
 

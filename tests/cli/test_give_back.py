@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.cli.fleet import CliFleet, end, fleet_of, out_of, read_until
+from tests.cli.fleet import CliFleet, fleet_of
+from tests.cli.tools import end, out_of, read_until
 from tests.live.lab import START
 
 pytestmark = pytest.mark.live

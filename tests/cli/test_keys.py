@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.tools import zscout_soon
+from tests.cli.tools import Terminal, zscout_soon
 from tests.live.lab import Lab
 from zscout.messages import RcAsk, RcmState, RcState, StateAsk
 
@@ -54,6 +54,24 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
             assert {line for line in listed if line[3] != "-"} == {
                 (*who, key["how"], key["key"]) for who, one in alive.items() for key in one["keys"]
             }
+
+    asyncio.run(story())
+
+
+def test_at_a_narrow_terminal_every_key_can_be_copied(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a-rather-long-name-for-a-robot")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a-rather-long-name-for-a-robot")
+            with Terminal("keys", env=lab.env, columns=80) as terminal:
+                assert await asyncio.to_thread(terminal.code) == 0
+            lines = terminal.text.splitlines()[1:]
+            assert max(map(len, lines)) <= 80
+            assert "…" not in terminal.text
+            begin = next(line for line in lines if line.startswith("HOST")).index("KEY")
+            keys = "".join(line[begin:].strip() for line in lines if "HOST" not in line)
+            assert "rc/robot/a-rather-long-name-for-a-robot/command/*/*" in keys
 
     asyncio.run(story())
 

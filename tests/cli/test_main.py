@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from tests.cli.fleet import ZSCOUT
+from tests.cli import tools
 from tests.live.lab import Lab
 from zscout.cli.arguments import gather_needs, parse_duration, parse_need
 from zscout.cli.common import plain_table, span
@@ -24,7 +25,7 @@ HEAVY = ("zenoh", "rich", "rerun", "msgspec", "numpy", "cv2")
 
 
 def zscout(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*ZSCOUT, *args], env=os.environ | env, capture_output=True, text=True, timeout=30)
+    return tools.zscout(*args, env=os.environ | env)
 
 
 def test_help_loads_nothing_heavy_and_lists_all() -> None:
@@ -48,9 +49,9 @@ def test_every_command_is_there_and_its_help_has_examples(name: str) -> None:
 
 
 def test_an_unknown_command_is_one_line_with_a_hint() -> None:
-    done = zscout("statu")
+    done = zscout("requst")
     assert done.returncode == 2
-    assert done.stderr == "zscout: there is no command 'statu'; did you mean status? (see zscout --help)\n"
+    assert done.stderr == "zscout: there is no command 'requst'; did you mean request? (see zscout --help)\n"
 
 
 @pytest.mark.parametrize(
@@ -58,12 +59,15 @@ def test_an_unknown_command_is_one_line_with_a_hint() -> None:
     [
         (["request"], "Missing argument 'NEED...'"),
         (["request", "robot/a", "--"], "no command follows the --"),
-        (["request", "robot/a", "--priority", "high"], "'high' is not a valid integer range"),
+        (["request", "robot/a", "--priority", "high"], "'high' is not a whole number"),
         (["request", "robot"], "need \"robot\": RC 'robot' is not valid: write kind/name"),
         (["request", "robot/a", "robot/a"], "robot/a is named twice"),
         (["request", "robot/a", "--again"], "--again runs a command again"),
         (["request", "robot/a", "--min-runtime", "0"], "--min-runtime must be positive"),
+        (["request", "robot/a", "sleep", "5"], "a command goes after --"),
+        (["request", "robot/a:rate"], "rate has no number; write parameter=number"),
         (["cancel"], "Missing argument 'ARC'"),
+        (["cancel", ""], '"" names no ARC; zscout status lists them'),
     ],
 )
 def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
@@ -99,7 +103,7 @@ def test_a_closed_pipe_is_quiet() -> None:
     read, write = os.pipe()
     os.close(read)
     process = subprocess.Popen(
-        [*ZSCOUT, "completion", "fish"], stdout=write, stderr=subprocess.PIPE, text=True
+        [*tools.COMMAND, "completion", "fish"], stdout=write, stderr=subprocess.PIPE, text=True
     )
     os.close(write)
     _, errors = process.communicate(timeout=30)
@@ -117,6 +121,31 @@ def test_completion_knows_the_commands_without_loading_them() -> None:
     unknown = zscout("completion", SHELL="/bin/tcsh")
     assert unknown.returncode == 2
     assert "write one of bash, zsh, fish" in unknown.stderr
+
+
+def test_bash_completes_at_tab(tmp_path: Path) -> None:
+    """A real bash at a terminal, with `zscout` on its path and the script read."""
+    here = tmp_path / "zscout"
+    here.write_text(f'#!/bin/sh\nexec {shlex.join(tools.COMMAND)} "$@"\n')
+    here.chmod(0o755)
+    (tmp_path / "table.rrd").touch()
+    env = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PS1": "ready> "}
+    with tools.Terminal(command=("bash", "--norc", "--noprofile", "-i"), env=env) as terminal:
+        terminal.until("ready> ")
+        terminal.press(f"cd {tmp_path} && zscout completion bash > script && . ./script && echo re''ad\n")
+        terminal.until("\nread\nready> ")
+        for typed, offered in (
+            ("zscout stat", "zscout status "),
+            ("zscout status --w", "zscout status --watch "),
+            ("zscout replay --strategy pri", "zscout replay --strategy priority "),
+            ("zscout view ta", "zscout view table.rrd "),
+        ):
+            # Ctrl-U empties the line.
+            terminal.press("\x15" + typed + "\t")
+            terminal.until(offered)
+        # An interactive shell does not heed SIGTERM.
+        terminal.press("\x15exit\n")
+        assert terminal.code() == 0
 
 
 @pytest.mark.parametrize(

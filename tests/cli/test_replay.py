@@ -103,7 +103,7 @@ def test_table_1_gives_table_2_as_a_table(table1: Path) -> None:
 
 def test_at_a_narrow_terminal_the_table_is_wrapped_and_coloured(table1: Path) -> None:
     with Terminal("replay", table1, columns=50) as terminal:
-        assert terminal.end() == 0
+        assert terminal.code() == 0
     table = [line for line in terminal.text.splitlines() if line.startswith(("seconds", *RCS))]
     assert max(map(len, table)) <= 50
     shown = cells("\n".join(table))
@@ -184,11 +184,17 @@ def test_nothing_at_all_is_said_in_one_line(tmp_path: Path, capsys: pytest.Captu
     assert capsys.readouterr().out == '{"strategy": "priority", "holds": [], "unserved": []}\n'
 
 
+@pytest.mark.parametrize("strategy", ["optimal", "adaptive"])
+def test_the_other_strategies_serve_table_1_as_the_paper_does(
+    table1: Path, strategy: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert zscout_here("replay", table1, "--strategy", strategy, "--json") == 0
+    assert capsys.readouterr().out == JSON.replace('"priority"', f'"{strategy}"', 1)
+
+
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["--strategy", "optimal"], "strategy optimal is not there yet; use --strategy priority"),
-        (["--strategy", "adaptive"], "strategy adaptive is not there yet; use --strategy priority"),
         (["--rrd", "picture.png"], "end it in .rrd"),
         (["--rrd", "no/such/folder/x.rrd"], "can't write the recording"),
     ],

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.fleet import CliFleet, end, events, fleet_of, gone, out_of, read_until
+from tests.cli.fleet import CliFleet, fleet_of
+from tests.cli.tools import end, events, gone, out_of, read_until
 from tests.live.lab import START
 
 pytestmark = pytest.mark.live
@@ -191,7 +192,7 @@ def test_the_live_line_shows_and_ctrl_c_ends_the_wait(fleet: CliFleet) -> None:
         terminal.until("seen waits ")
         terminal.until("robot/a: blocker (priority 0, ")
         terminal.until("seen waits ")  # drawn anew
-        terminal.type("\x03")
+        terminal.press("\x03")
         terminal.until("seen is cancelled")
         assert terminal.code() == 130
     fleet.state(lambda state: not state.queue)
@@ -210,12 +211,12 @@ def test_a_command_has_the_terminal(fleet: CliFleet) -> None:
     )
     with fleet.terminal("request", "robot/a", "--", sys.executable, "-c", script) as terminal:
         terminal.until("front True")
-        terminal.type("hello\n")
+        terminal.press("hello\n")
         terminal.until("got hello")
-        terminal.type("\x03")
+        terminal.press("\x03")
         terminal.until("interrupted")
-        terminal.type("\x1a")
+        terminal.press("\x1a")
         terminal.until("not suspended")
-        terminal.type("\n")
+        terminal.press("\n")
         terminal.until("gave back")
         assert terminal.code() == 9

@@ -92,6 +92,31 @@ def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
     asyncio.run(story())
 
 
+def test_a_candidate_that_died_is_shown(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=("anvil", "bellows")) as lab:
+            lab.node("anvil", "robot/a")
+            bellows = lab.node("bellows", "robot/b")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a", "robot/b")
+
+            async def hosts() -> dict[str, str]:
+                shown = await zscout_soon("status", env=lab.env)
+                assert shown.returncode == 0, shown.stderr
+                return {row[0]: row[1] for row in section(shown.stdout, "Hosts")}
+
+            assert (await hosts())["bellows"] in ("alive", "leads")
+            bellows.kill()
+            await lab.state(client, lambda state: not all(rc.present for rc in state.rcs))
+            await lab.living(client, "rcm", lambda hosts: hosts == ["anvil"])
+            assert (await hosts())["bellows"] == "not there"
+            told = json.loads((await zscout_soon("status", "--json", env=lab.env)).stdout)
+            alive = {host["host"]: host["alive"] for host in told["hosts"]}
+            assert alive == {"anvil": True, "bellows": False, "test": True}
+
+    asyncio.run(story())
+
+
 def test_watching_in_a_pipe_prints_a_block_when_something_happens(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path) as lab:
@@ -169,27 +194,24 @@ def test_watching_at_a_terminal_draws_in_place_until_q(tmp_path: Path) -> None:
             client = await lab.client("program")
             await lab.ready(client, "robot/a")
 
-            def watch(terminal: Terminal, words: str) -> str:
-                return terminal.until(words)
-
             with Terminal("status", "--watch", env=lab.env) as terminal:
                 before = terminal.modes
-                await asyncio.to_thread(watch, terminal, "q or Ctrl-C ends")
+                await asyncio.to_thread(terminal.until, "q or Ctrl-C ends")
                 modes = terminal.modes[3]
                 assert isinstance(modes, int)
                 assert not modes & termios.ICANON
                 await client.request("survey", {"robot/a": {}}, priority=10, min_runtime=600)
-                await asyncio.to_thread(watch, terminal, "Running")
+                await asyncio.to_thread(terminal.until, "Running")
                 assert "\x1b[1A" in terminal.raw, "the picture is drawn over the last"
                 assert "\x1b[1;31m" in terminal.raw, "an operator's hold is red"
                 terminal.press("q")
-                assert await asyncio.to_thread(terminal.end) == 0
+                assert await asyncio.to_thread(terminal.code) == 0
                 assert terminal.modes == before
             with Terminal("status", "--watch", env=lab.env) as terminal:
                 before = terminal.modes
-                await asyncio.to_thread(watch, terminal, "q or Ctrl-C ends")
+                await asyncio.to_thread(terminal.until, "q or Ctrl-C ends")
                 terminal.process.send_signal(signal.SIGINT)
-                assert await asyncio.to_thread(terminal.end) == 130
+                assert await asyncio.to_thread(terminal.code) == 130
                 assert terminal.modes == before
                 assert "Traceback" not in terminal.text
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from tests.cli.fleet import CliFleet, end, events, fleet_of, out_of, read_until
+from tests.cli.fleet import CliFleet, fleet_of
+from tests.cli.tools import COMMAND, Terminal, end, events, out_of, read_until
 from tests.live.lab import START
 
 pytestmark = pytest.mark.live
@@ -24,11 +27,11 @@ def test_a_yes_at_the_terminal_takes_and_ctrl_c_gives_back(fleet: CliFleet) -> N
         shown = terminal.until("Take robot/a? [y/N] ")
         assert "operator preempts survey (priority 3, " in shown
         assert ": robot/a, robot/b" in shown
-        terminal.type("y\n")
+        terminal.press("y\n")
         terminal.until("operator holds robot/a until it is needed elsewhere")
         state = fleet.state(lambda state: bool(state.holds))
         assert [(hold.arc, hold.priority, hold.keep) for hold in state.holds] == [("operator", 10, True)]
-        terminal.type("\x03")
+        terminal.press("\x03")
         assert terminal.code() == 130
     assert survey.wait(START) == 1
     assert "survey lost its grant: preempted by operator, priority 10" in out_of(survey).read()
@@ -40,7 +43,7 @@ def test_anything_but_a_yes_takes_nothing(fleet: CliFleet, answer: str) -> None:
     survey = fleet.holder("survey", "robot/a")
     with fleet.terminal("take", "robot/a") as terminal:
         terminal.until("[y/N] ")
-        terminal.type(answer)
+        terminal.press(answer)
         terminal.until("zscout: nothing was taken")
         assert terminal.code() == 1
     assert survey.poll() is None
@@ -58,6 +61,26 @@ def test_without_a_terminal_it_needs_yes(fleet: CliFleet) -> None:
     preview, granted, ended = events(taken.stdout)
     assert [(hold["arc"], hold["priority"]) for hold in preview["preempts"]] == [("survey", 0)]
     assert (granted["event"], granted["keep"], ended["outcome"]) == ("granted", False, "completed")
+    assert survey.wait(START) == 1
+
+
+def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(
+    fleet: CliFleet, tmp_path: Path
+) -> None:
+    survey = fleet.holder("survey", "robot/a")
+    out = tmp_path / "events.json"
+    # A shell at the terminal, as people have it: the JSON goes into a file.
+    script = f'exec {shlex.join(COMMAND)} take robot/a --json > "{out}"'
+    with Terminal(command=("sh", "-c", script), env=fleet.lab.env) as terminal:
+        shown = terminal.until("Take robot/a? [y/N] ")
+        assert "operator preempts survey (priority 0, " in shown
+        assert "{" not in shown
+        assert [event["event"] for event in events(out.read_text())] == ["preview"]
+        terminal.press("y\n")
+        fleet.state(lambda state: [hold.arc for hold in state.holds] == ["operator"])
+        terminal.press("\x03")
+        assert terminal.code() == 130
+    assert [event["event"] for event in events(out.read_text())] == ["preview", "granted", "ended"]
     assert survey.wait(START) == 1
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import re
 import signal
@@ -14,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import psutil
@@ -116,6 +118,24 @@ def shows_table_2(path: Path) -> bool:
     return False
 
 
+def test_as_json_it_says_once_where_all_is(recording: Path, tmp_path: Path) -> None:
+    with viewing(tmp_path, recording, "--web", "--json") as process:
+        said = said_as_json(tmp_path, process)
+        assert (said["file"], said["live"]) == (str(recording), None)
+        with urllib.request.urlopen(said["url"], timeout=PATIENCE) as answer:  # noqa: S310 - our own page
+            assert b"Rerun" in answer.read()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+    assert (tmp_path / "view.log").read_text().count("\n") == 1
+
+
+def said_as_json(folder: Path, process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    log = folder / "view.log"
+    until(lambda: b"}" in log.read_bytes() or process.poll() is not None, "it said nothing")
+    said: dict[str, Any] = json.loads(log.read_text().splitlines()[0])
+    return said
+
+
 def test_the_viewer_does_not_outlive_a_command_that_is_killed(recording: Path, tmp_path: Path) -> None:
     with viewing(tmp_path, recording, "--web") as process:
         url, _ = page(tmp_path, process)
@@ -155,6 +175,18 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
             assert [states for _, states in lane][-2:] == [["survey"], [""]]
 
     asyncio.run(story())
+
+
+@pytest.mark.live
+def test_a_live_view_as_json(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    with viewing(tmp_path, "--web", "--json", "--out", tmp_path / "out", env=lab.env) as process:
+        said = said_as_json(tmp_path, process)
+        assert listens(said["url"])
+        assert listens(said["live"])
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+    assert [Path(said["file"])] == list((tmp_path / "out").glob("*.rrd"))
 
 
 def test_without_a_display_it_names_web(

@@ -4,31 +4,39 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import json
 import os
 import re
 import select
-import signal
 import struct
 import subprocess
 import sys
 import termios
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import IO, Any, Self
 
 from zscout.cli.main import main
 
 COMMAND = (sys.executable, "-m", "zscout.cli.main")
 PATIENCE = 30.0
 """Seconds within which anything that is waited for must have come true, on a busy machine."""
+# Makes the terminal that it has as stdin its controlling one: what a terminal window does for its shell.
+OWN_TERMINAL = (
+    "import fcntl, os, sys, termios; os.setsid(); fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
+    "os.execvp(sys.argv[1], sys.argv[1:])"
+)
 _ESCAPE = re.compile(r"\x1b(\[[0-9;?]*[A-Za-z]|[=>])")
 
 
-def zscout(*args: object, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+def zscout(
+    *args: object, env: Mapping[str, str] | None = None, stdin: str = ""
+) -> subprocess.CompletedProcess[str]:
     """Runs it in a pipe, to its end."""
     command = [*COMMAND, *map(str, args)]
-    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    return subprocess.run(command, env=env, input=stdin, capture_output=True, text=True, timeout=PATIENCE)
 
 
 def zscout_here(*args: object) -> int:
@@ -43,27 +51,33 @@ async def zscout_soon(*args: object, env: Mapping[str, str]) -> subprocess.Compl
 
 
 class Terminal:
-    """A command at a terminal of this size. What it draws is kept in `text`, without escape sequences."""
+    """The person at a terminal of this size, which is the command's own: Ctrl-C reaches it."""
 
     def __init__(
-        self, *args: object, env: Mapping[str, str] | None = None, columns: int = 120, lines: int = 40
+        self,
+        *args: object,
+        command: Sequence[str] = COMMAND,
+        env: Mapping[str, str] | None = None,
+        columns: int = 120,
+        lines: int = 40,
     ) -> None:
-        self._ours, theirs = os.openpty()
-        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+        self._ours, self._theirs = os.openpty()
+        fcntl.ioctl(self._theirs, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
         clean = {key: value for key, value in (env or os.environ).items() if key not in ("COLUMNS", "LINES")}
         self.process = subprocess.Popen(
-            [*COMMAND, *map(str, args)],
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
+            [sys.executable, "-c", OWN_TERMINAL, *command, *map(str, args)],
+            stdin=self._theirs,
+            stdout=self._theirs,
+            stderr=self._theirs,
             env=clean | {"TERM": "xterm-256color"},
-            start_new_session=True,
+            text=True,
         )
-        self._theirs = theirs
         self.raw = ""
+        self._looked = 0
 
     @property
     def text(self) -> str:
+        """All that was drawn, without escape sequences."""
         return _ESCAPE.sub("", self.raw).replace("\r", "")
 
     @property
@@ -72,18 +86,20 @@ class Terminal:
         return termios.tcgetattr(self._theirs)
 
     def until(self, words: str) -> str:
-        """All text so far, once these words were drawn."""
+        """What was drawn since the last look, as soon as these words are among it."""
         deadline = time.monotonic() + PATIENCE
-        while words not in self.text:
-            assert time.monotonic() < deadline, f"never said {words!r}: {self.text}"
-            self._read(0.1)
-        return self.text
+        while (at := self.text.find(words, self._looked)) < 0:
+            assert time.monotonic() < deadline, f"waited in vain for {words!r}: {self.text}"
+            ended = self.process.poll() is not None
+            assert self._read(0.1) or not ended, f"ended without {words!r}: {self.text}"
+        begin, self._looked = self._looked, at + len(words)
+        return self.text[begin : self._looked]
 
     def press(self, keys: str) -> None:
         os.write(self._ours, keys.encode())
 
-    def end(self) -> int:
-        """Waits for its end; returns the exit code."""
+    def code(self) -> int:
+        """Waits for its end; the exit code."""
         deadline = time.monotonic() + PATIENCE
         while self.process.poll() is None:
             assert time.monotonic() < deadline, f"never ended: {self.text}"
@@ -104,8 +120,52 @@ class Terminal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGKILL)
-            self.process.wait()
+        end(self.process)
         os.close(self._ours)
         os.close(self._theirs)
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    """Ends a command in order; what does not obey is killed."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+def read_until(process: subprocess.Popen[str], text: str) -> list[str]:
+    """The lines up to the one that has `text`; the process's own end is the limit."""
+    lines: list[str] = []
+    for line in out_of(process):
+        lines.append(line.rstrip("\n"))
+        if text in line:
+            return lines
+    raise AssertionError(f"waited in vain for {text!r} in {lines}")
+
+
+def out_of(process: subprocess.Popen[str]) -> IO[str]:
+    assert process.stdout is not None
+    return process.stdout
+
+
+def events(text: str) -> list[dict[str, Any]]:
+    """What `--json` printed, line by line."""
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def gone(pid: int) -> bool:
+    """True as soon as a process is dead (a zombie is), False if it is not within PATIENCE."""
+    before = time.monotonic()
+    while time.monotonic() - before < PATIENCE:
+        try:
+            if "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text():
+                return True
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        time.sleep(0.02)
+    return False

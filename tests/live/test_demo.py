@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from tests.services.paper_run import RCS, TABLE2, colours, events, lanes, rows
-from zscout.cli.demo_tables import Observed, differences, paper
+from zscout.cli.demo.tables import Observed, differences, paper
 from zscout.scheduling.model import SECOND
 from zscout.services.timeline import OPERATOR_MARK
 

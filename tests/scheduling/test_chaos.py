@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from fractions import Fraction
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,6 +30,7 @@ from zscout.scheduling.events import (
     VoteOverdue,
 )
 from zscout.scheduling.model import NO_TERM, SECOND, Arc, Ns, RcName, Term
+from zscout.scheduling.strategies import STRATEGIES, StrategyName
 from zscout.scheduling.workload import WorkloadRc, excess
 
 OPS = (
@@ -51,7 +53,8 @@ MAX_SETTLING_STEPS = 400
 class Chaos:
     """A fleet whose votes are late or lost, and whose parts come and go."""
 
-    def __init__(self, draw: st.DataObject) -> None:
+    def __init__(self, draw: st.DataObject, strategy: StrategyName) -> None:
+        self.strategy = strategy
         self.fleet = draw.draw(rcs())
         names = [rc.name for rc in self.fleet]
         self.to_ask = [
@@ -61,7 +64,7 @@ class Chaos:
         self.sharable = {rc.name: rc.sharable for rc in self.fleet}
         self.present: list[RcName] = []
         self.now: Ns = 0
-        self.core = Core()
+        self.core = self.new_core()
         self.ledger = Ledger(self.fleet, self.to_ask)
         self.waiting: list[Propose] = []
         """Proposals that may yet be answered or called overdue."""
@@ -69,6 +72,9 @@ class Chaos:
         """Overdue ones; their answers may still come, or never."""
         self.wake: Ns | None = None
         self.send(*[self.join(rc) for rc in self.fleet])
+
+    def new_core(self) -> Core:
+        return Core(STRATEGIES[self.strategy]())
 
     def join(self, rc: WorkloadRc) -> Event:
         self.present.append(rc.name)
@@ -141,7 +147,7 @@ class Chaos:
         """The RCM dies with all it knew of votes; the next one hears of every hold and request."""
         old, before = self.core, dict(self.ledger.open)
         term = Term(old.term.counter + 1, "rcm/b") if old.term != NO_TERM else Term(1, "rcm/a")
-        self.core, self.waiting, self.late = Core(), [], []
+        self.core, self.waiting, self.late = self.new_core(), [], []
         standing = tuple(
             Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end)
             for arc in old.floor.running.values()
@@ -187,12 +193,13 @@ class Chaos:
         return False
 
 
+@pytest.mark.parametrize("strategy", STRATEGIES)
 @settings(max_examples=300, deadline=None)
 @given(st.data(), st.lists(st.tuples(st.sampled_from(OPS), st.integers(0, 11)), max_size=60))
 def test_promises_hold_in_any_chaos_and_in_the_end_all_are_served(
-    draw: st.DataObject, ops: list[tuple[str, int]]
+    strategy: StrategyName, draw: st.DataObject, ops: list[tuple[str, int]]
 ) -> None:
-    chaos = Chaos(draw)
+    chaos = Chaos(draw, strategy)
     for op, pick in ops:
         chaos.do(op, pick)
     chaos.settle()

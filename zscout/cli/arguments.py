@@ -49,7 +49,14 @@ class Need(click.ParamType[tuple[str, dict[str, Decimal]]]):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, dict[str, Decimal]]:
-        return value if isinstance(value, tuple) else parse_need(str(value))
+        if isinstance(value, tuple):
+            return value
+        try:
+            return parse_need(str(value))
+        except BadInput as error:
+            if "/" not in str(value) and ctx is not None and not ctx.meta.get("command"):
+                raise BadInput(f"{error}; a command goes after --") from None
+            raise
 
 
 def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
@@ -78,7 +85,7 @@ def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
         raise BadInput(f"need {quoted(text)}: {error}") from None
     params: dict[str, Decimal] = {}
     for part in rest.split(",") if colon else []:
-        name, _, number = part.partition("=")
+        name, equals, number = part.partition("=")
         remedy = f"write parameter=number, as in {rc}:command_rate=5"
         try:
             check_name(name, "parameter")
@@ -87,7 +94,8 @@ def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
         if name in params:
             raise BadInput(f"need {quoted(text)}: {name} is given twice; give it once")
         if _NUMBER.fullmatch(number) is None:
-            raise BadInput(f"need {quoted(text)}: {name} is {quoted(number)}; {remedy}")
+            found = f"is {quoted(number)}" if equals else "has no number"
+            raise BadInput(f"need {quoted(text)}: {name} {found}; {remedy}")
         params[name] = Decimal(number)
     if len(params) > MAX_PARAMS:
         raise BadInput(f"need {quoted(text)}: {len(params)} parameters; at most {MAX_PARAMS} are allowed")

@@ -21,6 +21,7 @@ import msgspec
 from zscout.config import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.messages import RcmState
+from zscout.strict import BadInput, quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,17 +33,13 @@ LOOK_FOR_RCM: Final = 2.0
 LOOK_FOR_TAKEOVER: Final = 5.0
 """The same where a candidate is seen: it may be about to take the lead."""
 STATE_TRIES: Final = 3
+MAX_NAME: Final = 200
+"""Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
+NARROW: Final = 110
+"""Columns of a terminal below which tables leave out what matters least."""
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
-
-_UNITS: Final = {
-    "": Decimal(1),
-    "s": Decimal(1),
-    "ms": Decimal("0.001"),
-    "m": Decimal(60),
-    "h": Decimal(3600),
-}
 
 
 class Failed(Exception):
@@ -179,6 +176,13 @@ async def state_of(client: Client, arc: str | None = None) -> RcmState:
     raise NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again, or see its log")
 
 
+def arc_named(text: str) -> str:
+    """What may be an ARC's name, its id or `<host>/<client>/<id>`. Raises BadInput."""
+    if not text or len(text) > MAX_NAME or not text.isprintable():
+        raise BadInput(f"{quoted(text)} names no ARC; zscout status lists them")
+    return text
+
+
 async def _within(seconds: float, event: asyncio.Event) -> bool:
     try:
         async with asyncio.timeout(seconds):
@@ -217,6 +221,11 @@ def console(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
 
 
+def narrow() -> bool:
+    """Whether the terminal has so few columns that tables leave out what matters least."""
+    return console().width < NARROW
+
+
 def print_table(
     columns: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", stream: IO[str] | None = None
 ) -> None:
@@ -234,7 +243,8 @@ def print_table(
         title=title or None, title_justify="left", box=None, header_style="bold", padding=(0, 2, 0, 0)
     )
     for column in columns:
-        table.add_column(column)
+        # A name or key that is cut short can't be copied.
+        table.add_column(column, overflow="fold")
     for row in cells:
         table.add_row(*(Text(cell) for cell in row))
     console(stderr=stream is sys.stderr).print(table)

@@ -10,6 +10,7 @@ from zscout.behaviors.client import TRY_AGAIN, Client
 from zscout.cli.common import (
     Failed,
     NobodyThere,
+    arc_named,
     clean,
     connected,
     json_option,
@@ -47,7 +48,7 @@ def cancel(arc: str, every: bool, as_json: bool) -> None:
       zscout cancel 5f0c2a9d13be
       zscout cancel survey --all
     """
-    run(_end(arc, "cancel", every=every, as_json=as_json))
+    run(_end(arc_named(arc), "cancel", every=every, as_json=as_json))
 
 
 @click.command()
@@ -63,7 +64,7 @@ def release(arc: str, every: bool, as_json: bool) -> None:
       zscout release survey
       zscout release anvil/request-5f0c2a9d13be/0b1d3c5e7f90 --json
     """
-    run(_end(arc, "release", every=every, as_json=as_json))
+    run(_end(arc_named(arc), "release", every=every, as_json=as_json))
 
 
 class Target(NamedTuple):

@@ -14,7 +14,7 @@ from zscout.keyexpr import Keys, Role, Sender, Token
 @click.command()
 @common.json_option("Print one JSON object.")
 def keys(as_json: bool) -> None:
-    """Lists who is alive on the mesh, by host, and the keys that each serves, publishes or hears.
+    """List who is alive on the mesh, by host, and the keys that each serves, publishes or hears.
 
     For writing a client in another language, or access rules, and to see whether two hosts see each other.
     HOW: `query` is answered, `put` published, `hear` subscribed to. Exit code 3: nobody is there.
@@ -99,4 +99,7 @@ def _print(own: Keys, tokens: list[Token], links: int, sharable: set[str] | None
             who = token[:3] if number == 0 or not common.at_terminal() else ("", "", "")
             rows.append((*who, key["how"], key["key"].removeprefix(f"{own.base}/"), key["what"]))
     common.print_line("")
-    common.print_table(("HOST", "ROLE", "NAME", "HOW", "KEY", "WHAT"), rows)
+    columns: tuple[str, ...] = ("HOST", "ROLE", "NAME", "HOW", "KEY", "WHAT")
+    if common.at_terminal() and common.narrow():
+        columns, rows = columns[:-1], [row[:-1] for row in rows]
+    common.print_table(columns, rows)

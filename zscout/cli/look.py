@@ -78,6 +78,11 @@ class Look:
             name: host for name, host in self.hosts.items() if host.gone is None or now - host.gone < GONE
         }
 
+    def everyone(self) -> dict[str, Host]:
+        """All hosts, with the fleet's candidates that are not there: they should be."""
+        missing = {name: Host() for name in self.client.fleet.candidates if name not in self.hosts}
+        return dict(sorted((missing | self.hosts).items()))
+
     def tokens(self, role: str) -> list[Token]:
         return sorted(token for host in self.hosts.values() for token in host.tokens if token.role == role)
 
@@ -107,6 +112,9 @@ class Look:
             silent = any(host.load is None for host in self.hosts.values() if host.has(Role.LOAD))
             seen = rcs <= {token.name for token in self.tokens(Role.RC)}
             seen &= clients <= {f"{token.host}/{token.name}" for token in self.tokens(Role.CLIENT)}
+            if loads:
+                # Without this a candidate whose token comes last would be shown as missing.
+                seen &= all(host.tokens for host in self.everyone().values())
             return seen and not (loads and silent)
 
         await self.until(complete, FIND_LOADS)

@@ -32,7 +32,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "keys": ("zscout.cli.keys", "List what is alive on the mesh, and the keys it serves."),
     "view": ("zscout.cli.view", "Watch the fleet live on a timeline, or open a recording."),
     "replay": ("zscout.cli.replay", "Schedule a workload file under virtual time."),
-    "demo": ("zscout.cli.demo", "Run the paper's experiment on a live mesh on this machine."),
+    "study": ("zscout.cli.study", "Compare scheduling strategies on random workloads."),
+    "demo": ("zscout.cli.demo.command", "Run the paper's experiment on a live mesh on this machine."),
     "completion": ("zscout.cli.completion", "Print the completion script for bash, zsh or fish."),
 }
 """Name: where the click command of that name lives, and its line in the help."""
@@ -102,7 +103,9 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         return BAD_INPUT, error.format_message()
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx is not None else "zscout"
-        return BAD_INPUT, f"{path}: {_line(error.format_message()).removesuffix('.')} (see {path} --help)"
+        # Click's own words for a bounded number say that the text is no range.
+        words = _line(error.format_message()).replace("not a valid integer range", "not a whole number")
+        return BAD_INPUT, f"{path}: {words.removesuffix('.')} (see {path} --help)"
     if isinstance(error, click.ClickException):
         return error.exit_code, f"zscout: {_line(error.format_message())}"
     if isinstance(error, (click.Abort, KeyboardInterrupt)):

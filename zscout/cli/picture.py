@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 MAX_ROWS: Final = 500
 """Of one table at a terminal."""
-NARROW: Final = 110
-"""Columns of a terminal below which tables leave out what matters least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +104,7 @@ def _waiting_table(state: RcmState) -> Table:
 
 def _host_table(look: Look) -> Table:
     rows, styles = [], []
-    for name, host in sorted(look.hosts.items()):
+    for name, host in look.everyone().items():
         words, style = _condition(look, host)
         load, cpu, memory = "-", "-", "-"
         if host.load is not None:
@@ -121,6 +119,8 @@ def _host_table(look: Look) -> Table:
 def _condition(look: Look, host: Host) -> tuple[str, str]:
     if host.gone is not None:
         return f"gone for {common.span((clock.now() - host.gone) / SECOND)}", "red"
+    if not host.tokens:
+        return "not there", "red"
     if look.stale(host):
         return "no load report", "yellow"
     return ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
@@ -158,7 +158,7 @@ def rich_picture(look: Look, state: RcmState | None, *after: Text) -> Group:
     from rich.console import Group
     from rich.text import Text
 
-    narrow = common.console().width < NARROW
+    narrow = common.narrow()
     parts: list[Any] = [Text(_headline(look, state), style="bold" if state is not None else "bold red")]
     for table in _tables(look, state):
         if not table.rows:

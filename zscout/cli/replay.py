@@ -19,6 +19,7 @@ from zscout.scheduling.effects import Effect, Granted, Outcome, Queued, Revoked
 from zscout.scheduling.model import SECOND, ArcId, Ns, RcName
 from zscout.scheduling.replay import HoldRecord, Replay
 from zscout.scheduling.replay import replay as play
+from zscout.scheduling.strategies import STRATEGIES, StrategyName
 from zscout.scheduling.workload import Workload
 from zscout.scheduling.workload_file import MAX_BYTES, parse_workload
 from zscout.strict import BadInput, read_text
@@ -84,7 +85,7 @@ class _Told:
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
     "--strategy",
-    type=click.Choice(["priority", "optimal", "adaptive"]),
+    type=click.Choice(list(STRATEGIES)),
     default="priority",
     show_default=True,
     help="How RCs are shared out.",
@@ -96,8 +97,8 @@ class _Told:
     metavar="FILE",
     help="Write a Rerun recording besides; look at it with `zscout view FILE`.",
 )
-def replay(file: Path, strategy: str, as_json: bool, rrd: Path | None) -> None:
-    """Shows who would hold what, and when, if the requests in FILE came.
+def replay(file: Path, strategy: StrategyName, as_json: bool, rrd: Path | None) -> None:
+    """Show who would hold what, and when, if the requests in FILE came.
 
     FILE is a workload: RCs, and ARCs with the time at which they ask (TOML). No mesh is needed, and no time
     passes. Without --json, a table with a row for each RC (a sharable one has a row for each holder) and a
@@ -109,14 +110,12 @@ def replay(file: Path, strategy: str, as_json: bool, rrd: Path | None) -> None:
       zscout replay table1.toml --json | jq '.holds[] | select(.outcome == "preempted")'
       zscout replay table1.toml --rrd table1.rrd && zscout view table1.rrd
     """
-    if strategy != "priority":
-        raise BadInput(f"strategy {strategy} is not there yet; use --strategy priority")
     workload = parse_workload(read_text(file, max_bytes=MAX_BYTES), str(file))
     told = _Told(workload)
     with ExitStack() as stack:
         if rrd is not None:
             told.timeline = _recording(stack, rrd, file)
-        played = play(workload, told.watch)
+        played = play(workload, told.watch, strategy=STRATEGIES[strategy]())
         if told.timeline is not None:
             _draw_holders(told.timeline, workload, played)
     if as_json:

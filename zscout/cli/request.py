@@ -70,7 +70,10 @@ class Wanted:
 def hold_options(command: F) -> F:
     """The options of all commands that hold something."""
     options: list[Callable[[F], F]] = [
-        click.option("--name", help="What the ARC is called. Default: the command's name."),
+        click.option(
+            "--name",
+            help="What the ARC is called. Default: the command's name, else request (take: operator).",
+        ),
         click.option(
             "--min-runtime",
             type=Duration(),

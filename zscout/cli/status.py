@@ -32,10 +32,12 @@ PASSING: Final = frozenset({"held", "remaining", "waited", "seq", "links", "load
 @click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
 def status(watch: bool, as_json: bool) -> None:
-    """Shows the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
+    """Show the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
 
-    The queue stands in rank order, each ARC with what it waits for. --watch refreshes once a second; in a
-    pipe it prints a new block when something else than a load or a time has changed. Exit code 3: no RCM.
+    The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are
+    shown even where they are not there; other hosts that died only with --watch. --watch refreshes once a
+    second; in a pipe it prints a new block when something else than a load or a time has changed. Exit code
+    3: no RCM.
 
     \b
     Examples:
@@ -197,7 +199,7 @@ def as_object(look: Look, state: RcmState | None) -> dict[str, Any]:
         "holds": [structs.asdict(hold) for hold in state.holds] if state is not None else [],
         "queue": [structs.asdict(wait) for wait in state.queue] if state is not None else [],
         "more": state.more if state is not None else 0,
-        "hosts": [_host_object(look, name, host, now) for name, host in sorted(look.hosts.items())],
+        "hosts": [_host_object(look, name, host, now) for name, host in look.everyone().items()],
     }
 
 
@@ -209,7 +211,7 @@ def _host_object(look: Look, name: str, host: Host, now: Ns) -> dict[str, Any]:
         "candidate": host.has(Role.CANDIDATE),
         "rcs": sorted(token.name for token in host.tokens if token.role == Role.RC),
         "clients": sorted({token.name for token in host.tokens if token.role == Role.CLIENT}),
-        "alive": host.gone is None,
+        "alive": bool(host.tokens),
         "gone": None if host.gone is None else (now - host.gone) / SECOND,
         "stale": look.stale(host),
         "load": None if host.load is None else structs.asdict(host.load),

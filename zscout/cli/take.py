@@ -38,8 +38,8 @@ MAX_ANSWER = 4_096
 def take(ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
-    Says who will be preempted and asks; without a terminal it needs --yes.
-    Then it waits, holds and runs a COMMAND as `zscout request` does, with the
+    Says who will be preempted and asks, on stderr; without a terminal it needs
+    --yes. Then it waits, holds and runs a COMMAND as `zscout request` does, with the
     same exit codes; 1 also where the question was not answered with y.
 
     \b
@@ -118,6 +118,9 @@ async def _agree(client: Client, wanted: Wanted, *, yes: bool) -> None:
             return
         if not (sys.stdin.isatty() and sys.stderr.isatty()):
             raise Failed("nobody can be asked here whether to preempt others; add --yes")
+        if wanted.as_json:
+            # The JSON may go down a pipe; who is asked must see what the question is about.
+            _say_in_words(wanted, cost)
         sys.stderr.write(f"Take {', '.join(sorted(wanted.needs))}? [y/N] ")
         sys.stderr.flush()
         if (await _answer()).strip().lower() not in ("y", "yes"):
@@ -132,6 +135,10 @@ def _say(client: Client, wanted: Wanted, cost: Toll) -> None:
             {"event": "preview", "arc": wanted.name, "client": str(client.mesh.me), **cost.as_json()}, stream
         )
         return
+    _say_in_words(wanted, cost)
+
+
+def _say_in_words(wanted: Wanted, cost: Toll) -> None:
     for line in cost.lines():
         print_line(clean(f"{wanted.name} {line}"), sys.stderr)
 

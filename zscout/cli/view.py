@@ -61,8 +61,9 @@ _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
     show_default=True,
     help="Without FILE: the folder in which the live recording is kept.",
 )
-def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path) -> None:
-    """Opens the recording FILE (.rrd), or records the fleet and shows it live.
+@common.json_option("Print one JSON object as soon as it is served or recorded: url, live, file.")
+def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path, as_json: bool) -> None:
+    """Open the recording FILE (.rrd), or record the fleet and show it live.
 
     The viewer is a window of its own, which ends the command when it is closed. On a host without a display
     use --web. Ctrl-C ends everything that was started; a live recording is complete then.
@@ -72,25 +73,33 @@ def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path) -
       zscout view
       zscout view --web
       zscout view runs/lab.rrd
+      zscout view --web --json | jq -r --unbuffered .url
     """
     try:
         address = ipaddress.ip_address("127.0.0.1" if bind == "localhost" else bind)
     except ValueError:
         raise BadInput(f"--bind: {quoted(bind)} is not an IP address; write one, as in 127.0.0.1") from None
+    if file is not None:
+        _check(file)
+        file = file.absolute()  # it may begin with a dash
     if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise common.Failed(
             "no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser"
         )
-    if file is not None:
-        _check(file)
-        file = file.absolute()  # it may begin with a dash
-    common.run(_view(file, web, str(address), port, out))
+    common.run(_view(file, web, str(address), port, out, as_json=as_json))
 
 
-async def _view(file: Path | None, web: bool, bind: str, port: int | None, out: Path) -> None:
+async def _view(
+    file: Path | None, web: bool, bind: str, port: int | None, out: Path, *, as_json: bool
+) -> None:
     # The page comes last, so what it shows needs its own port first.
-    async with _source(file, bind, None if web else port, out) as (shown, recorder):
+    async with _source(file, bind, None if web else port, out) as (told, recorder):
         children = [recorder] if recorder is not None else []
+        shown = told.url or told.file
+        if not as_json and recorder is not None:
+            common.print_line(f"Recording to {told.file}")
+            common.print_line(f"Live at {told.url}")
+        address: str | None = None
         command = [str(viewer_binary())]
         if not web:
             command += ["--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen"]
@@ -105,9 +114,11 @@ async def _view(file: Path | None, web: bool, bind: str, port: int | None, out: 
                 await viewer.says(HOSTING)
                 source = shown if file is None else f"rerun+http://{_host(bind)}:{stream}/proxy"
                 url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
-                common.print_line(
-                    f"Open http://{_host(bind)}:{page}/?url={url}&renderer=webgl&hide_welcome_screen=1"
-                )
+                address = f"http://{_host(bind)}:{page}/?url={url}&renderer=webgl&hide_welcome_screen=1"
+            if as_json:
+                common.print_json({"url": address, "live": told.url, "file": told.file})
+            elif web:
+                common.print_line(f"Open {address}")
                 common.print_line("Ctrl-C ends")
             await _first_to_end([viewer, *children])
 
@@ -115,10 +126,10 @@ async def _view(file: Path | None, web: bool, bind: str, port: int | None, out: 
 @asynccontextmanager
 async def _source(
     file: Path | None, bind: str, port: int | None, out: Path
-) -> AsyncIterator[tuple[str, Child | None]]:
+) -> AsyncIterator[tuple[Recording, Child | None]]:
     """What the viewer opens, and the recorder behind it where that is a live stream."""
     if file is not None:
-        yield str(file), None
+        yield Recording(str(file), None), None
         return
     fleet = common.the_fleet()
     host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
@@ -126,13 +137,11 @@ async def _source(
     command = [sys.executable, "-m", "zscout.services.recorder"]
     async with _child("the recorder", command, {}, job=encode_job(job)) as recorder:
         told = await recorder.told()
-        common.print_line(f"Recording to {told.file}")
         if told.url is None:
             raise common.Failed("the recorder serves no live stream; report this as a bug")
-        common.print_line(f"Live at {told.url}")
         alone = asyncio.create_task(_say_if_alone())
         try:
-            yield told.url, recorder
+            yield told, recorder
         finally:
             alone.cancel()
             await asyncio.gather(alone, return_exceptions=True)

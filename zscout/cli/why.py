@@ -11,13 +11,11 @@ from msgspec import structs
 
 from zscout.cli import common
 from zscout.messages import HoldView, RcmState, RcView, StoryLine, WaitView
-from zscout.strict import BadInput, quoted
+from zscout.strict import quoted
 
 if TYPE_CHECKING:
     from zscout.behaviors.client import Client
 
-MAX_NAME: Final = 200
-"""Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 MAX_TWINS: Final = 20
 """Open ARCs of one name that are told of."""
 MAX_NAMED: Final = 8
@@ -29,7 +27,7 @@ View = HoldView | WaitView
 @click.argument("arc")
 @common.json_option("Print one JSON object.")
 def why(arc: str, as_json: bool) -> None:
-    """Tells what became of ARC, and why it waits if it does.
+    """Tell what became of ARC, and why it waits if it does.
 
     ARC is its name, its id, or HOST/CLIENT/ID. Of each RC that it needs: who holds it, with which priority,
     since when, for how long yet. An ARC that has ended is known for as long as the RCM remembers it.
@@ -39,9 +37,7 @@ def why(arc: str, as_json: bool) -> None:
       zscout why survey
       zscout why 4caaac1a6451 --json | jq .arcs[0].story
     """
-    if not arc or len(arc) > MAX_NAME or not arc.isprintable():
-        raise BadInput(f"{quoted(arc)} names no ARC; zscout status lists them")
-    found = common.run(_look(arc))
+    found = common.run(_look(common.arc_named(arc)))
     if as_json:
         common.print_json(found)
         return

@@ -76,6 +76,8 @@ class Core:
         self._ends: list[tuple[Ns, ArcId, int]] = []
         """When holds are over, soonest first; entries of holds that ended otherwise are skipped."""
         self._wake: Ns | None = None
+        self._again = False
+        """Whether the strategy asked for another pass at once."""
 
     @property
     def batches(self) -> int:
@@ -89,6 +91,7 @@ class Core:
         self._now = now
         self._cause += 1
         self._effects = []
+        self._again = False
         self._expire()
         for event in events:
             self._apply(event)
@@ -135,8 +138,15 @@ class Core:
 
     def arcs_of(self, client: str) -> list[Arc]:
         """The ARCs of one client, those that wait first: so none of them profits from the others' end."""
-        arcs = (*self.floor.queued.values(), *self.floor.running.values())
-        return [arc for arc in arcs if arc.request.client == client]
+        return self.floor.arcs_of(client)
+
+    def reason(self, arc: Arc) -> str:
+        """Why a queued ARC waits, with all that is in its way as of the last batch; `arc.reason` is what was
+        told last. For who asks: nobody is told each time that one holder follows another far ahead of him."""
+        if arc.watched is None:
+            return arc.reason
+        visit = priority.Visit(self.floor, self.votes, self._now, arc)
+        return visit.obstacle(0) or visit.refusal() or arc.reason
 
     def given(self, place: Place) -> bool:
         """Whether `place` may have been given; of earlier terms the core does not know."""
@@ -164,7 +174,7 @@ class Core:
                 outcome = Outcome.COMPLETED
             self._end(arc, outcome, reason, requeue=False)
             return
-        del self.floor.queued[arc_id]
+        self.floor.drop(arc)
         self._forget(arc)
         self._effects.append(Dropped(self._cause, arc.id, arc.request.client, outcome, reason))
 
@@ -182,7 +192,7 @@ class Core:
             return
         old = self._revocation(arc, arc.hold, Outcome.HANDED_OVER, f"handed over to {to}", requeued=False)
         self._effects.append(old)
-        arc.request = replace(arc.request, client=to)
+        self.floor.hand_over(arc, to)
         arc.hold = replace(arc.hold, grant=self._next_grant())
         self._effects.append(self._granted(arc, arc.hold))
 
@@ -219,7 +229,9 @@ class Core:
             arc = self.floor.running.get(arc_id)
             if arc is None or arc.hold is None or arc.hold.end > self._now:
                 continue
-            if not arc.request.keep:
+            if arc.request.keep:
+                self.floor.overstayed(arc)
+            else:
                 self._end(arc, Outcome.COMPLETED, "its minimum runtime is over", requeue=False)
 
     # What a strategy may do (priority.Actions)
@@ -253,6 +265,9 @@ class Core:
         params = {arc.id: arc.request.needs[rc.name] for arc in arcs if arc is not None}
         self._effects.append(Propose(self._cause, number, rc.name, params))
 
+    def again(self) -> None:
+        self._again = True
+
     # Holds
 
     def _take(self, arc: Arc, hold: Hold) -> None:
@@ -273,6 +288,7 @@ class Core:
             self._forget(arc)
 
     def _forget(self, arc: Arc) -> None:
+        self.floor.forget(arc)
         for rc in self.floor.of(arc.mask & self.floor.sharable):
             self.votes.forget_arc(rc.name, arc.id)
 
@@ -303,7 +319,9 @@ class Core:
         at = self._ends[0][0] if self._ends else None
         if self.floor.queued:
             at = min(self._now + QUANTUM, at) if at is not None else self._now + QUANTUM
-        if at != self._wake:
+        if self._again:
+            at = self._now
+        if at != self._wake or self._again:
             self._wake = at
             self._effects.append(WakeAt(self._cause, at))
 

@@ -6,8 +6,10 @@ Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
-from zscout.scheduling.model import Arc, ArcId, Hold, Ns, Rc, RcName
+from zscout.scheduling.model import Arc, ArcId, ClientId, Hold, Ns, Rc, RcName
+from zscout.scheduling.waits import Waits
 
 
 class Floor:
@@ -23,7 +25,11 @@ class Floor:
         """Bits of the RCs that vote and take several holders."""
         self.busy = 0
         """Bits of the exclusive RCs that somebody holds."""
+        self.waits = Waits()
         self._by_bit: list[Rc] = []
+        self._clients: dict[ClientId, dict[ArcId, Arc]] = {}
+        self.turns = 0
+        """Counts who was queued or started."""
 
     def rc(self, name: RcName) -> Rc:
         """The RC of this name, made known (absent, exclusive) if it was not."""
@@ -32,6 +38,10 @@ class Floor:
             rc = self.rcs[name] = Rc(name, 1 << len(self._by_bit))
             self._by_bit.append(rc)
         return rc
+
+    def known(self) -> int:
+        """Bits of all RCs that were ever named."""
+        return (1 << len(self._by_bit)) - 1
 
     def mask(self, names: Iterator[RcName]) -> int:
         mask = 0
@@ -54,21 +64,50 @@ class Floor:
         rc.present, rc.sharable = True, sharable
         self.present |= rc.bit
         self.sharable = self.sharable | rc.bit if sharable else self.sharable & ~rc.bit
+        self.waits.freed |= rc.bit
 
     def leave(self, name: RcName) -> None:
         rc = self.rc(name)
         rc.present = False
         self.present &= ~rc.bit
+        self.waits.freed |= rc.bit
 
     def enqueue(self, arc: Arc, now: Ns) -> None:
-        arc.since = now
+        arc.since, arc.turn = now, self._turn()
+        arc.rcs = arc.rcs or tuple(self.of(arc.mask))
         self.queued[arc.id] = arc
+        self.waits.add(arc)
+        self._clients.setdefault(arc.request.client, {})[arc.id] = arc
+
+    def drop(self, arc: Arc) -> None:
+        """A queued ARC waits no more, and runs neither."""
+        del self.queued[arc.id]
+        self.waits.remove(arc)
+
+    def forget(self, arc: Arc) -> None:
+        """An ARC that neither waits nor runs is over for good."""
+        arcs = self._clients[arc.request.client]
+        del arcs[arc.id]
+        if not arcs:
+            del self._clients[arc.request.client]
+
+    def arcs_of(self, client: ClientId) -> list[Arc]:
+        """The ARCs of one client, first those that wait, each group in the order in which it came there."""
+        arcs = self._clients.get(client, {}).values()
+        return sorted(arcs, key=lambda arc: (arc.hold is not None, arc.turn))
+
+    def hand_over(self, arc: Arc, to: ClientId) -> None:
+        """A running ARC goes on under another client."""
+        self.forget(arc)
+        arc.request = replace(arc.request, client=to)
+        self._clients.setdefault(to, {})[arc.id] = arc
 
     def start(self, arc: Arc, hold: Hold, now: Ns) -> None:
-        del self.queued[arc.id]
-        arc.hold, arc.reason, arc.since = hold, "", now
+        self.drop(arc)
+        arc.hold, arc.reason, arc.since, arc.turn = hold, "", now, self._turn()
         self.running[arc.id] = arc
-        for rc in self.of(arc.mask):
+        self.waits.stirred |= arc.mask
+        for rc in arc.rcs:
             rc.holders[arc.id] = arc
         self.busy |= arc.mask & ~self.sharable
 
@@ -78,10 +117,19 @@ class Floor:
         assert hold is not None, arc.id  # noqa: S101
         del self.running[arc.id]
         arc.hold = None
-        for rc in self.of(arc.mask):
+        for rc in arc.rcs:
             del rc.holders[arc.id]
         self.busy &= ~arc.mask
+        self.waits.freed |= arc.mask
         return hold
+
+    def overstayed(self, arc: Arc) -> None:
+        """A kept hold has had its minimum runtime: from now on it yields to its equals."""
+        self.waits.freed |= arc.mask
+
+    def _turn(self) -> int:
+        self.turns += 1
+        return self.turns
 
     def validate(self) -> None:
         """Checks every invariant; for tests and simulators. Raises AssertionError that names the breach."""
@@ -102,6 +150,10 @@ class Floor:
                 check(len(rc.holders) <= 1, f"{rc.name} has two holders: {sorted(rc.holders)}")
                 busy |= rc.bit if rc.holders else 0
         check(busy == self.busy, "the mask of busy RCs is wrong")
+        for breach in self.waits.validate(self.queued):
+            check(False, breach)
+        known = {arc.id for arcs in self._clients.values() for arc in arcs.values()}
+        check(known == self.queued.keys() | self.running.keys(), "the clients' ARCs are not those known")
 
 
 def check(truth: bool, breach: str) -> None:

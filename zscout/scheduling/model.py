@@ -51,6 +51,10 @@ class Place(NamedTuple):
     arrival: int
 
 
+Rank: TypeAlias = tuple[int, Ns, Place, ArcId]
+"""Sorts contenders, best first: priority (negated), minimum runtime, place, id."""
+
+
 @dataclass(frozen=True, slots=True)
 class Request:
     """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0)."""
@@ -93,28 +97,39 @@ class Arc:
     request: Request
     place: Place
     mask: int
-    """Bits of the needed RCs, sharable or not (see `Fleet.bit`)."""
+    """Bits of the needed RCs, sharable or not (see `Floor.rc`)."""
     hold: Hold | None = None
     reason: str = ""
-    """Why it waits, in words; empty while it runs."""
+    """Why it waits, in the words last told; empty while it runs. `Core.reason` has those of now."""
     since: Ns = 0
     """When it was last queued or granted."""
     preemptions: int = 0
+    turn: int = 0
+    """Grows with each entry into the queue or among the running: who came there first."""
+    rcs: tuple[Rc, ...] = ()
+    """Those of `mask`, in the order of the bits; set when the ARC comes to the floor."""
+    id: ArcId = field(init=False)
+    priority: int = field(init=False)
+    rank: Rank = field(init=False)
+    """Higher priority, then shorter minimum runtime, then earlier place goes first.
 
-    @property
-    def id(self) -> ArcId:
-        return self.request.arc
+    Clients tell their places after a takeover, so two may claim one: the id keeps the order total."""
+    watched: Rc | None = None
+    """While it waits: the RC whose situation alone keeps it out; None if it has to be looked at anyway."""
+    footprint: int = 0
+    """What it would take or free, as bits, from a visit that came to no end."""
+    hidden: int = 0
+    """Where a firm obstacle lay under what was off limits at that visit, as bits."""
+    asked: bool = False
+    """Whether that visit waits for votes of its own."""
+
+    def __post_init__(self) -> None:
+        self.id, self.priority = self.request.arc, self.request.priority
+        self.rank = (-self.priority, self.request.min_runtime, self.place, self.id)
 
     @property
     def name(self) -> str:
         return self.request.name
-
-    @property
-    def rank(self) -> tuple[int, Ns, Place, ArcId]:
-        """Sorts contenders, best first: priority, then shorter minimum runtime, then earlier place.
-
-        Clients tell their places after a takeover, so two may claim one: the id keeps the order total."""
-        return (-self.request.priority, self.request.min_runtime, self.place, self.id)
 
     def overstays(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may displace it then."""
@@ -122,11 +137,12 @@ class Arc:
 
     def yields_to(self, other: Arc, now: Ns) -> bool:
         """Whether `other` may take what this running ARC holds."""
-        mine, theirs = self.request.priority, other.request.priority
-        return mine < theirs or (mine == theirs and self.overstays(now))
+        if self.priority != other.priority:
+            return self.priority < other.priority
+        return self.overstays(now)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Rc:
     """One resource controller. `bit` is its bit in every mask, kept for as long as the core lives."""
 
@@ -135,3 +151,5 @@ class Rc:
     present: bool = False
     sharable: bool = False
     holders: dict[ArcId, Arc] = field(default_factory=dict)
+    watchers: list[Rank] = field(default_factory=list)
+    """Ranks of the queued ARCs that watch this RC, best first."""

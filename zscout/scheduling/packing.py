@@ -2,8 +2,8 @@
 
 The value of a set is the vector of (ARC, RC) pairs in use by priority level, highest level first, compared
 lexicographically; among equals the set with fewest preemptions, then the one that holds the best-ranked item
-in which they differ. Items come in the order of decision (see `order`): with "take it" tried first, the first
-best set that is met is the best-ranked one, so only strictly better sets need be looked for.
+in which they differ. Items are numbered by rank. With "take it" tried first and best ranks decided first, the
+first best set that is met is the best-ranked one, so only strictly better sets need be looked for.
 
 The bound: an RC is used once, so free RCs, each counted at the highest level that still covers it, can't be
 beaten; pairs at sharable RCs are added as they are.
@@ -11,14 +11,14 @@ beaten; pairs at sharable RCs are added as they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 NO_LIMIT = 1 << 60
 
 
-@dataclass(frozen=True, slots=True)
-class Item:
+class Item(NamedTuple):
     """A contender: exclusive RCs as a bit mask, RCs in all, its level (0 is the highest), whether it runs.
 
     `spent` marks one that runs on after its minimum runtime: it is worth nothing, yields to its own level as
@@ -29,6 +29,11 @@ class Item:
     level: int
     standing: bool = False
     spent: bool = False
+
+    @property
+    def owed(self) -> bool:
+        """Whether to end it is a preemption."""
+        return self.standing and not self.spent
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,30 +46,18 @@ class Packing:
     """No set is worth more than this."""
     exact: bool
     nodes: int
-    first: int
-    """The value of the first complete set: the heuristic's, which takes whatever fits, best rank first."""
 
 
-def order(item: Item) -> tuple[int, int]:
-    """Sorts items for decision; those of one key stay as they are ranked."""
-    return (item.level, 2 if item.spent else 0 if item.standing else 1)
+class Problem:
+    """Items in rank order, so levels never fall; and `barred`, bit sets of items that must not all be chosen.
 
+    All running items fit together, or are barred from it by a veto."""
 
-def pack(items: Sequence[Item], barred: Iterable[int] = (), *, nodes: int = NO_LIMIT) -> Packing:
-    """The best set of `items`, which are in the order of decision.
-
-    `barred` are bit sets of items that must not all be chosen (vetoes). At most `nodes` steps are taken, one
-    complete set at least."""
-    return _Search(items, list(barred), nodes).run()
-
-
-class _Search:
-    def __init__(self, items: Sequence[Item], barred: list[int], nodes: int) -> None:
+    def __init__(self, items: Sequence[Item], barred: Iterable[int] = ()) -> None:
         self.items = items
-        self.limit = nodes
-        levels = max((item.level for item in items), default=0) + 1
+        self.levels = items[-1].level + 1 if items else 1
         base = sum(item.width for item in items) + 1
-        self.unit = [base ** (levels - 1 - item.level) for item in items]
+        self.unit = [base ** (self.levels - 1 - item.level) for item in items]
         """What one RC in use is worth at an item's level: more than all lower levels together."""
         self.masks = [item.mask for item in items]
         self.worth = [
@@ -74,99 +67,29 @@ class _Search:
             0 if item.spent else (item.width - item.mask.bit_count()) * unit
             for item, unit in zip(items, self.unit, strict=True)
         ]
-        self.shares = any(self.extra)
+        self.plain = self.levels == 1 and not any(self.extra) and not any(item.spent for item in items)
+        """Whether an RC in use counts one, whoever uses it."""
         self.barred: list[list[int]] = [[] for _ in items]
         for bar in barred:
-            for number in _numbers(bar):
+            for number in numbers(bar):
                 self.barred[number].append(bar)
-        self.best = -1
-        self.best_lost = 0
-        self.chosen = 0
-        self.first = -1
-        self.nodes = 0
-        self.cut = False
-        """Whether the limit left something unseen."""
+        self.vetoes = any(self.barred)
+        self.standing = [number for number, item in enumerate(items) if item.standing]
 
-    def run(self) -> Packing:
-        whole = [number for number in range(len(self.items)) if self._allowed(number, 0)]
-        bound = self._bound(whole)
-        self._go(whole, 0, 0, 0)
-        return Packing(
-            chosen=self.chosen,
-            value=self.best,
-            bound=bound if self.cut else self.best,
-            exact=not self.cut,
-            nodes=self.nodes,
-            first=self.first,
-        )
-
-    def _go(self, open_: list[int], chosen: int, value: int, lost: int) -> None:
-        """Decides the first open item, both ways where both are allowed. `open_` fit beside `chosen`."""
-        items, masks = self.items, self.masks
-        while open_:
-            self.nodes += 1
-            if self.best >= 0:
-                if self.nodes > self.limit:
-                    self.cut = True
-                    return
-                bound = value + self._bound(open_)
-                if bound < self.best or (bound == self.best and lost >= self.best_lost):
-                    return
-            head, *tail = open_
-            mask, bit = masks[head], 1 << head
-            taken = chosen | bit
-            rest = [number for number in tail if not masks[number] & mask]
-            if any(self.barred):
-                rest = [number for number in rest if self._allowed(number, taken)]
-            dropped = lost
-            if len(rest) < len(tail):
-                gone = set(tail).difference(rest)
-                dropped += sum(items[number].standing and not items[number].spent for number in gone)
-            if len(rest) == len(tail) or self._must(head):
-                chosen, value, lost, open_ = taken, value + self.worth[head], dropped, rest
-                continue
-            self._go(rest, taken, value + self.worth[head], dropped)
-            item = items[head]
-            lost += item.standing and not item.spent
-            open_ = tail
-        self._complete(chosen, value, lost)
-
-    def _must(self, number: int) -> bool:
-        """Who runs and fits beside all that is chosen above stays; only vetoes among equals may differ."""
-        return self.items[number].standing and not self.barred[number]
-
-    def _complete(self, chosen: int, value: int, lost: int) -> None:
-        if not self._lawful(chosen):
-            return
-        if self.first < 0:
-            self.first = value
-        if value > self.best or (value == self.best and lost < self.best_lost):
-            self.best, self.best_lost, self.chosen = value, lost, chosen
-
-    def _lawful(self, chosen: int) -> bool:
-        """Whether nobody is left out who runs and fits beside the chosen above and the equals that run."""
-        for number, item in enumerate(self.items):
-            if not item.standing or chosen >> number & 1 or not self.barred[number]:
-                continue
-            beside, mask = 0, 0
-            for other in _numbers(chosen):
-                them = self.items[other]
-                same = them.level == item.level and (them.standing or item.spent)
-                if them.level < item.level or same:
-                    beside |= 1 << other
-                    mask |= them.mask
-            if not item.mask & mask and self._allowed(number, beside):
-                return False
-        return True
-
-    def _allowed(self, number: int, chosen: int) -> bool:
+    def allowed(self, number: int, chosen: int) -> bool:
+        """Whether no veto keeps an item out beside those chosen."""
         beside = chosen | 1 << number
         return all(bar & ~beside for bar in self.barred[number])
 
-    def _bound(self, open_: list[int]) -> int:
-        """What the open items can be worth together, at most."""
+    def bound(self, open_: Iterable[int]) -> int:
+        """What these items can be worth together, at most. Levels must not fall."""
         masks, units = self.masks, self.unit
-        bound = seen = layer = unit = 0
+        if self.plain:
+            layer = 0
+            for number in open_:
+                layer |= masks[number]
+            return layer.bit_count()
+        bound = seen = layer = unit = extra = 0
         for number in open_:
             if units[number] != unit:
                 bound += (layer & ~seen).bit_count() * unit
@@ -174,13 +97,145 @@ class _Search:
                 layer, unit = 0, units[number]
             if self.worth[number]:
                 layer |= masks[number]
-        bound += (layer & ~seen).bit_count() * unit
-        if self.shares:
-            bound += sum(self.extra[number] for number in open_)
-        return bound
+            extra += self.extra[number]
+        return bound + (layer & ~seen).bit_count() * unit + extra
+
+    def bound_of_all(self) -> int:
+        return self.bound(number for number in range(len(self.items)) if self.allowed(number, 0))
+
+    def value(self, chosen: int) -> int:
+        return sum(self.worth[number] for number in numbers(chosen))
+
+    def lost(self, chosen: int) -> int:
+        """How many would be preempted."""
+        return sum(1 for number in self.standing if self.items[number].owed and not chosen >> number & 1)
+
+    def key(self, chosen: int) -> tuple[int, int]:
+        """Compares sets by value, then by preemptions; greater is better."""
+        return self.value(chosen), -self.lost(chosen)
+
+    def complete(self, wish: int = 0) -> int:
+        """A lawful set that nothing can be added to: level by level who runs, who is wished for, the rest by
+        rank. Without a wish that is the heuristic's."""
+        items, masks = self.items, self.masks
+
+        def turn(number: int) -> tuple[int, int]:
+            item = items[number]
+            if item.standing:
+                return item.level, 3 if item.spent else 0
+            return item.level, 1 if wish >> number & 1 else 2
+
+        used = chosen = 0
+        for number in sorted(range(len(items)), key=turn):
+            if not masks[number] & used and (not self.vetoes or self.allowed(number, chosen)):
+                used |= masks[number]
+                chosen |= 1 << number
+        return chosen
+
+    def lawful(self, chosen: int) -> bool:
+        """Whether nobody is left out who runs and fits beside the chosen above and the equals that run."""
+        for number in self.standing:
+            if chosen >> number & 1:
+                continue
+            beside, mask = 0, 0
+            for other in numbers(chosen):
+                if self.goes_before(other, number):
+                    beside |= 1 << other
+                    mask |= self.masks[other]
+            if not self.masks[number] & mask and self.allowed(number, beside):
+                return False
+        return True
+
+    def goes_before(self, other: int, running: int) -> bool:
+        """Whether `running` may have to end because `other` was chosen."""
+        them, item = self.items[other], self.items[running]
+        return them.level < item.level or (them.level == item.level and (them.standing or item.spent))
 
 
-def _numbers(bits: int) -> Iterable[int]:
+def pack(problem: Problem, nodes: int = NO_LIMIT) -> Packing:
+    """The best set, or the best that is found in so many steps, at least the heuristic's."""
+    return _Search(problem, nodes).run()
+
+
+class _Search:
+    def __init__(self, problem: Problem, nodes: int) -> None:
+        self.problem = problem
+        self.limit = nodes
+        items = problem.items
+        # These stay wherever they fit, so there is nothing to decide about them. Others that run have to be
+        # decided by rank, and the set as a whole is checked.
+        self.firm = [item.owed and not barred for item, barred in zip(items, problem.barred, strict=True)]
+        self.owed = [item.owed for item in items]
+        self.ends = any(self.owed)
+        self.checked = any(item.standing and not firm for item, firm in zip(items, self.firm, strict=True))
+        self.best = -1
+        self.best_lost = 0
+        self.chosen = 0
+        self.nodes = 0
+
+    def run(self) -> Packing:
+        problem = self.problem
+        whole = [number for number in range(len(problem.items)) if problem.allowed(number, 0)]
+        whole.sort(key=lambda number: (problem.items[number].level, not self.firm[number]))
+        bound = problem.bound(whole)
+        out = sum(self.owed) - sum(self.owed[number] for number in whole)
+        todo = [(whole, 0, 0, out)]
+        cut = False
+        while todo and not cut:
+            cut = self._descend(todo, *todo.pop())
+        if cut:
+            self.chosen = max(self.chosen, problem.complete(), key=problem.key)
+            self.best = problem.value(self.chosen)
+        return Packing(self.chosen, self.best, bound if cut else self.best, not cut, self.nodes)
+
+    def _descend(
+        self,
+        todo: list[tuple[list[int], int, int, int]],
+        open_: list[int],
+        chosen: int,
+        value: int,
+        lost: int,
+    ) -> bool:
+        """Takes whatever comes first, down to a complete set; what else might be done is put on `todo`.
+
+        `open_` are allowed beside `chosen`. True: the limit left something unseen."""
+        problem, masks, worth = self.problem, self.problem.masks, self.problem.worth
+        while open_:
+            self.nodes += 1
+            if self.nodes > self.limit:
+                return True
+            if self.best >= 0:
+                bound = value + problem.bound(open_)
+                if bound < self.best or (bound == self.best and lost >= self.best_lost):
+                    return False
+            head, *tail = open_
+            mask = masks[head]
+            taken = chosen | 1 << head
+            rest = [number for number in tail if not masks[number] & mask]
+            if problem.vetoes:
+                rest = [number for number in rest if problem.allowed(number, taken)]
+            dropped = lost
+            if self.ends and len(rest) < len(tail):
+                dropped += sum(self.owed[number] for number in set(tail).difference(rest))
+            if not self.firm[head] and (len(rest) < len(tail) or self._in_the_way(head, taken, tail)):
+                todo.append((tail, chosen, value, lost + self.owed[head]))
+            open_, chosen, value, lost = rest, taken, value + worth[head], dropped
+        better = value > self.best or (value == self.best and lost < self.best_lost)
+        if better and (not self.checked or problem.lawful(chosen)):
+            self.best, self.best_lost, self.chosen = value, lost, chosen
+        return False
+
+    def _in_the_way(self, head: int, taken: int, tail: list[int]) -> bool:
+        """Whether a veto on `head` can still bite, if all that are open were taken as well."""
+        bars = self.problem.barred[head]
+        if not bars:
+            return False
+        reach = taken | sum(1 << number for number in tail)
+        return any(not bar & ~reach for bar in bars)
+
+
+def numbers(bits: int) -> Iterator[int]:
+    """The numbers in a bit set, smallest first."""
     while bits:
         low = bits & -bits
         yield low.bit_length() - 1

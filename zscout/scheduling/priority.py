@@ -14,20 +14,40 @@ lower ranks, and so is what a visit stopped by that would take or free; all othe
 run again from the top at any time: what a lower rank takes never makes a higher one possible (a lower rank
 only displaces those who would have yielded to the higher one as well, and votes are monotone), so an answer
 that arrives simply runs the next pass, and the outcome is that of votes given on the spot.
+
+**Who need not be visited** (`waits.py`). The outcome is that of a pass over the whole queue, because an ARC
+is passed over only where its visit would again come to "waits", stopping nobody and asking nothing:
+
+- It *watches* an RC outside what is off limits. (a) An absent RC: until it joins. (b) An exclusive RC whose
+  holder does not yield to it: until that holder goes or overstays. Who takes the RC instead ranks above all
+  that still watch it below him, so it does not yield to them either: after the first watcher that takes the
+  RC, the others need no look. (c) A sharable RC that vetoed it beside the holders who do not yield: until
+  one of them goes or overstays, or the RC's rules change; more holders leave a veto standing, because what
+  an RC accepts it accepts of every subset. When the RC becomes off limits, its watchers below are visited.
+- It is *asleep* before a silent RC. Its visit reads nothing outside its footprint; it is visited when
+  anything within changes, is answered or becomes off limits, and when the silent RC may be asked again.
+- It is *open*, but nothing within its footprint has changed. Then it is stopped again, if what it would
+  take is off limits and what hides its firm obstacles still is, or it waits for the same votes as before.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from operator import attrgetter
 from typing import Protocol, TypeAlias
 
 from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import Arc, ArcId, Ns, Rc
+from zscout.scheduling.model import Arc, Ns, Rank, Rc
+from zscout.scheduling.visit import Admitted, Open, Refused, Visit, absence, listed
 from zscout.scheduling.votes import HolderSet, Votes
 
+__all__ = ["UNSETTLED", "Actions", "Strategy", "Visit", "absence", "run_full_pass", "run_pass"]
+
 UNSETTLED = "votes are out"
+TOLD = 4
+"""How many of those who watch an RC are told at once that its holder is another; the rest see it when they
+ask. In a long queue every grant would else be news to everyone."""
 
 
 class Actions(Protocol):
@@ -40,176 +60,174 @@ class Actions(Protocol):
 
     def wait(self, arc: Arc, reason: str, *, settled: bool = True) -> None: ...
     def propose(self, rc: Rc, holders: HolderSet) -> None: ...
+    def again(self) -> None:
+        """Asks for another pass at once: the strategy needs more time, and others shall have their turn."""
+        ...
 
 
 Strategy: TypeAlias = Callable[[Floor, Votes, Ns, Actions], None]
 """One pass: reads the floor and the votes, and acts."""
 
 
-@dataclass(frozen=True, slots=True)
-class Refused:
-    """The visit is over: `reason` is why the ARC goes on waiting."""
+def run_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions, *, off_limits: int = 0) -> None:
+    """One pass over the queue at `now`, as far as something has changed for those who wait.
 
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Open:
-    """The visit can't be decided before these are answered."""
-
-    questions: list[tuple[Rc, HolderSet]]
+    `off_limits`: bits of RCs that another strategy is still deciding about."""
+    Pass(floor, votes, now, actions).run(
+        sorted(floor.waits.open.values(), key=attrgetter("rank")), off_limits
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class Admitted:
-    """The ARC may start once these are displaced."""
+def run_full_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
+    """The same pass as if every RC had been freed: whoever waits is looked at, himself or by way of the first
+    who watches the same RC, for what keeps him out keeps out all below him. For tests and benchmarks."""
+    floor.waits.freed = floor.known()
+    Pass(floor, votes, now, actions, told=0).run(floor.waits.open.values())
 
-    victims: list[Arc]
 
+class Pass:
+    """Visits in rank order: those who are open, and those who watch what has been freed."""
 
-def run_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
-    """One pass over the queue at `now`."""
-    order = [(arc.rank, arc) for arc in floor.queued.values()]
-    heapq.heapify(order)
-    off_limits = 0
-    while order:
-        _, arc = heapq.heappop(order)
-        visit = Visit(floor, votes, now, arc)
-        if obstacle := visit.obstacle(off_limits):
-            actions.wait(arc, obstacle)
-            continue
-        if visit.footprint & off_limits:
-            off_limits |= visit.footprint
-            actions.wait(arc, UNSETTLED, settled=False)
-            continue
-        match visit.decide():
-            case Refused(reason):
-                actions.wait(arc, reason)
-            case Open(questions) if silent := [ask for ask in questions if votes.silent(ask[0].name)]:
-                actions.wait(arc, f"{_list([rc.name for rc, _ in silent])} does not answer")
+    def __init__(self, floor: Floor, votes: Votes, now: Ns, actions: Actions, told: int = TOLD) -> None:
+        self.floor, self.votes, self.now, self.actions = floor, votes, now, actions
+        self.told = told
+        self.waits = floor.waits
+        self.off_limits = 0
+        self.changed = 0
+        """Bits of the RCs at which something is new since the last pass began."""
+        self._coming: list[tuple[Rank, int, Arc, Rc | None]] = []
+        """Heap of who is next, beside the open. By way of an RC come its watchers, one after the other."""
+        self._walks: dict[int, int] = {}
+        """By bit of each RC whose watchers come: how many more of them are told of a new holder."""
+        self._done = 0
+        """Bits of the RCs at which this pass itself has changed something."""
+
+    def run(self, open_arcs: Iterable[Arc], off_limits: int = 0) -> None:
+        """Visits `open_arcs` and whom changes call; `off_limits` are bits of RCs."""
+        opened = sorted(open_arcs, key=attrgetter("rank"))
+        self._note_votes()
+        self._rouse(None)
+        self._bar(off_limits, None)
+        coming, at, last = self._coming, 0, None
+        while coming or at < len(opened):
+            if at < len(opened) and (not coming or opened[at].rank <= coming[0][0]):
+                arc, rc = opened[at], None
+                at += 1
+            else:
+                _, _, arc, rc = heapq.heappop(coming)
+                if rc is not None and not self._worth_a_look(rc, arc):
+                    continue
+            # One may come by several ways, but then at once: ranks are unique.
+            if arc.rank != last:
+                last = arc.rank
+                if not arc.footprint or not self._stopped_again(arc):
+                    self._visit(arc)
+            if rc is not None:
+                self._walk_on(rc, last)
+        # Those who were visited before a change further down have not seen it.
+        self.waits.stirred |= self._done
+
+    def _visit(self, arc: Arc) -> None:
+        visit = Visit(self.floor, self.votes, self.now, arc)
+        decision = visit.obstacle_outside(self.off_limits)
+        if decision is None and self.off_limits and visit.footprint() & self.off_limits:
+            self._put_off(arc, visit, asked=False)
+            self.actions.wait(arc, UNSETTLED, settled=False)
+            return
+        match decision or visit.decide():
+            case Refused(rc, reason):
+                self.waits.watch(arc, rc)
+                self.actions.wait(arc, reason)
+            case Open(questions) if silent := [ask for ask in questions if self.votes.silent(ask[0].name)]:
+                self.waits.sleep(arc, visit.footprint())
+                self.actions.wait(arc, f"{listed([rc.name for rc, _ in silent])} does not answer")
                 for rc, holders in silent:
-                    actions.propose(rc, holders)
+                    self.actions.propose(rc, holders)
             case Open(questions):
-                off_limits |= visit.footprint
-                actions.wait(arc, UNSETTLED, settled=False)
+                self._put_off(arc, visit, asked=True)
+                self.actions.wait(arc, UNSETTLED, settled=False)
                 for rc, holders in questions:
-                    actions.propose(rc, holders)
+                    self.actions.propose(rc, holders)
             case Admitted(victims):
                 for victim in victims:
-                    if actions.displace(victim, by=arc):
-                        heapq.heappush(order, (victim.rank, victim))
-                actions.start(arc)
+                    if self.actions.displace(victim, by=arc):
+                        heapq.heappush(self._coming, (victim.rank, 0, victim, None))
+                self.actions.start(arc)
+                self._done |= self._rouse(arc.rank)
 
+    def _put_off(self, arc: Arc, visit: Visit, *, asked: bool) -> None:
+        footprint = visit.footprint()
+        self.waits.reopen(arc, footprint, hidden=visit.hidden(), asked=asked)
+        self._bar(footprint, arc.rank)
 
-class Visit:
-    """One look at one queued ARC: who is in its way, what it would take and free, what the RCs say."""
+    def _stopped_again(self, arc: Arc) -> bool:
+        """Whether a visit that came to no end comes to none again, seen without repeating it."""
+        if arc.footprint & self.changed or arc.hidden & ~self.off_limits:
+            return False
+        if not (arc.asked or arc.footprint & self.off_limits):
+            return False
+        self._bar(arc.footprint, arc.rank)
+        return True
 
-    def __init__(self, floor: Floor, votes: Votes, now: Ns, arc: Arc) -> None:
-        self.floor, self.votes, self.now, self.arc = floor, votes, now, arc
-        self.firm: list[tuple[Rc, Arc]] = []
-        """Exclusive RCs it needs, with holders that do not yield to it."""
-        self.blockers: dict[ArcId, Arc] = {}
-        self.candidates: dict[ArcId, Arc] = {}
-        self.footprint = arc.mask
-        """All that the visit would take or free."""
-        self._sharables: list[Rc] = []
-        if not arc.mask & (floor.busy | floor.sharable):
-            return
-        for rc in floor.of(arc.mask & floor.busy):
-            (holder,) = rc.holders.values()
-            if holder.yields_to(arc, now):
-                self.blockers[holder.id] = holder
-            else:
-                self.firm.append((rc, holder))
-        self._sharables = list(floor.of(arc.mask & floor.sharable))
-        for rc in self._sharables:
-            for holder in rc.holders.values():
-                if holder.id not in self.blockers and holder.yields_to(arc, now):
-                    self.candidates[holder.id] = holder
-        for group in (self.blockers, self.candidates):
-            for holder in group.values():
-                self.footprint |= holder.mask
+    def _bar(self, footprint: int, rank: Rank | None) -> None:
+        """Puts all of `footprint` off limits for those below `rank`; for all of them without a rank."""
+        new = footprint & ~self.off_limits
+        if new:
+            self.off_limits |= new
+            self._call(new, new, rank)
 
-    def obstacle(self, off_limits: int) -> str:
-        """Why the ARC can't start whatever becomes of the visits that are open; empty if it may."""
-        if absent := absence(self.floor, self.arc):
-            return absent
-        if any(not rc.bit & off_limits for rc, _ in self.firm):
-            return "needs " + _list([f"{rc.name} (held by {_who(holder)})" for rc, holder in self.firm])
-        if not off_limits:
-            return ""
-        for rc in self._sharables:
-            if not rc.bit & off_limits:
-                answer = self.votes.known(rc.name, self._firm_holders(rc))
-                if answer is not None and not answer.accept:
-                    return _veto(rc, answer.reason)
-        return ""
+    def _note_votes(self) -> None:
+        waits, votes, rc = self.waits, self.votes, self.floor.rc
+        for name in votes.forgotten:
+            waits.freed |= rc(name).bit
+        for name in (*votes.heard, *votes.due(self.now)):
+            waits.stirred |= rc(name).bit
+        votes.forgotten.clear()
+        votes.heard.clear()
 
-    def decide(self) -> Refused | Open | Admitted:
-        """Steps 2 and 3, with the votes that are known. Only for a visit without an obstacle."""
-        verdict = self._ask([(rc, self._firm_holders(rc)) for rc in self._sharables])
-        if verdict is not None:
-            return verdict
-        kept = {rc.name: self._firm_holders(rc) for rc in self._sharables}
-        victims = list(self.blockers.values())
-        for candidate in sorted(self.candidates.values(), key=lambda arc: arc.rank):
-            shared = [rc for rc in self._sharables if candidate.id in rc.holders]
-            beside = [(rc, kept[rc.name] | {candidate.id}) for rc in shared]
-            verdict = self._ask(beside)
-            match verdict:
-                case None:
-                    for rc, holders in beside:
-                        kept[rc.name] = holders
-                case Refused() if self._vetoed(beside):
-                    victims.append(candidate)
-                case Refused() | Open():
-                    return verdict
-        return Admitted(sorted(victims, key=lambda arc: arc.rank))
+    def _rouse(self, rank: Rank | None) -> int:
+        """Calls whom the latest changes concern, below `rank`; returns where something changed."""
+        waits = self.waits
+        freed, touched = waits.freed, waits.freed | waits.stirred
+        waits.freed = waits.stirred = 0
+        self.changed |= touched
+        self._call(freed, touched, rank)
+        return touched
 
-    def refusal(self) -> str:
-        """The veto that keeps the ARC out beside those who would stay; empty if none is known."""
-        for rc in self._sharables:
-            answer = self.votes.known(rc.name, self._firm_holders(rc))
-            if answer is None and self.votes.silent(rc.name):
-                return f"{rc.name} does not answer"
-            if answer is not None and not answer.accept:
-                return _veto(rc, answer.reason)
-        return ""
+    def _call(self, walks: int, touched: int, rank: Rank | None) -> None:
+        waits = self.waits
+        for rc in self.floor.of(walks & waits.watched):
+            known = rc.bit in self._walks
+            self._walks[rc.bit] = self.told
+            if not known:
+                self._walk_on(rc, rank)
+        if waits.asleep:
+            for arc in list(waits.asleep.values()):
+                if arc.footprint & touched and (rank is None or arc.rank > rank):
+                    waits.reopen(arc)
+                    heapq.heappush(self._coming, (arc.rank, 0, arc, None))
 
-    def _firm_holders(self, rc: Rc) -> HolderSet:
-        stay = (arc for arc in rc.holders if arc not in self.blockers and arc not in self.candidates)
-        return frozenset((*stay, self.arc.id))
+    def _walk_on(self, rc: Rc, rank: Rank | None) -> None:
+        """The next watcher of `rc` below `rank` comes."""
+        following = self.waits.after(rc, rank)
+        if following is None:
+            del self._walks[rc.bit]
+        else:
+            heapq.heappush(self._coming, (following, rc.bit, self.floor.queued[following[3]], rc))
 
-    def _vetoed(self, sets: list[tuple[Rc, HolderSet]]) -> bool:
-        answers = (self.votes.known(rc.name, holders) for rc, holders in sets)
-        return any(answer is not None and not answer.accept for answer in answers)
+    def _worth_a_look(self, rc: Rc, arc: Arc) -> bool:
+        """False ends the walk: `rc` has a holder again who yields to nobody from `arc` downwards."""
+        if not self._keeps_out(rc, arc):
+            return True
+        if not self._walks[rc.bit]:
+            del self._walks[rc.bit]
+            return False
+        self._walks[rc.bit] -= 1
+        return True
 
-    def _ask(self, sets: list[tuple[Rc, HolderSet]]) -> Refused | Open | None:
-        """None if all RCs accept. A veto settles it whatever else is unknown."""
-        unknown: list[tuple[Rc, HolderSet]] = []
-        for rc, holders in sets:
-            answer = self.votes.known(rc.name, holders)
-            if answer is None:
-                unknown.append((rc, holders))
-            elif not answer.accept:
-                return Refused(_veto(rc, answer.reason))
-        return Open(unknown) if unknown else None
-
-
-def absence(floor: Floor, arc: Arc) -> str:
-    """Which RCs of `arc` are not there, in words; empty if all are."""
-    absent = arc.mask & ~floor.present
-    return f"{_list([rc.name for rc in floor.of(absent)])} not on the mesh" if absent else ""
-
-
-def _who(holder: Arc) -> str:
-    return f"{holder.name}, priority {holder.request.priority}"
-
-
-def _veto(rc: Rc, reason: str) -> str:
-    return f"{rc.name} refuses: {reason}" if reason else f"{rc.name} refuses"
-
-
-def _list(names: list[str]) -> str:
-    shown = names[:3]
-    return ", ".join(shown) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    def _keeps_out(self, rc: Rc, arc: Arc) -> bool:
+        """Whether `rc`, exclusive and not off limits, has a holder who does not yield to `arc`."""
+        if rc.sharable or not rc.holders or rc.bit & self.off_limits:
+            return False
+        (holder,) = rc.holders.values()
+        return not holder.yields_to(arc, self.now)

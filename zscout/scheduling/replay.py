@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from zscout.scheduling import priority
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
+from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked, WakeAt
 from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
 from zscout.scheduling.model import ArcId, Ns, RcName
 from zscout.scheduling.priority import Strategy
@@ -88,6 +88,7 @@ class _Player:
             if self.watch is not None:
                 self.watch(now, self.core, effects)
             votes: list[Event] = []
+            again = False
             for effect in effects:
                 match effect:
                     case Granted(arc=arc):
@@ -98,6 +99,8 @@ class _Player:
                     case Propose(proposal=proposal, rc=rc, holders=holders):
                         reason = excess(self.capacity[rc], holders.items())
                         votes.append(Vote(proposal, accept=not reason, reason=reason))
+                    case WakeAt(at=at):
+                        again = at == now
                     case _:
                         pass
-            batch = votes
+            batch = votes or ([Tick()] if again else [])

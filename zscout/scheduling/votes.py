@@ -7,7 +7,7 @@ every superset, and one answer settles many questions. Answers stand until the R
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeAlias
 
 from zscout.scheduling.model import QUANTUM, ArcId, Ns, RcName
@@ -29,35 +29,81 @@ class Answer:
 YES = Answer(accept=True)
 
 
-@dataclass(slots=True)
 class Ballot:
     """One RC's answers. `silent` after an overdue vote: nobody waits for this RC until it answers."""
 
-    accepted: dict[HolderSet, None] = field(default_factory=dict)
-    vetoed: dict[HolderSet, str] = field(default_factory=dict)
-    out: dict[HolderSet, list[int]] = field(default_factory=dict)
-    """The proposals of each set that is asked for, newest last."""
-    overdue: set[HolderSet] = field(default_factory=set)
-    """Those whose newest proposal is overdue, and perhaps lost: they may be asked for anew."""
-    silent: bool = False
-    ask_again: Ns = 0
+    def __init__(self) -> None:
+        self.accepted: dict[HolderSet, None] = {}
+        self.vetoed: dict[HolderSet, str] = {}
+        self.out: dict[HolderSet, list[int]] = {}
+        """The proposals of each set that is asked for, newest last."""
+        self.overdue: set[HolderSet] = set()
+        """Those whose newest proposal is overdue, and perhaps lost: they may be asked for anew."""
+        self.silent = False
+        self.ask_again: Ns = 0
+        self._accepted_with: dict[ArcId, dict[HolderSet, None]] = {}
+        """The accepted sets that each ARC is in."""
+        self._vetoed_at: dict[ArcId, dict[HolderSet, None]] = {}
+        """Each vetoed set once, under whichever of its ARCs had fewest: a veto is looked for among those of
+        the set in question, and most vetoes name a holder that is in many others."""
 
     def known(self, holders: HolderSet) -> Answer | None:
         if holders in self.accepted:
             return YES
         if holders in self.vetoed:
             return Answer(accept=False, reason=self.vetoed[holders])
-        if any(holders < larger for larger in self.accepted):
-            return YES
-        for smaller, reason in self.vetoed.items():
-            if smaller < holders:
-                return Answer(accept=False, reason=reason)
+        with_each = [self._accepted_with.get(arc) for arc in holders]
+        if all(with_each):
+            fewest = min((sets for sets in with_each if sets), key=len, default={})
+            if any(holders < larger for larger in fewest):
+                return YES
+        for arc in holders:
+            for smaller in self._vetoed_at.get(arc, ()):
+                if smaller < holders:
+                    return Answer(accept=False, reason=self.vetoed[smaller])
         return None
 
-    def trim(self) -> None:
-        for answers in (self.accepted, self.vetoed):
-            while len(answers) > ANSWERS_PER_RC:
-                del answers[next(iter(answers))]
+    def accept(self, holders: HolderSet) -> None:
+        self.accepted[holders] = None
+        for arc in holders:
+            self._accepted_with.setdefault(arc, {})[holders] = None
+        while len(self.accepted) > ANSWERS_PER_RC:
+            self._drop_accepted(next(iter(self.accepted)))
+
+    def veto(self, holders: HolderSet, reason: str) -> None:
+        if holders not in self.vetoed:
+            rarest = min(sorted(holders), key=lambda arc: len(self._vetoed_at.get(arc, ())))
+            self._vetoed_at.setdefault(rarest, {})[holders] = None
+        self.vetoed[holders] = reason
+        while len(self.vetoed) > ANSWERS_PER_RC:
+            self._drop_vetoed(next(iter(self.vetoed)))
+
+    def forget(self, arc: ArcId) -> None:
+        """Of sets with this ARC, what was accepted stands without it and the vetoes fall."""
+        for holders in list(self._accepted_with.get(arc, ())):
+            self._drop_accepted(holders)
+            if len(holders) > 1:
+                self.accept(holders - {arc})
+        for holders in [holders for holders in self.vetoed if arc in holders]:
+            self._drop_vetoed(holders)
+
+    def _drop_accepted(self, holders: HolderSet) -> None:
+        del self.accepted[holders]
+        for arc in holders:
+            _discard(self._accepted_with, arc, holders)
+
+    def _drop_vetoed(self, holders: HolderSet) -> None:
+        del self.vetoed[holders]
+        for arc in holders:
+            _discard(self._vetoed_at, arc, holders)
+
+
+def _discard(index: dict[ArcId, dict[HolderSet, None]], arc: ArcId, holders: HolderSet) -> None:
+    sets = index.get(arc)
+    if sets is not None and holders in sets:
+        del sets[holders]
+        if not sets:
+            del index[arc]
 
 
 class Votes:
@@ -67,23 +113,32 @@ class Votes:
         self._ballots: dict[RcName, Ballot] = {}
         self._out: dict[int, tuple[RcName, HolderSet]] = {}
         self._next = 1
+        self._silent: set[RcName] = set()
+        self.heard: set[RcName] = set()
+        """RCs that answered, or fell silent, since somebody last took note and emptied this."""
+        self.forgotten: set[RcName] = set()
+        """RCs whose answers no longer stand, likewise."""
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
         """The answer that stands for exactly this set, by itself or by what it implies; None if unknown."""
-        return self._ballots.setdefault(rc, Ballot()).known(holders)
+        return self._ballot(rc).known(holders)
 
     def vetoed(self, rc: RcName) -> list[HolderSet]:
         """The sets that an RC has vetoed; each rules out every larger one as well."""
-        return list(self._ballots.setdefault(rc, Ballot()).vetoed)
+        return list(self._ballot(rc).vetoed)
 
     def silent(self, rc: RcName) -> bool:
-        return self._ballots.setdefault(rc, Ballot()).silent
+        return rc in self._silent
+
+    def due(self, now: Ns) -> list[RcName]:
+        """The silent RCs that may be asked again by now."""
+        return [rc for rc in self._silent if self._ballots[rc].ask_again <= now]
 
     def open_question(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
         """The number of a new proposal to send, or None where one is out already or the RC is not due.
 
         A silent RC is asked again once a quantum, so that it can show that it is back."""
-        ballot = self._ballots.setdefault(rc, Ballot())
+        ballot = self._ballot(rc)
         if ballot.silent:
             if now < ballot.ask_again:
                 return None
@@ -108,11 +163,12 @@ class Votes:
         ballot = self._ballots[rc]
         self._close(ballot, holders)
         ballot.silent = False
+        self._silent.discard(rc)
+        self.heard.add(rc)
         if accept:
-            ballot.accepted[holders] = None
+            ballot.accept(holders)
         else:
-            ballot.vetoed[holders] = reason
-        ballot.trim()
+            ballot.veto(holders, reason)
         return True
 
     def overdue(self, proposal: int, now: Ns) -> bool:
@@ -124,6 +180,8 @@ class Votes:
         if proposal != ballot.out[holders][-1]:
             return False
         ballot.overdue.add(holders)
+        self.heard.add(rc)
+        self._silent.add(rc)
         if not ballot.silent:
             ballot.silent = True
             ballot.ask_again = now + QUANTUM
@@ -131,6 +189,8 @@ class Votes:
 
     def forget_rc(self, rc: RcName) -> None:
         """The RC left, came anew or changed its rules: nothing it said stands, nothing asked is awaited."""
+        self.forgotten.add(rc)
+        self._silent.discard(rc)
         ballot = self._ballots.pop(rc, None)
         if ballot is not None:
             for holders in list(ballot.out):
@@ -141,12 +201,7 @@ class Votes:
         ballot = self._ballots.get(rc)
         if ballot is None:
             return
-        for holders in [holders for holders in ballot.accepted if arc in holders]:
-            del ballot.accepted[holders]
-            if len(holders) > 1:
-                ballot.accepted[holders - {arc}] = None
-        for holders in [holders for holders in ballot.vetoed if arc in holders]:
-            del ballot.vetoed[holders]
+        ballot.forget(arc)
         for holders in [holders for holders in ballot.out if arc in holders]:
             self._close(ballot, holders)
 
@@ -154,6 +209,12 @@ class Votes:
         """The proposals that are out."""
         for number, (rc, holders) in self._out.items():
             yield number, rc, holders
+
+    def _ballot(self, rc: RcName) -> Ballot:
+        ballot = self._ballots.get(rc)
+        if ballot is None:
+            ballot = self._ballots[rc] = Ballot()
+        return ballot
 
     def _close(self, ballot: Ballot, holders: HolderSet) -> None:
         ballot.overdue.discard(holders)

@@ -139,7 +139,7 @@ class Notices:
             arc.name,
             state,
             priority=arc.request.priority,
-            reason=arc.reason,
+            reason=self.core.reason(arc),
             place=arc.place,
             ahead=self._ahead(arc) if hold is None else None,
             grant=hold.grant if hold is not None else None,
@@ -148,7 +148,7 @@ class Notices:
         )
 
     def _ahead(self, arc: Arc) -> int:
-        return sum(1 for other in self.core.floor.queued.values() if other.rank < arc.rank)
+        return self.core.floor.waits.ahead(arc)
 
     def _notice(self, arc: ArcId, client: str, name: str, state: State, **details: Any) -> Notice:
         self._step += 1

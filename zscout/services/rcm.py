@@ -26,11 +26,13 @@ from zscout.messages import (
     Revocation,
     StateAsk,
 )
+from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Dropped, Effect, Granted, Propose, Queued, Revoked, WakeAt
 from zscout.scheduling.events import Event, LeadTaken, Tick, Vote, VoteOverdue
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import SECOND, Ns, Term
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.services import views
 from zscout.services.desk import Desk
 from zscout.services.notices import Notices
@@ -51,7 +53,8 @@ class Rcm:
     def __init__(self, mesh: Mesh, fleet: Fleet, term: Term, on_newer: Callable[[Term], None]) -> None:
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self._on_newer = on_newer
-        self.core = Core()
+        self.core = Core(STRATEGIES[fleet.strategy]())
+        self._gains = 0
         self.notices = Notices(mesh, self.core, term)
         self.presence = Presence(mesh, fleet, self)
         self.desk = Desk(mesh, fleet, self.core, self.notices, self.presence, self._decide)
@@ -121,6 +124,14 @@ class Rcm:
     def _decide(self, events: Sequence[Event]) -> None:
         if not self._closed:
             self._carry_out(self.core.handle(clock.now(), *events))
+            self._log_gain()
+
+    def _log_gain(self) -> None:
+        """Says where a search has beaten the heuristic, and at what cost."""
+        strategy = self.core.strategy
+        if isinstance(strategy, Adaptive) and strategy.statistics.gains > self._gains:
+            self._gains = strategy.statistics.gains
+            log.info("adaptive: %s", strategy.statistics.last)
 
     # Effects out of the core
 
@@ -255,7 +266,10 @@ class Rcm:
                 seq=self._published,
                 host=self.mesh.me.host,
                 holds=holds,
-                queue=[views.wait_view(arc, now, starts.get(arc.id)) for arc in queue[:MAX_LISTED]],
+                queue=[
+                    views.wait_view(arc, self.core.reason(arc), now, starts.get(arc.id))
+                    for arc in queue[:MAX_LISTED]
+                ],
                 rcs=views.rc_views(floor),
                 story=self.notices.story.of(asked.arc, now) if asked.arc is not None else [],
                 more=max(0, len(queue) - MAX_LISTED),

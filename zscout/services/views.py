@@ -89,7 +89,7 @@ def hold_view(arc: Arc, hold: Hold, now: Ns) -> HoldView:
     )
 
 
-def wait_view(arc: Arc, now: Ns, start: Ns | None = None) -> WaitView:
+def wait_view(arc: Arc, reason: str, now: Ns, start: Ns | None = None) -> WaitView:
     return WaitView(
         id=request_id(arc.id),
         arc=arc.name,
@@ -99,7 +99,7 @@ def wait_view(arc: Arc, now: Ns, start: Ns | None = None) -> WaitView:
         needs=needs(arc),
         min_runtime=seconds(arc.request.min_runtime),
         waited=(now - arc.since) / SECOND,
-        reason=arc.reason,
+        reason=reason,
         preemptions=arc.preemptions,
         starts_in=None if start is None else (start - now) / SECOND,
     )

@@ -44,7 +44,7 @@ class Mix:
     arcs: int = 400
     widths: Sequence[int] = (1, 2, 3, 4, 5)
     priorities: Sequence[int] = (1,)
-    mean_runtime: float = 10.0
+    mean_runtime: float = 5.0
     """Seconds; runtimes are exponential above `SHORTEST`."""
     load: float = 0.65
     burst: int = 1
@@ -98,9 +98,9 @@ def stream(mix: Mix, random: Random) -> Workload:
 
 
 def wide_among_narrow(random: Random) -> Workload:
-    """One ARC in twenty needs 8 of the 10 RCs for long; the others need one, shortly."""
-    wide = stream(Mix(arcs=20, widths=(8,), mean_runtime=20.0, load=0.2), random)
-    narrow = stream(Mix(arcs=380, widths=(1,), mean_runtime=5.0, load=0.4), random)
+    """A few need 8 of the 10 RCs for long; the many others need one, shortly."""
+    wide = stream(Mix(arcs=10, widths=(8,), mean_runtime=20.0, load=0.2), random)
+    narrow = stream(Mix(arcs=640, widths=(1,), mean_runtime=5.0, load=0.4), random)
     # Each has its own length: the shorter is stretched over the time of the longer.
     ends = [part.arrivals[-1].at for part in (wide, narrow)]
     arrivals = [
@@ -112,9 +112,7 @@ def wide_among_narrow(random: Random) -> Workload:
 
 
 def _renamed(request: Request, prefix: str) -> Request:
-    return Request(
-        prefix + request.arc, request.client, request.needs, request.priority, request.min_runtime
-    )
+    return Request(prefix + request.arc, request.client, request.needs, request.priority, request.min_runtime)
 
 
 def _family(name: str, summary: str, mix: Mix, *, together: bool = False) -> Family:
@@ -129,7 +127,7 @@ _ALL: Final = (
     _family("load65", "10 RCs, ARCs of 1 to 5, load 65 %", Mix()),
     _family("overload", "10 RCs, ARCs of 1 to 5, load 120 %", Mix(arcs=200, load=1.2)),
     _family("narrow", "10 RCs, ARCs of 1 or 2, load 80 %", Mix(widths=(1, 2), load=0.8)),
-    Family("wide", "10 RCs, one ARC in 20 of 8 among ARCs of 1, load 60 %", wide_among_narrow),
+    Family("wide", "10 RCs, 10 long ARCs of 8 among 640 short ones of 1, load about 60 %", wide_among_narrow),
     _family("levels", "10 RCs, ARCs of 1 to 5, 5 priorities, load 65 %", Mix(priorities=(1, 2, 3, 4, 5))),
     _family(
         "operators",

@@ -19,8 +19,8 @@ from zscout.strict import BadInput
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from zscout.cli.demo_run import Demo
-    from zscout.cli.demo_tables import Difference, Observed, Paper, Table
+    from zscout.cli.demo.run import Demo
+    from zscout.cli.demo.tables import Difference, Observed, Paper, Table
 
 FOLDER = Path("runs")
 FRAMES = 4
@@ -51,10 +51,10 @@ WIDE = 26
 )
 @common.json_option("Print the tables as JSON.")
 def demo(out: Path | None, as_json: bool) -> int:
-    """Plays Table 1 of the paper on a live mesh, and compares what happens with Table 2.
+    """Play Table 1 of the paper on a live mesh, and compare what happens with Table 2.
 
-    Starts three nodes with four devices and five programs on this machine, apart from every other fleet, for
-    about 25 seconds, and records them. Nothing is left but the recording. Exit code 1: a cell differs.
+    It starts three nodes with four devices and five programs on this machine, apart from every other fleet,
+    for about 25 seconds, and records them. Nothing is left but the recording. Exit code 1: a cell differs.
 
     \b
     Examples:
@@ -66,8 +66,8 @@ def demo(out: Path | None, as_json: bool) -> int:
 
 async def _demo(out: Path | None, *, as_json: bool) -> int:
     # Zenoh is loaded here: the help needs none of it.
-    from zscout.cli.demo_run import Demo
-    from zscout.cli.demo_tables import differences, paper
+    from zscout.cli.demo.run import Demo
+    from zscout.cli.demo.tables import differences, paper
 
     expected = paper()
     rcs, seconds = list(expected.table), len(next(iter(expected.table.values())))
@@ -80,9 +80,9 @@ async def _demo(out: Path | None, *, as_json: bool) -> int:
             common.print_line(f"{at:6.2f} s  {common.clean(text)}")
 
     began = clock.now()
-    if plain:
-        common.print_line("Table 1 of the paper on three nodes of this machine; starting them")
     with _recording(out) as path, tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
+        if plain:
+            common.print_line("Table 1 of the paper on three nodes of this machine; starting them")
         try:
             async with Demo(Path(folder), expected.workload, tell) as run:
                 with _picture(run, expected, events, hidden=plain or as_json):
@@ -128,7 +128,7 @@ def _recording(out: Path | None) -> Iterator[Path]:
 
 def _keep(folder: Path, path: Path) -> bool:
     """Moves the recording out of the demo's folder; False if there is none."""
-    from zscout.cli.demo_run import RECORDINGS
+    from zscout.cli.demo.run import RECORDINGS
 
     recorded = next((folder / RECORDINGS).glob("*.rrd"), None)
     if recorded is not None:

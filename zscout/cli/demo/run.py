@@ -20,8 +20,8 @@ import msgspec
 from zscout import clock
 from zscout.cli import launch
 from zscout.cli.common import Failed
-from zscout.cli.demo_arc import Part, Word
-from zscout.cli.demo_tables import Observed
+from zscout.cli.demo.arc import Part, Word
+from zscout.cli.demo.tables import Observed
 from zscout.config import load_fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Declared, Mesh
@@ -160,7 +160,7 @@ class Demo:
                 priority=request.priority,
                 min_runtime=views.seconds(request.min_runtime),
             )
-            process = await self._start(request.arc, ["-m", "zscout.cli.demo_arc"], speaks=True)
+            process = await self._start(request.arc, ["-m", "zscout.cli.demo.arc"], speaks=True)
             assert process.stdin is not None  # noqa: S101
             process.stdin.write(msgspec.json.encode(part) + b"\n")
             self._tasks.append(asyncio.create_task(self._hear(process, part)))

@@ -1,0 +1,200 @@
+"""`python -m benchmarks.scale`: what one event costs the scheduling core against the size of the queue.
+
+Nine of ten RCs are exclusive; the tenth shares 4 units among ARCs of 1 or 2, and its votes come at once. An
+ARC needs 1 to 4 RCs, at one of four priorities. Who leaves the queue is replaced, so that its size stays.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from random import Random
+
+from benchmarks.stats import Samples
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Effect, Propose
+from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
+from zscout.scheduling.model import SECOND, Params, Request
+from zscout.scheduling.priority import run_full_pass
+from zscout.scheduling.workload import excess
+
+QUEUES = (10, 100, 1_000, 10_000)
+RCS = (10, 100, 1_000)
+CAPACITY = {"rate": Fraction(4)}
+KINDS = ("request", "release", "end of hold", "vote", "full pass", "fill")
+MEANING = {
+    "request": "one ARC more",
+    "release": "a holder gives back, whoever can takes over",
+    "end of hold": "a minimum runtime is over, likewise",
+    "vote": "an answer arrives",
+    "full pass": "as if every RC had been freed, to no effect",
+    "fill": "the whole queue asks in one instant, as after a takeover",
+}
+AIMS = {"request": 200e-6, "release": 200e-6, "end of hold": 200e-6, "full pass": 10e-3}
+"""Medians, in seconds, at the largest size."""
+BAR = 40
+
+
+@dataclass(frozen=True)
+class Point:
+    """One kind of event at one size; seconds."""
+
+    kind: str
+    rcs: int
+    queue: int
+    samples: Samples
+
+
+class Fleet:
+    """A core with a queue of constant size."""
+
+    def __init__(self, rcs: int, queue: int, seed: int) -> None:
+        self.rng, self.queue = Random(seed), queue  # noqa: S311
+        self.core, self.now, self.number = Core(), 0, 0
+        self.sharable = {f"device/{number}": number % 10 == 0 for number in range(rcs)}
+        self.names = list(self.sharable)
+        self.samples = {kind: Samples() for kind in KINDS}
+        self.core.handle(0, *[RcJoined(name, sharable) for name, sharable in self.sharable.items()])
+        self.send("fill", *[self.ask() for _ in range(queue)])
+
+    def ask(self) -> Event:
+        rng, self.number = self.rng, self.number + 1
+        needs: dict[str, Params] = {
+            name: {"rate": Fraction(rng.randint(1, 2))} if self.sharable[name] else {}
+            for name in rng.sample(self.names, rng.randint(1, 4))
+        }
+        runtime = rng.randint(10 * SECOND, 100 * SECOND)
+        return Asked(Request(f"a{self.number}", f"h/{self.number % 100}", needs, rng.randrange(4), runtime))
+
+    def send(self, kind: str, *events: Event) -> None:
+        """One instant, timed, and then each vote that it takes."""
+        effects = self._timed(kind, *events)
+        votes = list(self._votes(effects))
+        while votes:
+            votes += self._votes(self._timed("vote", votes.pop()))
+
+    def _timed(self, kind: str, *events: Event) -> list[Effect]:
+        start = time.thread_time()
+        effects = self.core.handle(self.now, *events)
+        self.samples[kind].add(time.thread_time() - start)
+        return effects
+
+    def _votes(self, effects: list[Effect]) -> Iterator[Event]:
+        for effect in effects:
+            if isinstance(effect, Propose):
+                reason = excess(CAPACITY, effect.holders.items())
+                yield Vote(effect.proposal, accept=not reason, reason=reason)
+
+    def fill_up(self) -> None:
+        while len(self.core.floor.queued) < self.queue:
+            self.send("request", self.ask())
+
+    def rounds(self, count: int) -> None:
+        floor = self.core.floor
+        for _ in range(count):
+            self.fill_up()
+            self.now += 1
+            self.send("release", Released(self.rng.choice(list(floor.running))))
+            self.fill_up()
+            self.now = min(arc.hold.end for arc in floor.running.values() if arc.hold is not None)
+            self.send("end of hold", Tick())
+        self.fill_up()
+
+    def full_passes(self, count: int) -> None:
+        for _ in range(count):
+            start = time.thread_time()
+            run_full_pass(self.core.floor, self.core.votes, self.now, self.core)
+            self.samples["full pass"].add(time.thread_time() - start)
+
+
+def measure(rcs: int, queue: int, rounds: int, seed: int) -> list[Point]:
+    fleet = Fleet(rcs, queue, seed)
+    fleet.rounds(rounds)
+    fleet.full_passes(max(3, rounds // 20))
+    return [Point(kind, rcs, queue, samples) for kind, samples in fleet.samples.items() if samples.values]
+
+
+def table(points: list[Point]) -> str:
+    lines = [f"{'event':<12}{'RCs':>6}{'queued':>8}{'median':>12}{'p99':>12}{'samples':>9}"]
+    for kind in KINDS:
+        for point in (point for point in points if point.kind == kind):
+            samples = point.samples
+            lines.append(
+                f"{kind:<12}{point.rcs:>6}{point.queue:>8}{_span(samples.median):>12}"
+                f"{_span(samples.p99):>12}{len(samples.values):>9}"
+            )
+    return "\n".join(lines)
+
+
+def plot(points: list[Point], rcs: int) -> str:
+    """Median cost against the size of the queue; each step to the right is the same factor."""
+    low, high = 1e-6, 1.0
+    lines = [f"median cost with {rcs} RCs, from {_span(low)} at the left to {_span(high)} at the right"]
+    for kind in KINDS:
+        for point in (point for point in points if point.kind == kind and point.rcs == rcs):
+            share = math.log(max(point.samples.median, low) / low) / math.log(high / low)
+            bar = "#" * round(BAR * min(1.0, share))
+            lines.append(f"{kind:>12} {point.queue:>6} |{bar:<{BAR}}| {_span(point.samples.median)}")
+    return "\n".join(lines)
+
+
+def _million_additions() -> float:
+    """How fast this interpreter is here and now, in seconds."""
+    start = time.thread_time()
+    sum(number + 1 for number in range(1_000_000))
+    return time.thread_time() - start
+
+
+def _span(seconds: float) -> str:
+    for unit, factor in (("s", 1.0), ("ms", 1e3)):
+        if seconds * factor >= 1:
+            return f"{seconds * factor:.3g} {unit}"
+    return f"{seconds * 1e6:.3g} us"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.add_argument("--rounds", type=int, default=300, help="releases per size (default: 300)")
+    parser.add_argument("--seed", type=int, default=1, help="of the random requests (default: 1)")
+    args = parser.parse_args()
+    if not 10 <= args.rounds <= 100_000:
+        parser.error(f"--rounds is {args.rounds}; give 10 to 100000")
+    sizes = [(rcs, queue) for rcs in RCS for queue in QUEUES]
+    speed = _million_additions()
+    points = [point for rcs, queue in sizes for point in measure(rcs, queue, args.rounds, args.seed)]
+    largest = {point.kind: point for point in points if (point.rcs, point.queue) == (RCS[-1], QUEUES[-1])}
+    met = {kind: largest[kind].samples.median <= aim for kind, aim in AIMS.items()}
+    if args.json:
+        rows = [
+            {
+                "event": point.kind,
+                "rcs": point.rcs,
+                "queued": point.queue,
+                "median_s": point.samples.median,
+                "p99_s": point.samples.p99,
+                "samples": len(point.samples.values),
+            }
+            for point in points
+        ]
+        machine = {"cores": os.cpu_count(), "python": platform.python_version(), "million_additions_s": speed}
+        print(json.dumps({"machine": machine, "rows": rows, "aims_met": met}, indent=2))
+        return
+    print(table(points), *(plot(points, rcs) for rcs in RCS), sep="\n\n")
+    print()
+    for kind, meaning in MEANING.items():
+        aim = f"; aim {_span(AIMS[kind])}: {'met' if met[kind] else 'missed'}" if kind in AIMS else ""
+        print(f"{kind}: {meaning}{aim}")
+    print(f"\n{os.cpu_count()} cores, Python {platform.python_version()}, load {os.getloadavg()[0]:.1f};")
+    print(f"a million additions take {_span(speed)} here. All times are of the processor, not of the clock.")
+
+
+if __name__ == "__main__":
+    main()

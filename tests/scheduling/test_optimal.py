@@ -1,0 +1,145 @@
+"""Strategy `optimal` in the core: the best set by the brief, its votes asked as late as can be."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+from hypothesis import given, settings
+
+from tests.scheduling.exhaustive import best_set
+from tests.scheduling.invariants import Ledger
+from tests.scheduling.workloads import workloads
+from zscout.scheduling import optimal
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
+from zscout.scheduling.events import Asked, Event, RcJoined, Tick, Vote, VoteOverdue
+from zscout.scheduling.model import SECOND, ArcId, Request
+from zscout.scheduling.packing import Item
+from zscout.scheduling.replay import replay
+from zscout.scheduling.workload import Workload, WorkloadRc, excess
+
+
+def arc(name: ArcId, needs: str, priority: int = 0, runtime: int = 5, rate: int = 1) -> Request:
+    """`needs`: RCs by letter; capitals are sharable."""
+    shares = {"rate": Fraction(rate)}
+    return Request(
+        name, "host/a", {rc: shares if rc.isupper() else {} for rc in needs}, priority, runtime * SECOND
+    )
+
+
+def core_of(rcs: str, *requests: Request) -> tuple[Core, list[Effect]]:
+    core = Core(optimal.run_pass)
+    core.handle(0, *(RcJoined(rc, rc.isupper()) for rc in rcs))
+    return core, core.handle(0, *map(Asked, requests))
+
+
+def proposed(effects: list[Effect]) -> list[Propose]:
+    return [effect for effect in effects if isinstance(effect, Propose)]
+
+
+def test_two_that_use_more_go_before_one_of_better_rank() -> None:
+    core, _ = core_of("abcd", arc("narrow", "bc", runtime=1), arc("left", "ab"), arc("right", "cd"))
+    assert core.floor.running.keys() == {"left", "right"}
+    assert (
+        core.floor.queued["narrow"].reason
+        == "needs b (held by left, priority 0), c (held by right, priority 0)"
+    )
+
+
+def test_who_runs_is_not_ended_for_more_pairs_of_its_own_priority() -> None:
+    core, _ = core_of("abc", arc("runs", "b"))
+    core.handle(SECOND, Asked(arc("wide", "abc")))
+    assert core.floor.running.keys() == {"runs"}
+
+
+def test_a_higher_priority_takes_the_place_that_costs_least() -> None:
+    """Both hold what the operator could do with; the one that uses less has to go."""
+    core, effects = core_of("R", arc("small", "R", rate=2), arc("great", "R", priority=1, rate=3))
+    effects = core.handle(0, Vote(proposed(effects)[0].proposal, True))
+    assert core.floor.running.keys() == {"small", "great"}
+    effects = core.handle(SECOND, Asked(arc("operator", "R", priority=10, rate=3)))
+    asked = proposed(effects)
+    assert [set(one.holders) for one in asked] == [{"small", "great", "operator"}]
+    effects = core.handle(SECOND, Vote(asked[0].proposal, False, "full"))
+    asked = proposed(effects)
+    assert [set(one.holders) for one in asked] == [{"great", "operator"}]
+    effects = core.handle(SECOND, Vote(asked[0].proposal, True))
+    ended = [effect for effect in effects if isinstance(effect, Revoked)]
+    assert [(effect.arc, effect.outcome, effect.by) for effect in ended] == [
+        ("small", Outcome.PREEMPTED, "operator")
+    ]
+
+
+def test_a_slow_voter_stops_nobody_who_has_nothing_to_do_with_it() -> None:
+    core, effects = core_of("Rab", arc("waits", "Ra", priority=5), arc("beside", "a"), arc("apart", "b"))
+    assert core.floor.running.keys() == {"apart"}
+    (question,) = proposed(effects)
+    core.handle(SECOND, VoteOverdue(question.proposal))
+    assert core.floor.running.keys() == {"apart", "beside"}
+    assert core.floor.queued["waits"].reason
+    effects = core.handle(SECOND, Vote(question.proposal, True))
+    assert core.floor.running.keys() == {"apart", "waits"}
+
+
+def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
+    _, effects = core_of("R", *(arc(f"a{number}", "R") for number in range(8)))
+    assert [len(one.holders) for one in proposed(effects)] == [8]
+
+
+@settings(max_examples=300, deadline=None)
+@given(workloads())
+def test_promises_hold_in_replay(workload: Workload) -> None:
+    ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])
+    replay(workload, ledger.take, strategy=optimal.run_pass)
+    assert not ledger.open
+
+
+@settings(max_examples=200, deadline=None)
+@given(workloads(keep=False))
+def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
+    """All ask at once; the RCs' own sums, not their votes, say which sets are ruled out."""
+    requests = sorted(
+        (arrival.request for arrival in workload.arrivals), key=lambda one: (-one.priority, one.min_runtime)
+    )
+    there = {rc.name: rc for rc in workload.rcs}
+    able = [one for one in requests if one.needs.keys() <= there.keys()]
+    core = Core(optimal.run_pass)
+    core.handle(0, *(RcJoined(rc.name, rc.sharable) for rc in workload.rcs))
+    batch: list[Event] = [Asked(request) for request in requests]
+    while batch:
+        effects = core.handle(0, *batch)
+        batch = [
+            Vote(one.proposal, not excess(there[one.rc].capacity, one.holders.items()))
+            for one in proposed(effects)
+        ]
+    assert core.floor.running.keys() == {able[one].arc for one in expected(able, there)}
+
+
+def expected(requests: list[Request], there: dict[str, WorkloadRc]) -> frozenset[int]:
+    exclusive = [name for name, rc in there.items() if not rc.sharable]
+    levels = sorted({request.priority for request in requests}, reverse=True)
+    items = [
+        Item(
+            sum(1 << exclusive.index(name) for name in request.needs if name in exclusive),
+            len(request.needs),
+            levels.index(request.priority),
+        )
+        for request in requests
+    ]
+    vetoes = []
+    for chosen in range(1, 1 << len(requests)):
+        holders = [number for number in range(len(requests)) if chosen >> number & 1]
+        for name, rc in there.items():
+            shares = [(requests[one].arc, requests[one].needs.get(name, {})) for one in holders]
+            if rc.sharable and excess(rc.capacity, shares):
+                vetoes.append(frozenset(holders))
+                break
+    smallest = [veto for veto in vetoes if not any(other < veto for other in vetoes)]
+    return best_set(items, smallest)
+
+
+def test_nothing_new_is_asked_or_done_by_a_tick() -> None:
+    core, effects = core_of("Rab", arc("x", "Ra"), arc("y", "Rb"), arc("z", "ab"))
+    core.handle(0, *(Vote(one.proposal, True) for one in proposed(effects)))
+    assert core.floor.running.keys() == {"x", "y"}
+    assert not [one for one in core.handle(SECOND, Tick()) if isinstance(one, (Granted, Revoked, Propose))]

@@ -1,0 +1,244 @@
+"""A pass that looks only where something has changed comes out as one over the whole queue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from random import Random
+
+import pytest
+
+from tests.scheduling.plain_pass import run_plain_pass
+from zscout.scheduling import priority
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Effect, Granted, Propose, Queued, Revoked
+from zscout.scheduling.events import (
+    Asked,
+    Cancelled,
+    ClientLost,
+    Event,
+    HandedOver,
+    RcJoined,
+    RcLost,
+    RcReported,
+    Released,
+    Tick,
+    Vote,
+    VoteOverdue,
+)
+from zscout.scheduling.floor import Floor
+from zscout.scheduling.model import SECOND, Arc, Params, Request
+from zscout.scheduling.votes import Votes
+from zscout.scheduling.workload import excess
+
+
+@dataclass(frozen=True)
+class Size:
+    """How big a random run is; `wait_for_votes` is the chance that a vote stays out for one more event."""
+
+    rcs: int
+    sharable: int
+    arcs: int
+    clients: int
+    events: int
+    validate_every: int
+    wait_for_votes: float
+
+
+SIZES = {
+    "few, crowded": Size(5, 3, 25, 4, 1200, 2, 0.5),
+    "few, exclusive": Size(6, 0, 40, 6, 1200, 2, 0.0),
+    "many, slow votes": Size(20, 6, 250, 10, 400, 10, 0.6),
+    "thousands": Size(100, 10, 2000, 50, 40, 20, 0.05),
+}
+
+
+class Twins:
+    """The indexed core and the plain one, fed with the same random events; they must say the same."""
+
+    def __init__(self, size: Size, seed: int) -> None:
+        self.size, self.rng = size, Random(seed)  # noqa: S311
+        self.indexed, self.plain = Core(), Core(run_plain_pass)
+        self.now = 0
+        self.number = 0
+        self.sharable = {f"rc/{number}": number < size.sharable for number in range(size.rcs)}
+        self.capacity = {rc: Fraction(self.rng.randint(2, 9)) for rc in self.sharable}
+        self.present = set(self.sharable)
+        self.out: dict[int, Propose] = {}
+        self.grants = self.preemptions = self.vetoes = 0
+        self.send(*[RcJoined(rc, sharable) for rc, sharable in self.sharable.items()])
+        self.send(*[self.ask() for _ in range(size.arcs)])
+
+    def ask(self) -> Event:
+        rng, self.number = self.rng, self.number + 1
+        names = rng.sample(sorted(self.sharable), min(rng.choice((1, 1, 2, 3, 4)), self.size.rcs))
+        needs: dict[str, Params] = {
+            rc: {"rate": Fraction(rng.randint(0, 6))} if self.sharable[rc] else {} for rc in names
+        }
+        client = f"host/{rng.randrange(self.size.clients)}"
+        runtime = rng.randint(1, 6) * SECOND // 2
+        return Asked(Request(f"a{self.number}", client, needs, rng.randrange(4), runtime, rng.random() < 0.2))
+
+    def send(self, *events: Event) -> bool:
+        """False if nothing was decided."""
+        effects = self.indexed.handle(self.now, *events)
+        plain = self.plain.handle(self.now, *events)
+        assert decisions(effects) == decisions(plain), f"after {events[:3]} at {self.now}"
+        for effect in effects:
+            match effect:
+                case Propose(proposal=proposal):
+                    self.out[proposal] = effect
+                case Granted():
+                    self.grants += 1
+                case Revoked(by=by):
+                    self.preemptions += by is not None
+                case _:
+                    pass
+        return bool(decisions(effects))
+
+    def step(self) -> None:
+        rng = self.rng
+        self.now += rng.choice((0, 0, 1, SECOND // 4, SECOND // 2))
+        for proposal in list(self.out):
+            if rng.random() >= self.size.wait_for_votes:
+                self.send(self.answer(self.out.pop(proposal)))
+        self.send(*[self.event() for _ in range(rng.choice((1, 1, 1, 3)))])
+
+    def answer(self, question: Propose) -> Event:
+        if self.rng.random() < 0.05:
+            # Overdue; it may yet be answered, late or never.
+            if self.rng.random() < 0.5:
+                self.out[question.proposal] = question
+            return VoteOverdue(question.proposal)
+        reason = excess({"rate": self.capacity[question.rc]}, question.holders.items())
+        self.vetoes += bool(reason)
+        return Vote(question.proposal, accept=not reason, reason=reason)
+
+    def event(self) -> Event:
+        rng, floor = self.rng, self.indexed.floor
+        running, queued = sorted(floor.running), sorted(floor.queued)
+        some_rc = rng.choice(sorted(self.sharable))
+        doings: list[tuple[float, Callable[[], Event]]] = [
+            (5.0 if len(queued) < self.size.arcs else 0.5, self.ask),
+            (3.0 if running else 0.0, lambda: Released(rng.choice(running))),
+            (1.0 if queued else 0.0, lambda: Cancelled(rng.choice(queued))),
+            (0.3 if running else 0.0, lambda: HandedOver(rng.choice(running), f"host/{rng.randrange(9)}")),
+            (2.0, Tick),
+            (0.2, lambda: ClientLost(f"host/{rng.randrange(self.size.clients)}")),
+            (0.5, lambda: self.come_or_go(some_rc)),
+            (0.4, lambda: self.new_rules(some_rc)),
+        ]
+        weights = [weight for weight, _ in doings]
+        return rng.choices([make for _, make in doings], weights)[0]()
+
+    def come_or_go(self, rc: str) -> Event:
+        self.void(rc)
+        if rc in self.present and self.rng.random() < 0.7:
+            self.present.discard(rc)
+            return RcLost(rc)
+        self.present.add(rc)
+        return RcJoined(rc, self.sharable[rc])
+
+    def new_rules(self, rc: str) -> Event:
+        self.void(rc)
+        self.capacity[rc] = Fraction(self.rng.randint(2, 9))
+        return RcReported(rc, rules_changed=True)
+
+    def void(self, rc: str) -> None:
+        self.out = {number: question for number, question in self.out.items() if question.rc != rc}
+
+    def compare(self) -> None:
+        """All state, the words for who asks, and the clients' ARCs; slow."""
+        # What the plain core said of an ARC is older than what it did for those below: one more pass.
+        calm = not self.send(Tick()) and next(self.indexed.votes.out(), None) is None
+        self.indexed.validate()
+        one, two = self.indexed.floor, self.plain.floor
+        assert list(one.queued) == list(two.queued)
+        assert list(one.running) == list(two.running)
+        ranked = sorted(one.queued.values(), key=lambda arc: arc.rank)
+        for ahead, arc in enumerate(ranked):
+            assert one.waits.ahead(arc) == ahead
+            if calm and arc.watched is not None:
+                assert self.indexed.reason(arc) == two.queued[arc.id].reason
+        for client in {arc.request.client for arc in one.running.values()}:
+            theirs: list[Arc] = [*one.queued.values(), *one.running.values()]
+            assert one.arcs_of(client) == [arc for arc in theirs if arc.request.client == client]
+
+
+def decisions(effects: list[Effect]) -> list[Effect]:
+    """All but the words for those who wait: they are told later than they change."""
+    return [effect for effect in effects if not isinstance(effect, Queued)]
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("size", SIZES.values(), ids=list(SIZES))
+def test_an_indexed_pass_is_a_full_pass(size: Size, seed: int) -> None:
+    twins = Twins(size, seed)
+    for number in range(size.events):
+        twins.step()
+        if number % size.validate_every == 0:
+            twins.compare()
+    twins.compare()
+    assert twins.grants > size.events / 4
+    assert twins.preemptions > 10
+    assert bool(twins.vetoes) == bool(size.sharable)
+
+
+def test_what_a_release_looks_at_does_not_grow_with_the_queue(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted in visits, not in seconds: 4,000 ARCs that wait for other RCs are nobody's business."""
+    looked_at: list[str] = []
+
+    class Counted(priority.Visit):
+        def __init__(self, floor: Floor, votes: Votes, now: int, arc: Arc) -> None:
+            looked_at.append(arc.id)
+            super().__init__(floor, votes, now, arc)
+
+    monkeypatch.setattr(priority, "Visit", Counted)
+    core = Core()
+    core.handle(0, *[RcJoined(f"robot/{number}", sharable=False) for number in range(50)])
+    asked = [
+        Asked(Request(f"a{number}", "host/c", {f"robot/{number % 50}": {}}, 0, (1 + number) * SECOND))
+        for number in range(4000)
+    ]
+    core.handle(0, *asked)
+    assert len(looked_at) == 4000
+    looked_at.clear()
+    granted = [effect for effect in core.handle(1, Released("a7")) if isinstance(effect, Granted)]
+    assert [grant.arc for grant in granted] == ["a57"], "the next in line for robot/7"
+    assert looked_at == [f"a{57 + 50 * step}" for step in range(1 + priority.TOLD)]
+
+
+def test_the_words_for_who_asks_are_those_of_now() -> None:
+    core = Core()
+    core.handle(0, RcJoined("robot/a", sharable=False))
+    core.handle(0, *[Asked(Request(f"a{number}", "h/c", {"robot/a": {}}, 0, SECOND)) for number in range(20)])
+    last = core.floor.queued["a19"]
+    assert core.reason(last) == last.reason == "needs robot/a (held by a0, priority 0)"
+    core.handle(1, Released("a0"))
+    assert core.reason(last) == "needs robot/a (held by a1, priority 0)"
+    assert core.floor.waits.ahead(last) == 17
+    core.handle(2, RcLost("robot/a"))
+    assert core.reason(last) == last.reason == "robot/a not on the mesh"
+
+
+def test_one_asleep_hears_in_the_next_pass_of_what_was_done_below_it() -> None:
+    cores = (Core(), Core(run_plain_pass))
+
+    def both(*events: Event) -> list[Effect]:
+        effects, plain = (core.handle(1, *events) for core in cores)
+        assert decisions(effects) == decisions(plain)
+        return effects
+
+    def proposed(effects: list[Effect]) -> int:
+        return next(effect.proposal for effect in effects if isinstance(effect, Propose))
+
+    both(RcJoined("radio/s", sharable=True), RcJoined("robot/x", sharable=False))
+    asked = both(Asked(Request("low", "h/c", {"radio/s": {}, "robot/x": {}}, 0, SECOND)))
+    both(Vote(proposed(asked), accept=True))
+    alone = both(Asked(Request("high", "h/c", {"radio/s": {}}, 2, SECOND)))
+    beside_low = both(Vote(proposed(alone), accept=True))
+    both(VoteOverdue(proposed(beside_low)))
+    taken = both(Asked(Request("middle", "h/c", {"robot/x": {}}, 1, SECOND)))
+    assert [effect.arc for effect in taken if isinstance(effect, Granted)] == ["middle"]
+    assert [effect.arc for effect in both(Tick()) if isinstance(effect, Granted)] == ["high"]

@@ -1,0 +1,187 @@
+"""A better set by local search, where a part is too large for an exact answer. Its time is counted in steps.
+
+A step picks an RC at random that is free, or used below the highest level that could use it, and forces in
+the best item that covers it: those in its way leave, and whatever fits then comes in. What was moved a moment
+ago does not move again (tabu), so the search walks on from a local best. Every set that looks better than the
+best is made lawful first (`Problem.complete`), so that the result can be taken as it is.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from zscout.scheduling.packing import Problem, numbers
+
+MAX_ITEMS: Final = 2_000
+"""Items that the search looks at, best ranks first; the others only fill what it leaves."""
+MAX_LEVELS: Final = 12
+"""Levels likewise: a value has a digit for each, and numbers get slow."""
+TENURE: Final = 7
+"""Steps for which an item stays as it was moved."""
+IDLE_FACTOR: Final = 40
+"""The search ends when so many steps per item brought nothing."""
+
+
+class LocalSearch:
+    """A search that goes on in slices. `best` is always lawful, and at least as good as the start."""
+
+    def __init__(self, problem: Problem, start: int) -> None:
+        self.problem = problem
+        self.bound = problem.bound_of_all()
+        self.best = problem.complete(start)
+        self.best_key = problem.key(self.best)
+        self.steps = 0
+        items = problem.items
+        looked_at = [
+            number
+            for number, item in enumerate(items[:MAX_ITEMS])
+            if item.level < MAX_LEVELS and item.mask and problem.allowed(number, 0)
+        ]
+        self._needs: dict[int, tuple[int, ...]] = {
+            number: tuple(numbers(items[number].mask)) for number in looked_at
+        }
+        width = max((rcs[-1] + 1 for rcs in self._needs.values()), default=0)
+        self._cover: list[list[int]] = [[] for _ in range(width)]
+        for number in looked_at:
+            if not items[number].spent:
+                for rc in self._needs[number]:
+                    self._cover[rc].append(number)
+        self._level = [item.level for item in items]
+        self._top = [min((self._level[number] for number in cover), default=-1) for cover in self._cover]
+        """The highest level that could use each RC; -1 for none."""
+        self._may_all = not problem.standing and not problem.vetoes
+        self._moved = [-TENURE] * len(items)
+        self._random = 1
+        self._improved_at = 0
+        self._idle = IDLE_FACTOR * max(1, len(looked_at))
+        self._adopt(self.best)
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing better is there, or nothing better was found for long."""
+        return self.best_key[0] >= self.bound or not self._pool or self.steps - self._improved_at > self._idle
+
+    def _adopt(self, chosen: int) -> None:
+        """Starts from this set."""
+        self._owner = [-1] * len(self._cover)
+        self._chosen = chosen
+        self._value = self.problem.value(chosen)
+        self._used = 0
+        self._pool: list[int] = []
+        """RCs that might be put to better use."""
+        self._at = [-1] * len(self._cover)
+        for number in numbers(chosen):
+            if number in self._needs:
+                self._used |= self.problem.masks[number]
+                for rc in self._needs[number]:
+                    self._owner[rc] = number
+        for rc, owner in enumerate(self._owner):
+            if self._top[rc] >= 0 and (owner < 0 or self._level[owner] > self._top[rc]):
+                self._at[rc] = len(self._pool)
+                self._pool.append(rc)
+
+    def run(self, steps: int) -> int:
+        """Goes on for at most so many steps; tells how many it took."""
+        began = self.steps
+        while self.steps - began < steps and not self.done:
+            self.steps += 1
+            # A plain congruential generator: the same search everywhere, and quick.
+            self._random = (self._random * 6364136223846793005 + 1442695040888963407) & 0xFFFFFFFFFFFFFFFF
+            incoming = self._pick(self._pool[(self._random >> 33) % len(self._pool)])
+            if incoming >= 0:
+                self._force(incoming)
+                if self._value > self.best_key[0]:
+                    self._keep()
+        return self.steps - began
+
+    def _keep(self) -> None:
+        lawful = self.problem.complete(self._chosen)
+        key = self.problem.key(lawful)
+        if key > self.best_key:
+            self.best, self.best_key = lawful, key
+            self._improved_at = self.steps
+        if lawful != self._chosen:
+            self._adopt(lawful)
+
+    def _pick(self, rc: int) -> int:
+        """The item to force in at `rc`: that which gains most, the longest unmoved of equals; -1 for none."""
+        worth, owner, moved, needs = self.problem.worth, self._owner, self._moved, self._needs
+        aim = self.best_key[0] - self._value
+        fresh = self.steps - TENURE
+        best, best_gain, best_moved = -1, 0, 0
+        for number in self._cover[rc]:
+            if self._chosen >> number & 1:
+                continue
+            gain = worth[number]
+            out: list[int] = []
+            for need in needs[number]:
+                other = owner[need]
+                if other >= 0 and other not in out:
+                    out.append(other)
+                    gain -= worth[other]
+            last = moved[number]
+            if last > fresh and gain <= aim:
+                continue
+            if best >= 0 and (gain < best_gain or (gain == best_gain and last >= best_moved)):
+                continue
+            if self._may_all or self._may(number, out):
+                best, best_gain, best_moved = number, gain, last
+        return best
+
+    def _may(self, number: int, out: list[int]) -> bool:
+        """Whether `number` may come in for those that would leave."""
+        problem, level = self.problem, self._level[number]
+        for other in out:
+            item = problem.items[other]
+            if item.standing and (item.level < level or (item.level == level and not item.spent)):
+                return False
+        if not problem.vetoes:
+            return True
+        left = self._chosen
+        for other in out:
+            left &= ~(1 << other)
+        return problem.allowed(number, left)
+
+    def _force(self, number: int) -> None:
+        """Puts `number` in; those in its way leave, and what fits into what they leave comes in."""
+        problem, owner, masks = self.problem, self._owner, self.problem.masks
+        out = {owner[need] for need in self._needs[number]}
+        out.discard(-1)
+        freed = 0
+        for other in out:
+            self._leave(other)
+            freed |= masks[other]
+        self._enter(number)
+        fits: set[int] = set()
+        for rc in numbers(freed & ~masks[number]):
+            fits.update(other for other in self._cover[rc] if not masks[other] & self._used)
+        for other in sorted(fits - out, key=lambda one: (-problem.worth[one], one)):
+            if not masks[other] & self._used and (not problem.vetoes or problem.allowed(other, self._chosen)):
+                self._enter(other)
+
+    def _enter(self, number: int) -> None:
+        self._chosen |= 1 << number
+        self._used |= self.problem.masks[number]
+        self._value += self.problem.worth[number]
+        self._moved[number] = self.steps
+        owner, pool, place, top, level = self._owner, self._pool, self._at, self._top, self._level[number]
+        for rc in self._needs[number]:
+            owner[rc] = number
+            at = place[rc]
+            if at >= 0 and level <= top[rc]:
+                last = pool.pop()
+                if last != rc:
+                    pool[at] = last
+                    place[last] = at
+                place[rc] = -1
+
+    def _leave(self, number: int) -> None:
+        self._chosen &= ~(1 << number)
+        self._used &= ~self.problem.masks[number]
+        self._value -= self.problem.worth[number]
+        self._moved[number] = self.steps
+        for rc in self._needs[number]:
+            self._owner[rc] = -1
+            if self._at[rc] < 0 and self._top[rc] >= 0:
+                self._at[rc] = len(self._pool)
+                self._pool.append(rc)

@@ -1,0 +1,194 @@
+"""What a pass could change at all, in parts that can be decided apart.
+
+Most of a busy fleet is settled whatever a strategy does: who runs, and could only have to give way to ARCs
+that can't start, stays; who needs what such a one holds waits. The others are *in play*. Those of them that
+share no RC, not even by way of others, are decided apart: so a slow voter stops nobody who has nothing to do
+with it, and the cost is that of the parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from zscout.scheduling.floor import Floor
+from zscout.scheduling.model import Arc, ArcId, Ns, Rc
+from zscout.scheduling.packing import Item, Problem
+from zscout.scheduling.priority import Actions
+from zscout.scheduling.votes import HolderSet, Votes
+
+
+def parts_in_play(floor: Floor, votes: Votes, now: Ns) -> list[Part]:
+    """The parts in which somebody could start; best-ranked first."""
+    arcs = in_play(floor, votes, now)
+    return [Part(floor, votes, now, members) for members in apart(arcs)] if arcs else []
+
+
+def in_play(floor: Floor, votes: Votes, now: Ns) -> list[Arc]:
+    """Those who might start in this pass, and those who might have to end for them."""
+    levels: dict[int, list[Arc]] = {}
+    absent = ~floor.present
+    for arc in floor.queued.values():
+        if not arc.mask & absent:
+            levels.setdefault(arc.request.priority, []).append(arc)
+    exclusive = ~floor.sharable
+    holders = sorted(floor.running.values(), key=lambda arc: -arc.request.priority)
+    firm = 0
+    """Exclusive RCs whose holders yield to nobody of the level at hand."""
+    above = 0
+    found: list[Arc] = []
+    movable: dict[ArcId, Arc] = {}
+    loose = 0
+    """Bits of what the movable hold."""
+    for level in sorted(levels, reverse=True):
+        while above < len(holders) and holders[above].request.priority > level:
+            firm |= holders[above].mask & exclusive
+            above += 1
+        here = firm
+        for holder in holders[above:]:
+            if holder.request.priority < level:
+                break
+            if not holder.overstays(now):
+                here |= holder.mask & exclusive
+        shut = here & ~loose
+        for arc in levels[level]:
+            if arc.mask & shut or _refused(floor, votes, now, arc, movable):
+                continue
+            found.append(arc)
+            for rc in floor.of(arc.mask & (floor.busy | floor.sharable)):
+                for holder in rc.holders.values():
+                    if holder.id not in movable and holder.yields_to(arc, now):
+                        movable[holder.id] = holder
+                        loose |= holder.mask
+    return [*found, *movable.values()]
+
+
+def _refused(floor: Floor, votes: Votes, now: Ns, arc: Arc, movable: dict[ArcId, Arc]) -> bool:
+    """Whether an RC has vetoed the ARC beside those who stay in any case, or is silent about that."""
+    for rc in floor.of(arc.mask & floor.sharable):
+        stay = [
+            holder.id
+            for holder in rc.holders.values()
+            if holder.id not in movable and not holder.yields_to(arc, now)
+        ]
+        answer = votes.known(rc.name, frozenset((*stay, arc.id)))
+        if votes.silent(rc.name) if answer is None else not answer.accept:
+            return True
+    return False
+
+
+def apart(arcs: Iterable[Arc]) -> list[list[Arc]]:
+    """The ARCs in groups that have no RC in common, each in rank order; the best-ranked group first."""
+    members = sorted(arcs, key=lambda arc: arc.rank)
+    leader = list(range(len(members)))
+
+    def find(number: int) -> int:
+        while leader[number] != number:
+            leader[number] = leader[leader[number]]
+            number = leader[number]
+        return number
+
+    first: dict[int, int] = {}
+    """By bit: the first that needs the RC."""
+    for number, arc in enumerate(members):
+        mask = arc.mask
+        while mask:
+            bit = mask & -mask
+            mask ^= bit
+            leader[find(first.setdefault(bit, number))] = find(number)
+    groups: dict[int, list[Arc]] = {}
+    for number, arc in enumerate(members):
+        groups.setdefault(find(number), []).append(arc)
+    # Each begins with its best-ranked, and they were met in that order.
+    return list(groups.values())
+
+
+class Part:
+    """ARCs that are decided together, in rank order, and what the RCs have said about them."""
+
+    def __init__(self, floor: Floor, votes: Votes, now: Ns, arcs: list[Arc]) -> None:
+        self.floor, self.votes, self.now = floor, votes, now
+        self.arcs = arcs
+        self.mask = 0
+        """All that they need or hold."""
+        for arc in arcs:
+            self.mask |= arc.mask
+        priorities = sorted({arc.request.priority for arc in arcs}, reverse=True)
+        levels = {priority: level for level, priority in enumerate(priorities)}
+        exclusive = ~floor.sharable
+        self.items = [
+            Item(
+                mask=arc.mask & exclusive,
+                width=arc.mask.bit_count(),
+                level=levels[arc.request.priority],
+                standing=arc.hold is not None,
+                spent=arc.overstays(now),
+            )
+            for arc in arcs
+        ]
+        self.priorities = priorities
+        """By level."""
+        self._number = {arc.id: number for number, arc in enumerate(arcs)}
+        self.sharables = list(floor.of(self.mask & floor.sharable))
+        self.barred = {bar for rc in self.sharables for bar in self._vetoes(rc)}
+        """Sets that vetoes rule out, as `Problem` has them."""
+
+    def problem(self) -> Problem:
+        return Problem(self.items, sorted(self.barred))
+
+    def ask(self, chosen: int) -> list[tuple[Rc, HolderSet]] | None:
+        """What has to be asked before this set can be taken. None: a veto, now in `barred`, rules it out."""
+        questions: list[tuple[Rc, HolderSet]] = []
+        ruled_out = False
+        for rc in self.sharables:
+            holders = frozenset(self._holders(rc, chosen))
+            # Who holds it now has been accepted; an RC that can't carry its holders says so itself.
+            if holders <= rc.holders.keys():
+                continue
+            answer = self.votes.known(rc.name, holders)
+            if answer is None and not self.votes.silent(rc.name):
+                questions.append((rc, holders))
+            elif answer is None or not answer.accept:
+                self.barred.add(self._bits(holders))
+                ruled_out = True
+        return None if ruled_out else questions
+
+    def take(self, chosen: int, actions: Actions) -> None:
+        """Carries the set out: ends who has to end, starts who is to start."""
+        taken = [chosen >> number & 1 for number in range(len(self.arcs))]
+        starting = [arc for arc, one in zip(self.arcs, taken, strict=True) if one and arc.hold is None]
+        ending = [arc for arc, one in zip(self.arcs, taken, strict=True) if not one and arc.hold is not None]
+        for victim in ending:
+            actions.displace(victim, by=self._taker(victim, starting))
+        for arc in starting:
+            actions.start(arc)
+
+    def _vetoes(self, rc: Rc) -> Iterator[int]:
+        """The vetoes of `rc` that bear on these ARCs. Who else holds it stays."""
+        for holders in self.votes.vetoed(rc.name):
+            if all(arc in self._number or arc in rc.holders for arc in holders) and (
+                bar := self._bits(holders)
+            ):
+                yield bar
+
+    def _holders(self, rc: Rc, chosen: int) -> Iterator[ArcId]:
+        """Who would hold `rc`."""
+        for holder in rc.holders:
+            if holder not in self._number:
+                yield holder
+        for number, arc in enumerate(self.arcs):
+            if chosen >> number & 1 and arc.mask & rc.bit:
+                yield arc.id
+
+    def _bits(self, holders: HolderSet) -> int:
+        return sum(1 << self._number[arc] for arc in holders if arc in self._number)
+
+    def _taker(self, victim: Arc, starting: list[Arc]) -> Arc:
+        """For whom a hold is taken away: the best-ranked newcomer that needs one of its exclusive RCs, else
+        one of its sharable ones, else the best-ranked of all."""
+        entitled = [arc for arc in starting if victim.yields_to(arc, self.now)] or starting
+        exclusive = ~self.floor.sharable
+        for mask in (victim.mask & exclusive, victim.mask):
+            for arc in entitled:
+                if arc.mask & mask:
+                    return arc
+        return entitled[0]
