@@ -55,7 +55,9 @@ BAD_FLEETS = {
         'fleet.candidates[2]: "a" stands at fleet.candidates[0] already; rename or remove one of the two'
     ),
     f"[fleet]\ncandidates = {['a'] * 1001}": "fleet.candidates: has 1,001 entries; at most 1,000 are allowed",
-    '[fleet]\nstrategy = "fifo"': 'fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"',
+    '[fleet]\nstrategy = "fifo"': (
+        'fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"'
+    ),
     "[fleet]\noperator_priority = -1": (
         "fleet.operator_priority: is -1; write a whole number from 0 to 1000000000"
     ),

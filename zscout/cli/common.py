@@ -170,7 +170,7 @@ async def see_rcm(client: Client) -> None:
 async def state_of(client: Client, arc: str | None = None) -> RcmState:
     """The RCM's state, with the story of `arc`. Raises NobodyThere where no RCM answers."""
     for _ in range(STATE_TRIES):
-        state = await client.state(arc)
+        state = await client.state(arc, forecast=True)
         if state is not None:
             return state
     raise NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again, or see its log")

@@ -119,4 +119,4 @@ class Look:
 
         await self.until(complete, FIND_LOADS)
         self._settled = loads
-        return (await self.client.state() if loads else None) or state
+        return (await self.client.state(forecast=True) if loads else None) or state

@@ -91,6 +91,7 @@ def _waiting_table(state: RcmState) -> Table:
             str(wait.priority),
             common.span(wait.waited),
             common.span(float(wait.min_runtime)),
+            "?" if wait.starts_in is None else f"in {common.span(wait.starts_in)}",
             str(wait.preemptions),
             wait.client,
             wait.reason,
@@ -98,7 +99,7 @@ def _waiting_table(state: RcmState) -> Table:
         for number, wait in enumerate(state.queue, 1)
     ]
     title = f"Waiting, and {state.more} more" if state.more else "Waiting"
-    columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "PREEMPTED", "CLIENT", "WHY")
+    columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "CLIENT", "WHY")
     return Table(title, columns, rows, [""] * len(rows), ("RUNTIME", "PREEMPTED", "CLIENT"))
 
 

@@ -18,6 +18,7 @@ from zscout.behaviors.client import Client, CommandRefused
 from zscout.behaviors.request import OpenArc
 from zscout.cli.arguments import Duration, Need, Needs, gather_needs
 from zscout.cli.common import Failed, clean, connected, fleet_file, json_option, run, span
+from zscout.cli.dry_run import foresee
 from zscout.cli.run_command import RunningCommand, check_command, environment
 from zscout.cli.waiting import Report
 from zscout.keyexpr import check_name, valid_name
@@ -109,10 +110,13 @@ def hold_options(command: F) -> F:
     help="Higher ones preempt lower ones.",
 )
 @click.option("--keep", is_flag=True, help="Go on past the minimum runtime, until something else needs it.")
+@click.option(
+    "--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once."
+)
 @hold_options
 @click.pass_context
 def request(
-    ctx: click.Context, /, needs: Any, priority: int, keep: bool, name: str | None, **rest: Any
+    ctx: click.Context, /, needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, **rest: Any
 ) -> int:
     """Wait until all of the devices are granted at once, then hold them.
 
@@ -146,9 +150,10 @@ def request(
       zscout request robot/scout33 radio/rf0:command_rate=5 --keep -- ./survey.py --fast
       zscout request framegrabber/fgrab1 --timeout 30 --again -- ./record.sh
       zscout request robot/scout33 --json | jq .event
+      zscout request robot/scout33 --priority 5 --dry-run
     """
     wanted = gather(ctx, needs, name, priority=priority, keep=keep, **rest)
-    return run(_request(wanted))
+    return run(foresee(wanted) if dry_run else _request(wanted))
 
 
 def gather(

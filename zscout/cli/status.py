@@ -24,7 +24,9 @@ EVERY: Final = 1.0
 """Seconds between two pictures."""
 HASTE: Final = 0.1
 """The same where something has changed."""
-PASSING: Final = frozenset({"held", "remaining", "waited", "seq", "links", "load", "age", "gone"})
+PASSING: Final = frozenset(
+    {"held", "remaining", "waited", "starts_in", "seq", "links", "load", "age", "gone"}
+)
 """Fields that change without anything having happened."""
 
 
@@ -96,7 +98,7 @@ async def _watch(as_json: bool) -> None:
             await _within(EVERY, news)
             await _within(HASTE, stop)
             news.clear()
-            state = await client.state()
+            state = await client.state(forecast=True)
 
 
 async def _within(seconds: float, event: asyncio.Event) -> None:

@@ -164,6 +164,10 @@ def _standing(arc: dict[str, Any]) -> Iterator[Line]:
     ahead = arc["ahead"]
     place = "nobody is ahead of it" if not ahead else f"{ahead} {'is' if ahead == 1 else 'are'} ahead of it"
     yield f"  {place} in the queue of {arc['queued']}; it wants {runtime}", _PLAIN
+    if arc.get("starts_in") is not None:
+        yield f"  it may start in {common.span(arc['starts_in'])}, if nothing else comes", _PLAIN
+    else:
+        yield "  no start can be foretold as things stand", _PLAIN
     if arc["preemptions"]:
         yield f"  it was preempted {_times(arc['preemptions'])}", _PLAIN
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Granted, Outcome, Propose, Revoked
+from zscout.scheduling.effects import Granted, Outcome, Propose, Revoked, WakeAt
 from zscout.scheduling.events import Asked, Event, LeadTaken, RcJoined, Standing, Tick, Vote
 from zscout.scheduling.model import ArcId, Ns, Request, Term
 
@@ -37,7 +38,8 @@ def forecast(core: Core, now: Ns, newcomer: Request | None = None) -> Forecast:
 class _Player:
     def __init__(self, core: Core, now: Ns) -> None:
         self.real, self.now = core, now
-        self.core = Core(core.strategy)
+        # It keeps unfinished searches: the forecast must not meddle with them.
+        self.core = Core(Adaptive() if isinstance(core.strategy, Adaptive) else core.strategy)
         self.result = Forecast()
         self.ends: dict[ArcId, Ns] = {}
 
@@ -73,6 +75,7 @@ class _Player:
         """One instant, with every vote that it takes."""
         while events:
             votes: list[Event] = []
+            again = False
             for effect in self.core.handle(self.now, *events):
                 match effect:
                     case Granted(arc=arc, start=start):
@@ -87,8 +90,10 @@ class _Player:
                     case Propose(proposal=proposal, rc=rc, holders=holders):
                         known = self.real.votes.known(rc, frozenset(holders))
                         votes.append(Vote(proposal, known is None or known.accept))
+                    case WakeAt(at=at):
+                        again = at == self.now
                     case _:
                         pass
             # A kept hold goes on past its minimum runtime: what counts is when it begins to yield.
             self.ends = {arc: end for arc, end in self.ends.items() if end > self.now}
-            events = votes
+            events = votes or ([Tick()] if again else [])
