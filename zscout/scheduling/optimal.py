@@ -32,6 +32,11 @@ STEPS: Final = 6_000
 """Steps of local search for a large part."""
 
 
+MAX_VETOES: Final = 256
+"""Vetoes on one part. A voter gives no reason that could be reckoned with, so a proof may take a question for
+each of very many sets; beyond so many vetoes `priority` decides the part."""
+
+
 def run_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
     """One pass at `now`."""
     held = 0
@@ -43,9 +48,13 @@ def run_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
 
 
 def decide(part: Part, actions: Actions) -> bool:
-    """Takes the best set of a part. False: votes are out, so nothing changes yet."""
-    while (questions := part.ask(chosen := best(part.problem()))) is None:
-        pass  # a veto that was known ruled it out: each round bars at least one more set
+    """Takes the best set of a part, or leaves it to `priority`. False: votes are out; nothing changes yet."""
+    questions = None
+    while questions is None:
+        if len(part.barred) > MAX_VETOES:
+            return True
+        # None: a veto that was known ruled it out, and each round bars at least one more set.
+        questions = part.ask(chosen := best(part.problem()))
     if questions:
         for rc, holders in questions:
             actions.propose(rc, holders)

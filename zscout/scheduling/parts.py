@@ -129,8 +129,11 @@ class Part:
         """By level."""
         self._number = {arc.id: number for number, arc in enumerate(arcs)}
         self.sharables = list(floor.of(self.mask & floor.sharable))
-        self.barred = {bar for rc in self.sharables for bar in self._vetoes(rc)}
+        vetoes = {rc.name: set(self._vetoes(rc)) for rc in self.sharables}
+        self.barred = set().union(*vetoes.values())
         """Sets that vetoes rule out, as `Problem` has them."""
+        self._short = {name for name, bars in vetoes.items() if bars}
+        """RCs that have not enough for all."""
 
     def problem(self) -> Problem:
         return Problem(self.items, sorted(self.barred))
@@ -146,9 +149,11 @@ class Part:
                 continue
             answer = self.votes.known(rc.name, holders)
             if answer is None and not self.votes.silent(rc.name):
-                questions.append((rc, holders))
+                questions.append((rc, self._probe(rc, holders) if rc.name in self._short else holders))
             elif answer is None or not answer.accept:
-                self.barred.add(self._bits(holders))
+                # Who was not asked in time is taken to refuse, from the first that it was not asked about.
+                ranked, accepted = self._ranked(rc, holders)
+                self.barred.add(self._bits(frozenset(ranked[: accepted + 1]) if answer is None else holders))
                 ruled_out = True
         return None if ruled_out else questions
 
@@ -169,6 +174,28 @@ class Part:
                 bar := self._bits(holders)
             ):
                 yield bar
+
+    def _probe(self, rc: Rc, holders: HolderSet) -> HolderSet:
+        """What to ask an RC that is short: half of those whom it has not accepted yet, beside the others.
+
+        A veto of few rules out far more sets than one of many; in a few rounds all are asked."""
+        ranked, accepted = self._ranked(rc, holders)
+        return frozenset(ranked[: (accepted + len(ranked) + 1) // 2])
+
+    def _ranked(self, rc: Rc, holders: HolderSet) -> tuple[list[ArcId], int]:
+        """Those who hold `rc` already, then the others by rank; and how many of these it has accepted.
+
+        Not all of `holders` are accepted."""
+        newcomers = (arc.id for arc in self.arcs if arc.id in holders and arc.id not in rc.holders)
+        ranked = [*(holders & rc.holders.keys()), *newcomers]
+        accepted = len(ranked) - 1
+        while accepted and not self._accepted(rc, frozenset(ranked[:accepted])):
+            accepted -= 1
+        return ranked, accepted
+
+    def _accepted(self, rc: Rc, holders: HolderSet) -> bool:
+        answer = self.votes.known(rc.name, holders)
+        return holders <= rc.holders.keys() or (answer is not None and answer.accept)
 
     def _holders(self, rc: Rc, chosen: int) -> Iterator[ArcId]:
         """Who would hold `rc`."""
