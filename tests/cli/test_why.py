@@ -36,14 +36,15 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             )
             assert "held by take, priority 10" in lines[1]
             assert lines[2].endswith("in the queue of 2; it wants 10 min")
-            assert lines[3:5] == ["  it was preempted once", "Needs"]
-            assert lines[5].startswith(
+            assert lines[3] == "  it may start in 10 min, if nothing else comes"
+            assert lines[4:6] == ["  it was preempted once", "Needs"]
+            assert lines[6].startswith(
                 "  radio/rf0 (rate=4): shared with mapping (rate=5) of test/other, priority 0,"
             )
-            assert lines[5].endswith(" left at least")
-            assert lines[6].startswith("  robot/a: held by take of test/other, priority 10, for ")
-            assert lines[7] == "Story"
-            told = [line.split(" ago  ", 1)[1] for line in lines[8:]]
+            assert lines[6].endswith(" left at least")
+            assert lines[7].startswith("  robot/a: held by take of test/other, priority 10, for ")
+            assert lines[8] == "Story"
+            told = [line.split(" ago  ", 1)[1] for line in lines[9:]]
             assert told[:2] == [
                 "asked for radio/rf0, robot/a at priority 0",
                 "granted radio/rf0, robot/a",
