@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator, Set
 from contextlib import contextmanager
@@ -61,6 +63,8 @@ def demo(out: Path | None, as_json: bool) -> int:
       zscout demo
       zscout demo --out demo.rrd --json
     """
+    if out is not None and out.suffix != ".rrd":
+        raise BadInput(f"--out {out}: viewers know a recording by its name; let it end in .rrd")
     return common.run(_demo(out, as_json=as_json))
 
 
@@ -161,7 +165,9 @@ def _report(
         cells = sum(len(row) for row in tables["paper"].values())
         _print(console, f"All {cells} cells are those of the paper's Table 2 ({took:.0f} s).")
     _print(console, f"Recording: {path}")
-    _print(console, f"Look at it: zscout view {path}, or in a browser: zscout view --web {path}")
+    # A newcomer's shell does not find it yet: it lies in .venv/bin.
+    me = "zscout" if shutil.which("zscout") else os.path.relpath(sys.argv[0])
+    _print(console, f"Look at it: {me} view {path}, or in a browser: {me} view --web {path}")
 
 
 def _print(console: Any, text: str) -> None:
