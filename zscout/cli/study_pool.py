@@ -19,6 +19,8 @@ from typing import Final
 from zscout.cli.common import Failed
 from zscout.scheduling.study.trial import Job, Trial, run
 
+GIVE_UP: Final = 5.0
+"""Seconds for an interrupted pool to come to its end."""
 AHEAD: Final = 4
 """Jobs per process that are handed out before the results of earlier ones are taken."""
 
@@ -49,7 +51,13 @@ async def spread(jobs: Sequence[Job], processes: int) -> AsyncGenerator[Trial, N
         if not done:
             for child in set(multiprocessing.active_children()) - others:
                 child.terminate()
+        # A child that is ended while it holds a queue's lock leaves the pool waiting for ever.
+        impatience = threading.Timer(GIVE_UP, os._exit, (1,))
+        impatience.daemon = True
+        if not done:
+            impatience.start()
         pool.shutdown(cancel_futures=True)
+        impatience.cancel()
 
 
 @contextmanager
