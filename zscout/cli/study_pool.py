@@ -51,7 +51,7 @@ async def spread(jobs: Sequence[Job], processes: int) -> AsyncGenerator[Trial, N
         if not done:
             for child in set(multiprocessing.active_children()) - others:
                 child.terminate()
-        # A child that is ended while it holds a queue's lock leaves the pool waiting for ever.
+        # Seen once: the pool of an interrupted study waited for ever. Why is not known; its wait is bounded.
         impatience = threading.Timer(GIVE_UP, os._exit, (1,))
         impatience.daemon = True
         if not done:
