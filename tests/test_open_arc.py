@@ -56,7 +56,7 @@ def test_words_of_the_rcm(words: list[Notice], state: str, grant: Grant | None, 
     for number, word in enumerate(words):
         known.take(word, NOW + number)
     assert (known.state, known.grant, known.ending) == (state, grant, ending)
-    assert known.told().grant == grant
+    assert known.told(NOW).grant == grant
     assert known.place == Place(TERM, 1)
 
 

@@ -32,6 +32,8 @@ Amounts: TypeAlias = dict[str, Decimal]
 State: TypeAlias = Literal["queued", "running", "ended"]
 Seconds: TypeAlias = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 """A duration that is computed with: bounded, so that it is still finite in nanoseconds."""
+Elapsed: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+"""Likewise; of something that lies behind."""
 
 
 class Message(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -44,7 +46,8 @@ class Message(msgspec.Struct, frozen=True, omit_defaults=True):
 class Ask(Message, frozen=True, tag_field="op", tag="request"):
     """Asks for an ARC: all of `needs`, for at least `min_runtime` seconds.
 
-    `id` is the client's own and stays the same however often it asks; `place` is what an earlier RCM gave.
+    `id` is the client's own and stays the same however often it asks; `place` is what an earlier RCM gave,
+    and `waited` the seconds since it was last queued there.
     """
 
     id: str
@@ -54,6 +57,7 @@ class Ask(Message, frozen=True, tag_field="op", tag="request"):
     min_runtime: Decimal
     keep: bool = False
     place: Place | None = None
+    waited: Elapsed = 0.0
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -333,7 +337,7 @@ class RcState(Message, frozen=True):
 
 
 class OpenRequest(Message, frozen=True):
-    """A request as its client knows it, for an RCM that takes the lead."""
+    """A request as its client knows it, for an RCM that takes the lead. `waited` as in Ask."""
 
     id: str
     arc: str
@@ -342,6 +346,7 @@ class OpenRequest(Message, frozen=True):
     min_runtime: Decimal
     keep: bool = False
     place: Place | None = None
+    waited: Elapsed = 0.0
     grant: Grant | None = None
 
 

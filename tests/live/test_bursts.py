@@ -29,7 +29,7 @@ def test_what_is_asked_and_given_up_in_one_burst_is_gone(tmp_path: Path) -> None
             arcs = [await task for task in asked]
             assert {arc.state for arc in arcs} == {"queued"}
             # Each waiting request, asked again and cancelled without waiting for the answer in between.
-            pairs = [operation for arc in arcs for operation in (arc.ask(), Cancel(id=arc.id))]
+            pairs = [operation for arc in arcs for operation in (arc.ask(0), Cancel(id=arc.id))]
             answers = await asyncio.gather(
                 *(client.mesh.ask_one(key, operation, Notice, timeout=5) for operation in pairs)
             )

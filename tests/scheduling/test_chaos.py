@@ -28,6 +28,7 @@ from zscout.scheduling.events import (
     Tick,
     Vote,
     VoteOverdue,
+    Waiting,
 )
 from zscout.scheduling.model import NO_TERM, SECOND, Arc, Ns, RcName, Term
 from zscout.scheduling.strategies import STRATEGIES, StrategyName
@@ -153,7 +154,7 @@ class Chaos:
             for arc in old.floor.running.values()
             if arc.hold is not None
         )
-        queue = tuple((arc.request, arc.place) for arc in old.floor.queued.values())
+        queue = tuple(Waiting(arc.request, arc.place, arc.since) for arc in old.floor.queued.values())
         joins = [RcJoined(name, self.sharable[name]) for name in self.present]
         self.send(*joins, LeadTaken(term, standing, queue))
         assert self.ledger.open == before, "a change of RCM disturbed somebody"

@@ -22,6 +22,7 @@ from zscout.scheduling.events import (
     Tick,
     Vote,
     VoteOverdue,
+    Waiting,
 )
 from zscout.scheduling.model import QUANTUM, SECOND, Grant, Params, Place, Request, Term
 
@@ -264,7 +265,7 @@ def test_a_hold_whose_time_ran_out_between_two_reigns_is_completed_at_once() -> 
     core = Core()
     now = 60 * SECOND
     over = standing(request("over", "robot/a"), 1)
-    waits = (request("next", "robot/a"), Place(OLD, 2))
+    waits = Waiting(request("next", "robot/a"), Place(OLD, 2))
     effects = core.handle(now, RcJoined("robot/a", sharable=False), LeadTaken(NEW, (over,), (waits,)))
     core.validate()
     assert [(gone.arc, gone.outcome) for gone in only(Revoked, effects)] == [("over", Outcome.COMPLETED)]

@@ -38,6 +38,7 @@ from zscout.scheduling.events import (
     Tick,
     Vote,
     VoteOverdue,
+    Waiting,
 )
 from zscout.scheduling.model import SECOND, Grant, Ns, Params, Place, Request, Term
 
@@ -66,7 +67,7 @@ class _Player:
     core: Core = field(default_factory=Core)
     now: Ns = 0
     standing: list[Standing] = field(default_factory=list)
-    waiting: list[tuple[Request, Place]] = field(default_factory=list)
+    waiting: list[Waiting] = field(default_factory=list)
 
     def batch(self, line: str) -> list[str]:
         events: list[Event] = []
@@ -98,7 +99,7 @@ class _Player:
                 return None
             case "waiting":
                 request, options = _request(rest)
-                self.waiting.append((request, _place(options["place"])))
+                self.waiting.append(Waiting(request, _place(options["place"])))
                 return None
             case "lead":
                 lead = LeadTaken(_term(first), tuple(self.standing), tuple(self.waiting))

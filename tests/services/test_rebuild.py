@@ -56,6 +56,7 @@ def asked(
     needs: tuple[str, ...] = GANG,
     rate: str = "2.5",
     runtime: str = "60",
+    waited: float = 0.0,
 ) -> OpenRequest:
     return OpenRequest(
         id=f"{name}-id",
@@ -65,6 +66,7 @@ def asked(
         min_runtime=Decimal(runtime),
         keep=True,
         place=place,
+        waited=waited,
         grant=grant,
     )
 
@@ -79,7 +81,7 @@ RUNS = client(asked(grant=Grant(TERM, 5)))
 
 def summary(found: Inheritance) -> tuple[list[str], list[str]]:
     """The names of what stands and what waits."""
-    return [held.request.name for held in found.standing], [request.name for request, _ in found.waiting]
+    return [held.request.name for held in found.standing], [one.request.name for one in found.waiting]
 
 
 @pytest.mark.parametrize(
@@ -183,12 +185,12 @@ def test_the_parameters_at_an_absent_rc_are_what_the_client_says() -> None:
 
 def test_what_waits_keeps_place_and_parameters() -> None:
     place = Place(OLD, 9)
-    ((request, at),) = rebuild([], [client(asked(place=place, rate="0.1"))], NOW).waiting
-    assert at == place
+    ((request, at, since),) = rebuild([], [client(asked(place=place, rate="0.1", waited=2.5))], NOW).waiting
+    assert (at, since) == (place, NOW - 2_500_000_000)
     assert request.needs == {"robot/a": {}, "radio/b": {"rate": Fraction(1, 10)}}
 
 
 def test_requests_of_two_clients_may_share_an_id() -> None:
     clients = [client(asked(), name="h/one"), client(asked(), name="h/two")]
     found = rebuild([], clients, NOW)
-    assert [request.arc for request, _ in found.waiting] == ["h/one/gang-id", "h/two/gang-id"]
+    assert [one.request.arc for one in found.waiting] == ["h/one/gang-id", "h/two/gang-id"]

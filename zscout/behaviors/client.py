@@ -319,7 +319,7 @@ class Client:
             if promise < self.term or absurd(promise, self.term):
                 raise Refused("old_term", f"this client obeys term {self.term.counter}", self.term)
             self.term = promise
-        arcs = [arc.told() for arc in self._arcs.values() if arc.open]
+        arcs = [arc.told(clock.now()) for arc in self._arcs.values() if arc.open]
         request.answer(ClientRequests(client=str(self.mesh.me), requests=arcs))
 
     def _rcm_spoke(self) -> bool:
@@ -361,7 +361,9 @@ class Client:
 
     async def _ask(self, arc: OpenArc) -> list[Reply[Notice]]:
         key = self.mesh.keys.schedule(self.mesh.me)
-        replies = await self.mesh.ask(key, arc.ask(), Notice, timeout=QUERY_TIMEOUT, enough=_answered)
+        replies = await self.mesh.ask(
+            key, arc.ask(clock.now()), Notice, timeout=QUERY_TIMEOUT, enough=_answered
+        )
         for reply in replies:
             notice = reply.message
             if notice is not None and notice.term >= self.term and not absurd(notice.term, self.term):

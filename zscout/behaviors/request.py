@@ -45,6 +45,8 @@ class OpenArc:
     """When the minimum runtime of the present hold is over, on this host's clock."""
     since: Ns = 0
     """When `state` began."""
+    waits_since: Ns | None = None
+    """When it was last queued: its present wait began then, whichever RCM leads."""
     ending: Ending | None = None
     """How the last hold ended; `outcome` and `reason` are of the newest word, whatever it is about."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
@@ -61,9 +63,9 @@ class OpenArc:
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
         if notice.state != "running":
-            self._close(Ending(notice.outcome or "lost", notice.reason, notice.by))
+            self._close(Ending(notice.outcome or "lost", notice.reason, notice.by), now)
         elif notice.grant != self.grant:
-            self._close(Ending("lost", "it was granted anew"))
+            self._close(Ending("lost", "it was granted anew"), now)
         self.state = notice.state
         self.reason = notice.reason
         self.outcome, self.by = notice.outcome, notice.by
@@ -75,21 +77,27 @@ class OpenArc:
             self.end = now + round((notice.remaining or 0.0) * SECOND)
         return True
 
-    def _close(self, ending: Ending) -> None:
+    def _close(self, ending: Ending, now: Ns) -> None:
         if self.grant is not None:
-            self.grant, self.ending = None, ending
+            self.grant, self.ending, self.waits_since = None, ending, now
+        elif self.waits_since is None:
+            self.waits_since = now
 
     def lose(self, reason: str, now: Ns) -> None:
         """The hold is over by the client's own judgement; the request is asked again."""
-        self._close(Ending("lost", reason))
+        self._close(Ending("lost", reason), now)
         self.state, self.reason, self.outcome, self.since = "asking", reason, "lost", now
 
     def finish(self, outcome: str, reason: str, now: Ns) -> None:
         """The request is over by the client's own judgement."""
-        self._close(Ending(outcome, reason))
+        self._close(Ending(outcome, reason), now)
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
 
-    def ask(self) -> Ask:
+    def _waited(self, now: Ns) -> float:
+        since = self.waits_since
+        return 0.0 if since is None or self.grant is not None else max(0, now - since) / SECOND
+
+    def ask(self, now: Ns) -> Ask:
         return Ask(
             id=self.id,
             arc=self.name,
@@ -98,9 +106,10 @@ class OpenArc:
             min_runtime=self.min_runtime,
             keep=self.keep,
             place=self.place,
+            waited=self._waited(now),
         )
 
-    def told(self) -> OpenRequest:
+    def told(self, now: Ns) -> OpenRequest:
         """As an RCM that takes the lead is told of it."""
         return OpenRequest(
             id=self.id,
@@ -110,6 +119,7 @@ class OpenArc:
             min_runtime=self.min_runtime,
             keep=self.keep,
             place=self.place,
+            waited=self._waited(now),
             grant=self.grant,
         )
 

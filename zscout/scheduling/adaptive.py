@@ -11,7 +11,8 @@ are out, it is off limits and all others go on. A search works on a snapshot: wh
 starts again from what is left of the best set. A part has only so many slices and rounds of votes, whatever
 happens meanwhile; then the best set that needs no more votes is taken, or `priority` decides.
 
-In each pass the outcome is worth at least what that of `priority` is.
+In each pass the outcome is worth at least what that of `priority` is, among those whom no reservation
+against starving (`reservations.py`) holds back.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from zscout.scheduling.model import ArcId, Ns, RcName
 from zscout.scheduling.packing import Item, Problem, numbers, pack
 from zscout.scheduling.parts import Part, parts_in_play
 from zscout.scheduling.priority import Actions
+from zscout.scheduling.reservations import PATIENCE, Reservations
 from zscout.scheduling.votes import HolderSet, Votes
 
 WORK: Final = 20_000
@@ -124,8 +126,11 @@ class _Search:
 class Adaptive:
     """One run of the strategy. It keeps unfinished searches, so each core has its own."""
 
-    def __init__(self) -> None:
+    def __init__(self, patience: Ns | None = PATIENCE) -> None:
+        """`patience`: time in ns after which nobody passes an ARC that waits; None: whoever may."""
+        self.patience = patience
         self.statistics = Statistics()
+        self._reserved: Reservations | None = None
         self._searches: dict[ArcId, _Search] = {}
         self._work = 0
         """What this pass may still spend on branch and bound."""
@@ -134,6 +139,10 @@ class Adaptive:
         self._unfinished: list[_Search] = []
         self._seen: tuple[int, ...] = ()
         """The situation in which they are unfinished."""
+
+    def afresh(self) -> Adaptive:
+        """Another run with the same settings."""
+        return Adaptive(self.patience)
 
     def __call__(self, floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
         """One pass at `now`."""
@@ -144,11 +153,23 @@ class Adaptive:
             return
         before, self._searches, self._unfinished = self._searches, {}, []
         held = 0
-        for part in parts_in_play(floor, votes, now):
+        reserved = self._reserve(floor, votes, now)
+        for part in parts_in_play(floor, votes, now, reserved):
             if not self._decide(part, before, actions):
                 held |= part.mask
-        priority.run_pass(floor, votes, now, actions, off_limits=held)
+        priority.run_pass(floor, votes, now, actions, off_limits=held, reserved=reserved)
         self._seen = _situation(floor)
+
+    def _reserve(self, floor: Floor, votes: Votes, now: Ns) -> Reservations | None:
+        """What is kept for the owed in this pass; those who were held back by what is kept no more are
+        looked at again."""
+        if self.patience is None:
+            return None
+        before = self._reserved
+        reserved = self._reserved = Reservations(floor, votes, now, self.patience)
+        if before is not None:
+            floor.waits.freed |= reserved.changed(before)
+        return reserved
 
     def _nothing_new(self, floor: Floor, votes: Votes, now: Ns) -> bool:
         """Whether a whole pass would only find everything as the last one left it."""

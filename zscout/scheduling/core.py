@@ -41,6 +41,7 @@ from zscout.scheduling.events import (
     Tick,
     Vote,
     VoteOverdue,
+    Waiting,
 )
 from zscout.scheduling.floor import Floor, check
 from zscout.scheduling.model import (
@@ -104,8 +105,8 @@ class Core:
 
     def _apply(self, event: Event) -> None:
         match event:
-            case Asked(request, place):
-                self._ask(request, place)
+            case Asked(request, place, since):
+                self._ask(request, place, since)
             case Cancelled(arc, by):
                 self._give_up(arc, Outcome.CANCELLED, f"cancelled by {by}")
             case Released(arc, by):
@@ -152,10 +153,11 @@ class Core:
         """Whether `place` may have been given; of earlier terms the core does not know."""
         return place.term != self.term or place.arrival <= self._arrivals
 
-    def _ask(self, request: Request, place: Place | None) -> None:
+    def _ask(self, request: Request, place: Place | None, since: Ns | None) -> None:
         if self.floor.arc(request.arc) is not None:
             return
-        self.floor.enqueue(self._new_arc(request, place), self._now)
+        since = self._now if since is None else min(since, self._now)
+        self.floor.enqueue(self._new_arc(request, place), since)
 
     def _new_arc(self, request: Request, place: Place | None) -> Arc:
         if place is None:
@@ -196,9 +198,7 @@ class Core:
         arc.hold = replace(arc.hold, grant=self._next_grant())
         self._effects.append(self._granted(arc, arc.hold))
 
-    def _lead(
-        self, term: Term, standing: tuple[Standing, ...], waiting: tuple[tuple[Request, Place], ...]
-    ) -> None:
+    def _lead(self, term: Term, standing: tuple[Standing, ...], waiting: tuple[Waiting, ...]) -> None:
         if term <= self.term:
             raise ValueError(f"the new term {term} is not above {self.term}")
         self.term, self.seq, self._arrivals = term, 0, 0
@@ -220,8 +220,8 @@ class Core:
             else:
                 self._take(arc, hold)
         self._expire()
-        for request, place in waiting:
-            self._ask(request, place)
+        for one in waiting:
+            self._ask(*one)
 
     def _expire(self) -> None:
         while self._ends and self._ends[0][0] <= self._now:

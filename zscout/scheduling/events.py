@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from zscout.scheduling.model import ArcId, ClientId, Grant, Ns, Place, RcName, Request, Term
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A program asks for an ARC. `place` is set when it had one under an earlier RCM."""
+    """A program asks for an ARC. `place` is set when it had one under an earlier RCM; `since` is then when it
+    was last queued, on the core's clock, if that is known."""
 
     request: Request
     place: Place | None = None
+    since: Ns | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +102,21 @@ class Standing:
     end: Ns
 
 
+class Waiting(NamedTuple):
+    """A request that waited when an RCM took the lead; `since` as in `Asked`."""
+
+    request: Request
+    place: Place
+    since: Ns | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class LeadTaken:
     """This RCM leads from now on, in `term`, over the holds and the queue that stood."""
 
     term: Term
     standing: tuple[Standing, ...] = ()
-    waiting: tuple[tuple[Request, Place], ...] = ()
+    waiting: tuple[Waiting, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

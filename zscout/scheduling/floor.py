@@ -72,8 +72,8 @@ class Floor:
         self.present &= ~rc.bit
         self.waits.freed |= rc.bit
 
-    def enqueue(self, arc: Arc, now: Ns) -> None:
-        arc.since, arc.turn = now, self._turn()
+    def enqueue(self, arc: Arc, since: Ns) -> None:
+        arc.since, arc.turn = since, self._turn()
         arc.rcs = arc.rcs or tuple(self.of(arc.mask))
         self.queued[arc.id] = arc
         self.waits.add(arc)

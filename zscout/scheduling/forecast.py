@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Granted, Outcome, Propose, Revoked, WakeAt
-from zscout.scheduling.events import Asked, Event, LeadTaken, RcJoined, Standing, Tick, Vote
+from zscout.scheduling.events import Asked, Event, LeadTaken, RcJoined, Standing, Tick, Vote, Waiting
 from zscout.scheduling.model import ArcId, Ns, Request, Term
 
 MAX_VISITS = 4_000
@@ -39,7 +39,7 @@ class _Player:
     def __init__(self, core: Core, now: Ns) -> None:
         self.real, self.now = core, now
         # It keeps unfinished searches: the forecast must not meddle with them.
-        self.core = Core(Adaptive() if isinstance(core.strategy, Adaptive) else core.strategy)
+        self.core = Core(core.strategy.afresh() if isinstance(core.strategy, Adaptive) else core.strategy)
         self.result = Forecast()
         self.ends: dict[ArcId, Ns] = {}
 
@@ -66,7 +66,7 @@ class _Player:
             for arc in floor.running.values()
             if arc.hold is not None
         )
-        waiting = tuple((arc.request, arc.place) for arc in floor.queued.values())
+        waiting = tuple(Waiting(arc.request, arc.place, arc.since) for arc in floor.queued.values())
         self.ends = {held.request.arc: held.end for held in standing}
         term = Term(self.real.term.counter + 1, "forecast")
         return [*joined, LeadTaken(term, standing, waiting)]

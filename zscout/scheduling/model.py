@@ -122,6 +122,8 @@ class Arc:
     """Where a firm obstacle lay under what was off limits at that visit, as bits."""
     asked: bool = False
     """Whether that visit waits for votes of its own."""
+    owed: bool = False
+    """Whether it has waited longer than the fleet's patience (`reservations.py`)."""
 
     def __post_init__(self) -> None:
         self.id, self.priority = self.request.arc, self.request.priority

@@ -14,17 +14,20 @@ from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, ArcId, Ns, Rc
 from zscout.scheduling.packing import Item, Problem
 from zscout.scheduling.priority import Actions
+from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.votes import HolderSet, Votes
 
 
-def parts_in_play(floor: Floor, votes: Votes, now: Ns) -> list[Part]:
+def parts_in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None) -> list[Part]:
     """The parts in which somebody could start; best-ranked first."""
-    arcs = in_play(floor, votes, now)
-    return [Part(floor, votes, now, members) for members in apart(arcs)] if arcs else []
+    arcs = in_play(floor, votes, now, reserved)
+    return [Part(floor, votes, now, members, reserved) for members in apart(arcs)] if arcs else []
 
 
-def in_play(floor: Floor, votes: Votes, now: Ns) -> list[Arc]:
+def in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None) -> list[Arc]:
     """Those who might start in this pass, and those who might have to end for them."""
+    yielded = 0
+    """Sharable RCs at which one passes those who are owed: whether a second could as well was not asked."""
     levels: dict[int, list[Arc]] = {}
     absent = ~floor.present
     for arc in floor.queued.values():
@@ -53,6 +56,12 @@ def in_play(floor: Floor, votes: Votes, now: Ns) -> list[Arc]:
         for arc in levels[level]:
             if arc.mask & shut or _refused(floor, votes, now, arc, movable):
                 continue
+            if reserved is not None and arc.mask & reserved.bits:
+                shared = arc.mask & reserved.bits & floor.sharable
+                if shared & yielded or reserved.bar(arc) is not None:
+                    continue
+                if not arc.owed:
+                    yielded |= shared
             found.append(arc)
             for rc in floor.of(arc.mask & (floor.busy | floor.sharable)):
                 for holder in rc.holders.values():
@@ -103,29 +112,41 @@ def apart(arcs: Iterable[Arc]) -> list[list[Arc]]:
 
 
 class Part:
-    """ARCs that are decided together, in rank order, and what the RCs have said about them."""
+    """ARCs that are decided together, and what the RCs have said about them."""
 
-    def __init__(self, floor: Floor, votes: Votes, now: Ns, arcs: list[Arc]) -> None:
+    def __init__(
+        self, floor: Floor, votes: Votes, now: Ns, arcs: list[Arc], reserved: Reservations | None = None
+    ) -> None:
         self.floor, self.votes, self.now = floor, votes, now
+        # Who is due goes before its equals, but not before those who run: equals are not displaced.
+        later = set()
+        if reserved is not None and any(reserved.first(arc) for arc in arcs):
+            later = {
+                arc.id
+                for arc in arcs
+                if (arc.overstays(now) if arc.hold is not None else not reserved.first(arc))
+            }
+            arcs = sorted(arcs, key=lambda arc: (-arc.priority, arc.id in later, arc.rank))
         self.arcs = arcs
+        """Best first."""
         self.mask = 0
         """All that they need or hold."""
         for arc in arcs:
             self.mask |= arc.mask
-        priorities = sorted({arc.request.priority for arc in arcs}, reverse=True)
-        levels = {priority: level for level, priority in enumerate(priorities)}
+        grades = [(-arc.priority, arc.id in later) for arc in arcs]
+        levels = {grade: level for level, grade in enumerate(sorted(set(grades)))}
         exclusive = ~floor.sharable
         self.items = [
             Item(
                 mask=arc.mask & exclusive,
                 width=arc.mask.bit_count(),
-                level=levels[arc.request.priority],
+                level=levels[grade],
                 standing=arc.hold is not None,
                 spent=arc.overstays(now),
             )
-            for arc in arcs
+            for arc, grade in zip(arcs, grades, strict=True)
         ]
-        self.priorities = priorities
+        self.priorities = [-priority for priority, _ in levels]
         """By level."""
         self._number = {arc.id: number for number, arc in enumerate(arcs)}
         self.sharables = list(floor.of(self.mask & floor.sharable))

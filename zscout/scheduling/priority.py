@@ -26,6 +26,8 @@ is passed over only where its visit would again come to "waits", stopping nobody
   an RC accepts it accepts of every subset. When the RC becomes off limits, its watchers below are visited.
 - It is *asleep* before a silent RC. Its visit reads nothing outside its footprint; it is visited when
   anything within changes, is answered or becomes off limits, and when the silent RC may be asked again.
+- It is *held back* from an RC that is kept for another (`reservations.py`); it watches that RC until other
+  claims stand there.
 - It is *open*, but nothing within its footprint has changed. Then it is stopped again, if what it would
   take is off limits and what hides its firm obstacles still is, or it waits for the same votes as before.
 """
@@ -39,6 +41,7 @@ from typing import Protocol, TypeAlias
 
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, Ns, Rank, Rc
+from zscout.scheduling.reservations import Bar, Reservations
 from zscout.scheduling.visit import Admitted, Open, Refused, Visit, absence, listed
 from zscout.scheduling.votes import HolderSet, Votes
 
@@ -69,11 +72,20 @@ Strategy: TypeAlias = Callable[[Floor, Votes, Ns, Actions], None]
 """One pass: reads the floor and the votes, and acts."""
 
 
-def run_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions, *, off_limits: int = 0) -> None:
+def run_pass(
+    floor: Floor,
+    votes: Votes,
+    now: Ns,
+    actions: Actions,
+    *,
+    off_limits: int = 0,
+    reserved: Reservations | None = None,
+) -> None:
     """One pass over the queue at `now`, as far as something has changed for those who wait.
 
-    `off_limits`: bits of RCs that another strategy is still deciding about."""
-    Pass(floor, votes, now, actions).run(
+    `off_limits`: bits of RCs that another strategy is still deciding about. `reserved`: what is kept for
+    others; the paper's own strategy knows no such thing."""
+    Pass(floor, votes, now, actions, reserved=reserved).run(
         sorted(floor.waits.open.values(), key=attrgetter("rank")), off_limits
     )
 
@@ -88,9 +100,19 @@ def run_full_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None
 class Pass:
     """Visits in rank order: those who are open, and those who watch what has been freed."""
 
-    def __init__(self, floor: Floor, votes: Votes, now: Ns, actions: Actions, told: int = TOLD) -> None:
+    def __init__(
+        self,
+        floor: Floor,
+        votes: Votes,
+        now: Ns,
+        actions: Actions,
+        *,
+        told: int = TOLD,
+        reserved: Reservations | None = None,
+    ) -> None:
         self.floor, self.votes, self.now, self.actions = floor, votes, now, actions
         self.told = told
+        self.reserved = reserved
         self.waits = floor.waits
         self.off_limits = 0
         self.changed = 0
@@ -130,6 +152,10 @@ class Pass:
     def _visit(self, arc: Arc) -> None:
         visit = Visit(self.floor, self.votes, self.now, arc)
         decision = visit.obstacle_outside(self.off_limits)
+        bar = self.reserved.bar(arc) if decision is None and self.reserved is not None else None
+        if bar is not None:
+            self._hold_back(arc, bar)
+            return
         if decision is None and self.off_limits and visit.footprint() & self.off_limits:
             self._put_off(arc, visit, asked=False)
             self.actions.wait(arc, UNSETTLED, settled=False)
@@ -154,6 +180,16 @@ class Pass:
                         heapq.heappush(self._coming, (victim.rank, 0, victim, None))
                 self.actions.start(arc)
                 self._done |= self._rouse(arc.rank)
+
+    def _hold_back(self, arc: Arc, bar: Bar) -> None:
+        """Another is owed what `arc` would take."""
+        if bar.ask is None:
+            self.waits.watch(arc, bar.rc)
+            self.actions.wait(arc, bar.reason)
+        else:
+            self.waits.reopen(arc)
+            self.actions.wait(arc, UNSETTLED, settled=False)
+            self.actions.propose(bar.rc, bar.ask)
 
     def _put_off(self, arc: Arc, visit: Visit, *, asked: bool) -> None:
         footprint = visit.footprint()

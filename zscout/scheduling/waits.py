@@ -12,8 +12,9 @@ A queued ARC is in exactly one of three states:
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
+from collections.abc import Mapping
 
-from zscout.scheduling.model import Arc, ArcId, Rank, Rc
+from zscout.scheduling.model import Arc, ArcId, Ns, Rank, Rc
 
 
 class Waits:
@@ -30,16 +31,35 @@ class Waits:
         """Bits of the RCs at which something else has changed: it concerns those asleep or open."""
         self.ranks: list[Rank] = []
         """Of all that are queued, best first."""
+        self._patient: list[tuple[Ns, ArcId]] = []
+        """Those who wait and are not owed yet, by the time since when they do."""
+        self.owed: list[tuple[int, Ns, ArcId]] = []
+        """The others: by priority (negated), then by the same."""
 
     def add(self, arc: Arc) -> None:
         """A newcomer, open."""
         insort(self.ranks, arc.rank)
+        insort(self._patient, (arc.since, arc.id))
         self.open[arc.id] = arc
 
     def remove(self, arc: Arc) -> None:
         """It waits no more."""
         del self.ranks[bisect_left(self.ranks, arc.rank)]
+        if arc.owed:
+            arc.owed = False
+            del self.owed[bisect_left(self.owed, _claim(arc))]
+        else:
+            del self._patient[bisect_left(self._patient, (arc.since, arc.id))]
         self._leave(arc)
+
+    def ripen(self, before: Ns, queued: Mapping[ArcId, Arc]) -> None:
+        """Who has waited since before then is owed from now on."""
+        ripe = bisect_left(self._patient, (before, ""))
+        for _, arc_id in self._patient[:ripe]:
+            arc = queued[arc_id]
+            arc.owed = True
+            insort(self.owed, _claim(arc))
+        del self._patient[:ripe]
 
     def ahead(self, arc: Arc) -> int:
         """How many of the queued rank above `arc`."""
@@ -86,6 +106,10 @@ class Waits:
         found = []
         if self.ranks != sorted(arc.rank for arc in queued.values()):
             found.append("the ranks are not those of the queue")
+        if self._patient != sorted((arc.since, arc.id) for arc in queued.values() if not arc.owed):
+            found.append("the patient are not those of the queue")
+        if self.owed != sorted(_claim(arc) for arc in queued.values() if arc.owed):
+            found.append("the owed are not those of the queue")
         for arc in queued.values():
             states = (arc.id in self.open) + (arc.id in self.asleep) + (arc.watched is not None)
             if states != 1:
@@ -93,3 +117,7 @@ class Waits:
             if arc.watched is not None and arc.rank not in arc.watched.watchers:
                 found.append(f"{arc.watched.name} does not know that {arc.id} watches it")
         return found
+
+
+def _claim(arc: Arc) -> tuple[int, Ns, ArcId]:
+    return -arc.priority, arc.since, arc.id

@@ -134,7 +134,8 @@ class Desk:
             self._answers[arc] = [request]
             needs = ", ".join(sorted(ask.needs))
             self.notices.tell(arc, ask.arc, f"asked for {needs} at priority {ask.priority}")
-            self._gather(arc, Asked(wanted, ask.place))
+            since = None if ask.place is None else clock.now() - round(ask.waited * SECOND)
+            self._gather(arc, Asked(wanted, ask.place, since))
         else:
             request.answer(self.notices.standing(arc, str(sender), ask.id))
 

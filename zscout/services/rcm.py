@@ -78,7 +78,7 @@ class Rcm:
         joined = self.presence.inherit(inheritance.rcs)
         for request in (
             *(held.request for held in inheritance.standing),
-            *(r for r, _ in inheritance.waiting),
+            *(one.request for one in inheritance.waiting),
         ):
             self.notices.call(request.arc, request.name)
             self.presence.expect(request.client)

@@ -15,8 +15,8 @@ from decimal import Decimal
 from zscout.amounts import duration, exact_amounts
 from zscout.keyexpr import BadName, check_name, check_rc, client_of
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState
-from zscout.scheduling.events import Standing
-from zscout.scheduling.model import SECOND, Grant, Ns, Place, RcName, Request
+from zscout.scheduling.events import Standing, Waiting
+from zscout.scheduling.model import SECOND, Grant, Ns, RcName, Request
 from zscout.services import views
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ class Inheritance:
 
     rcs: dict[str, RcState] = field(default_factory=dict)
     standing: list[Standing] = field(default_factory=list)
-    waiting: list[tuple[Request, Place]] = field(default_factory=list)
+    waiting: list[Waiting] = field(default_factory=list)
 
 
 def rebuild(states: Iterable[RcState], clients: Iterable[ClientRequests], now: Ns) -> Inheritance:
@@ -65,10 +65,11 @@ def rebuild(states: Iterable[RcState], clients: Iterable[ClientRequests], now: N
             # A request without a place was never answered: its client will ask again.
             if request.place is not None:
                 wanted = _request(arc, client, request.needs, request)
-                result.waiting.append((wanted, request.place))
+                since = now - round(request.waited * SECOND)
+                result.waiting.append(Waiting(wanted, request.place, since))
         except (BadName, ValueError) as error:
             log.warning("the request %s is not carried on: %s", arc, error)
-    result.waiting.sort(key=lambda item: item[1])
+    result.waiting.sort(key=lambda one: one.place)
     return result
 
 
@@ -93,7 +94,7 @@ def _inherit_hold(
         end = now + round(remaining * SECOND)
         result.standing.append(Standing(request, some.place, grant, end - request.min_runtime, end))
     else:
-        result.waiting.append((request, some.place))
+        result.waiting.append(Waiting(request, some.place))
 
 
 def _request(arc: str, client: str, needs: dict[str, Amounts], said: OpenRequest | Holder) -> Request:

@@ -18,9 +18,9 @@ from typing import Final
 
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Propose
-from zscout.scheduling.events import Event, LeadTaken, RcJoined, Standing, Vote
+from zscout.scheduling.events import Event, LeadTaken, RcJoined, Standing, Vote, Waiting
 from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import Arc, Ns, Place, RcName, Request, Term
+from zscout.scheduling.model import Arc, Ns, RcName, Term
 from zscout.scheduling.priority import Strategy
 from zscout.scheduling.workload import WorkloadRc, excess
 
@@ -72,7 +72,7 @@ class Situation:
 class _Before:
     now: Ns
     running: tuple[Standing, ...]
-    queued: tuple[tuple[Request, Place], ...]
+    queued: tuple[Waiting, ...]
     features: tuple[float, ...]
     within_reach: int
     """Bits of the exclusive RCs that a startable ARC needs."""
@@ -102,7 +102,7 @@ class Observer:
             for arc in floor.running.values()
             if arc.hold is not None
         )
-        queued = tuple((arc.request, arc.place) for arc in floor.queued.values())
+        queued = tuple(Waiting(arc.request, arc.place) for arc in floor.queued.values())
         features, within_reach = _features(floor)
         self._before = _Before(now, running, queued, features, within_reach)
 

@@ -1,0 +1,148 @@
+"""Bounded waiting: an ARC that has waited for the fleet's patience is *due*, and nobody may pass it any more.
+
+Shortest-first starves, and so does the larger set of ARCs where it is preferred to a smaller one. The remedy
+is that of batch schedulers, reservation with conservative backfill (Mu'alem and Feitelson, IEEE TPDS 12(6),
+2001), on distinct RCs instead of many equal processors, and with a date: what is reserved is the time from
+which the ARC is due, so that until then nobody is held back who would be over by then. Minimum runtimes are
+exact, so reservations are.
+
+Half its patience ahead, an ARC is *owed* its RCs. In the order of priority, then of waiting, each of the owed
+is given the earliest time, from when it is due, at which its RCs are free of those who hold them and do not
+yield, and of those who were owed before it. An ARC of equal or lower priority that shares an RC with it may
+start only if it is over by then, or if the RC is sharable and accepts it beside everyone concerned.
+
+`docs/scheduling.md` states the promise that follows, and what else was tried.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from zscout.scheduling.floor import Floor
+from zscout.scheduling.model import SECOND, Arc, Ns, Rc
+from zscout.scheduling.votes import HolderSet, Votes
+
+PATIENCE: Final[Ns] = 130 * SECOND
+"""Default, in ns. Measured: `docs/study.md`."""
+MAX_OWED: Final = 256
+"""ARCs that are kept a place at one time; those owed after them follow as these start."""
+
+
+class Claim(NamedTuple):
+    """An RC is kept for `creditor` from `start` on."""
+
+    creditor: Arc
+    start: Ns
+
+
+class Bar(NamedTuple):
+    """An ARC would be in the way of a claim at `rc`, unless a vote that is not known yet says otherwise."""
+
+    rc: Rc
+    creditor: Arc
+    ask: HolderSet | None = None
+
+    @property
+    def reason(self) -> str:
+        return f"{self.rc.name} is kept for {self.creditor.name}, whose time to wait is over before this ends"
+
+
+class Reservations:
+    """What is kept for whom at one instant: for those of `floor.waits.owed`."""
+
+    def __init__(self, floor: Floor, votes: Votes, now: Ns, patience: Ns) -> None:
+        self._floor, self._votes, self._now = floor, votes, now
+        self._patience = patience
+        self.claims: dict[int, list[Claim]] = {}
+        """By bit of the RC, the first owed first; of an exclusive RC only the first."""
+        self.bits = 0
+        """RCs with claims."""
+        self._free: dict[int, Ns] = {}
+        """By bit: when those owed before are done with the RC."""
+        floor.waits.ripen(now - patience // 2, floor.queued)
+        for _, _, arc in floor.waits.owed[:MAX_OWED]:
+            self._reserve(floor.queued[arc])
+
+    def _reserve(self, arc: Arc) -> None:
+        if arc.mask & ~self._floor.present:
+            return
+        start = max(self._free_from(rc, arc) for rc in arc.rcs)
+        if math.isinf(start):
+            return
+        claim = Claim(arc, max(int(start), self.due(arc)))
+        for rc in arc.rcs:
+            claims = self.claims.setdefault(rc.bit, [])
+            if rc.sharable or not claims:
+                claims.append(claim)
+            self._free[rc.bit] = max(self._free.get(rc.bit, 0), claim.start + arc.request.min_runtime)
+        self.bits |= arc.mask
+
+    def _free_from(self, rc: Rc, arc: Arc) -> float:
+        """When `rc` has room for `arc` at the latest; infinite where nobody can tell."""
+        firm = [holder for holder in rc.holders.values() if not holder.yields_to(arc, self._now)]
+        if rc.sharable:
+            sharing = (claim.creditor.id for claim in self.claims.get(rc.bit, ()))
+            if self._accepts(rc, frozenset((*(holder.id for holder in firm), *sharing, arc.id))):
+                return self._now
+            alone = self._votes.known(rc.name, frozenset((arc.id,)))
+            if self._votes.silent(rc.name) or (alone is not None and not alone.accept):
+                return math.inf
+        start: float = self._free.get(rc.bit, self._now)
+        for holder in firm:
+            start = max(start, _end(holder, arc))
+        return start
+
+    def due(self, arc: Arc) -> Ns:
+        """When its patience is over."""
+        return arc.since + self._patience
+
+    def first(self, arc: Arc) -> bool:
+        """Whether `arc` goes before those of its equals that could start as well. Of exclusive RCs, nobody is
+        left who could take any; but of several that a sharable RC accepts beside `arc`, each by itself, it
+        may not accept all."""
+        return arc.owed and bool(arc.mask & self._floor.sharable) and self.due(arc) <= self._now
+
+    def bar(self, arc: Arc) -> Bar | None:
+        """What `arc` would be in the way of if it started now."""
+        if not arc.mask & self.bits:
+            return None
+        done = self._now + arc.request.min_runtime
+        for rc in self._floor.of(arc.mask & self.bits):
+            before: list[Arc] = []
+            bars: Claim | None = None
+            for claim in self.claims[rc.bit]:
+                if claim.creditor is arc:
+                    break
+                before.append(claim.creditor)
+                if bars is None and arc.priority <= claim.creditor.priority and done > claim.start:
+                    bars = claim
+            if bars is None:
+                continue
+            if not rc.sharable:
+                return Bar(rc, bars.creditor)
+            together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
+            if not self._accepts(rc, together):
+                known = self._votes.known(rc.name, together)
+                asked = known is None and not self._votes.silent(rc.name)
+                return Bar(rc, bars.creditor, together if asked else None)
+        return None
+
+    def changed(self, earlier: Reservations) -> int:
+        """Bits of the RCs at which other claims stand now than then."""
+        bits = 0
+        for bit in self.claims.keys() | earlier.claims.keys():
+            if self.claims.get(bit) != earlier.claims.get(bit):
+                bits |= bit
+        return bits
+
+    def _accepts(self, rc: Rc, holders: HolderSet) -> bool:
+        answer = self._votes.known(rc.name, holders)
+        return answer is not None and answer.accept
+
+
+def _end(holder: Arc, arc: Arc) -> float:
+    """When a holder is gone, or yields. What a higher priority keeps has no end that is known."""
+    if holder.hold is None or (holder.request.keep and holder.priority > arc.priority):
+        return math.inf
+    return holder.hold.end
