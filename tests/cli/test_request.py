@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import io
+import re
 import signal
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -12,6 +16,11 @@ import pytest
 from tests.cli.fleet import CliFleet, fleet_of
 from tests.cli.tools import end, events, gone, out_of, read_until
 from tests.live.lab import START
+from zscout import clock
+from zscout.behaviors.client import QUERY_TIMEOUT, Client
+from zscout.cli.waiting import REFRESH, Report
+from zscout.messages import RcmState
+from zscout.scheduling.model import SECOND, Ns
 
 pytestmark = pytest.mark.live
 
@@ -58,12 +67,64 @@ def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> 
     blocker = fleet.holder("blocker", "robot/a")
     waiting = fleet.start("request", "robot/a", "--name", "next", "--min-runtime", "0.1")
     (line,) = read_until(waiting, "next waits")
-    assert "held by blocker, priority 0" in line
-    assert "robot/a: blocker (priority 0, " in line
+    assert re.search(
+        r"\(held by blocker, priority 0\); starts in (\d\d s|1 min); robot/a: blocker \(priority 0, ", line
+    )
     assert line.endswith(" left")
     end(blocker)
     read_until(waiting, "next holds robot/a")
     assert waiting.wait(START) == 0
+
+
+def test_a_start_that_nobody_can_foretell_is_said_to_be_so(fleet: CliFleet) -> None:
+    never = ("request", "robot/nowhere", "--name", "never", "--timeout", "1")
+    line, _ = out_of(fleet.start(*never)).read().splitlines()
+    assert line == "never waits: robot/nowhere not on the mesh; no start can be foretold"
+    waits, _ = events(fleet.zscout(*never, "--json").stdout)
+    assert (waits["event"], waits["starts_in"]) == ("waits", None)
+
+
+class Noting(Client):
+    """A client that notes when it asked for the state, and what start was foretold."""
+
+    looks: list[tuple[Ns, float | None]]
+
+    async def state(
+        self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT
+    ) -> RcmState | None:
+        begin = clock.now()
+        state = await super().state(arc, forecast=forecast, timeout=timeout)
+        assert state is not None
+        self.looks.append((begin, state.queue[0].starts_in))
+        return state
+
+
+def test_an_estimate_that_ticks_down_prints_nothing_and_is_asked_for_once_a_second(fleet: CliFleet) -> None:
+    blocker = fleet.holder("blocker", "robot/a")
+    out = io.StringIO()
+
+    async def wait_in_a_crowd_of_news() -> list[tuple[Ns, float | None]]:
+        async with await Noting.connect("noting", fleet=fleet.lab.fleet, host="test") as client:
+            client.looks = []
+            with Report("next", str(client.mesh.me), as_json=False, stream=out) as report:
+                client.watch(report.news)
+                arc = await client.request("next", {"robot/a": {}})
+                telling = asyncio.ensure_future(report.follow_wait(client))
+                while len(client.looks) < 3:
+                    report.news(arc)
+                    await asyncio.sleep(0.01)
+                telling.cancel()
+            return client.looks
+
+    looks = asyncio.run(wait_in_a_crowd_of_news())
+    for (earlier, more), (later, less) in pairwise(looks):
+        assert later - earlier >= REFRESH * SECOND
+        assert more is not None
+        assert less is not None
+        assert less < more
+    (line,) = out.getvalue().splitlines()
+    assert "; starts in " in line
+    end(blocker)
 
 
 def test_a_command_is_ended_when_its_grant_is_taken(fleet: CliFleet) -> None:
@@ -161,6 +222,7 @@ def test_a_timeout_ends_the_wait(fleet: CliFleet) -> None:
     assert done.returncode == 1
     waits, ended = events(done.stdout)
     assert waits["needs"][0]["holders"][0]["arc"] == "blocker"
+    assert 50 < waits["starts_in"] <= waits["needs"][0]["holders"][0]["remaining"]
     assert (ended["event"], ended["outcome"]) == ("ended", "timeout")
     assert done.stderr.count("\n") == 1
     assert "late was not granted within 0.4 s" in done.stderr
@@ -189,7 +251,7 @@ def test_refusals_by_the_rcm_are_one_line(fleet: CliFleet) -> None:
 def test_the_live_line_shows_and_ctrl_c_ends_the_wait(fleet: CliFleet) -> None:
     blocker = fleet.holder("blocker", "robot/a")
     with fleet.terminal("request", "robot/a", "--name", "seen") as terminal:
-        terminal.until("seen waits ")
+        assert re.search(r"seen waits \d\.\d s, starts in (\d\d s|1 min): needs ", terminal.until(": needs "))
         terminal.until("robot/a: blocker (priority 0, ")
         terminal.until("seen waits ")  # drawn anew
         terminal.press("\x03")

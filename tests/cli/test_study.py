@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import multiprocessing
+import os
+import random
 import re
 import signal
 import subprocess
 import time
+from contextlib import aclosing, suppress
 from pathlib import Path
 
 import psutil
@@ -16,8 +21,9 @@ from rerun.chunk import RrdReader
 from tests.cli.tools import COMMAND, PATIENCE, Terminal, zscout, zscout_here
 from zscout.cli.common import Failed
 from zscout.cli.study import MAX_SEED, parse_seeds
+from zscout.cli.study_pool import spread
 from zscout.scheduling.study.families import FAMILIES
-from zscout.scheduling.study.trial import STRATEGIES
+from zscout.scheduling.study.trial import STRATEGIES, Job
 from zscout.strict import BadInput
 
 LONG = ("study", "--family", "load65", "--seeds", "200", "--jobs", "2")
@@ -96,9 +102,13 @@ def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
     pytest.fail("no processes came up")
 
 
-def study() -> subprocess.Popen[str]:
+def study(*options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [*COMMAND, *LONG], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        [*COMMAND, *LONG, *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
 
 
@@ -111,6 +121,38 @@ def test_a_signal_ends_all_of_it_without_a_word(number: signal.Signals) -> None:
         assert (process.returncode, out, err) == (128 + number, "", "")
         _, alive = psutil.wait_procs(children, timeout=PATIENCE)
         assert alive == []
+
+
+def session_is_empty(session: int) -> bool:
+    """True as soon as no process of a session runs (a zombie does not), False if that takes too long."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        running = []
+        for process in psutil.process_iter():
+            with suppress(psutil.NoSuchProcess, ProcessLookupError):
+                if os.getsid(process.pid) == session and process.status() != psutil.STATUS_ZOMBIE:
+                    running.append(process)
+        if not running:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_interrupted_at_any_time_it_ends_and_leaves_nothing(seed: int) -> None:
+    """Its results are bigger than a pipe: a process may be killed in the middle of one."""
+    chance = random.Random(seed)  # noqa: S311
+    number = chance.choice([signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+    with study("--strategy", "priority") as process:
+        while not psutil.Process(process.pid).children():
+            assert process.poll() is None
+            time.sleep(0.005)
+        time.sleep(chance.uniform(0, 2))
+        # As from a terminal: all its processes get it.
+        os.killpg(process.pid, number)
+        out, err = process.communicate(timeout=PATIENCE)
+        assert (process.returncode, out, err) == (128 + number, "", "")
+        assert session_is_empty(process.pid)
 
 
 def test_killed_it_leaves_nothing_either() -> None:
@@ -131,6 +173,26 @@ def test_a_process_that_dies_is_one_line() -> None:
             err
             == "zscout: a process of the study died, perhaps for want of memory; use fewer with --jobs 1\n"
         )
+
+
+def test_processes_that_can_not_start_are_one_line() -> None:
+    few = ("sh", "-c", 'ulimit -n 40; exec "$@"', "sh")
+    done = subprocess.run(
+        [*few, *COMMAND, *LONG, "--jobs", "200"], capture_output=True, text=True, timeout=PATIENCE
+    )
+    assert (done.returncode, done.stdout) == (Failed.exit_code, "")
+    line = "zscout: a process can't be started (Too many open files); use fewer with --jobs 1\n"
+    assert done.stderr == line
+
+
+def test_a_bug_in_a_trial_is_shown_and_leaves_nothing() -> None:
+    async def trials() -> list[Job]:
+        async with aclosing(spread([Job("paper", 1, "priority"), Job("paper", 1, "luck")], 2)) as found:
+            return [trial.job async for trial in found]
+
+    with pytest.raises(RuntimeError, match=r"strategy='luck'.* failed:\nTraceback[^$]*KeyError: 'luck'"):
+        asyncio.run(trials())
+    assert multiprocessing.active_children() == []
 
 
 def test_the_recording_has_curves_and_bars_of_every_strategy(tmp_path: Path) -> None:

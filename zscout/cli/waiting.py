@@ -14,13 +14,13 @@ from zscout.behaviors.client import Client
 from zscout.behaviors.request import OpenArc
 from zscout.cli.common import at_terminal, clean, console, print_json, print_line, span
 from zscout.messages import HoldView, RcmState
-from zscout.scheduling.model import SECOND
+from zscout.scheduling.model import SECOND, Ns
 
 if TYPE_CHECKING:
     from rich.live import Live
 
 REFRESH = 1.0
-"""Seconds between two looks at who holds what, where somebody watches."""
+"""Seconds between two looks at who holds what: at least, and where somebody watches at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +86,7 @@ class Report:
         self._watched = not as_json and at_terminal(stream)
         self._live: Live | None = None
         self._said: object = None
+        self._looked: Ns | None = None
         self._changed = asyncio.Event()
         self._arc: OpenArc | None = None
         self.ending = Ending()
@@ -149,37 +150,62 @@ class Report:
     async def follow_wait(self, client: Client) -> None:
         """Tells how the request waits, until cancelled."""
         while True:
+            await self._look_is_due()
             self._changed.clear()
             arc = self._arc
             if arc is None:
                 self.show(f"{self._name}: asking the RCM")
             elif arc.state in ("asking", "queued") and arc.reason:
-                state = await client.state() if arc.state == "queued" else None
+                state = None
+                if arc.state == "queued":
+                    self._looked = clock.now()
+                    state = await client.state(forecast=True)
                 if arc.state in ("asking", "queued"):
                     self._tell_wait(arc, state)
             await self._news_or_a_second()
 
+    async def _look_is_due(self) -> None:
+        """One look at the queue per REFRESH: each has the RCM foretell anew, and news may come in a crowd."""
+        while self._looked is not None and self._arc is not None and self._arc.state == "queued":
+            left = REFRESH - (clock.now() - self._looked) / SECOND
+            if left <= 0:
+                return
+            await asyncio.sleep(left)
+
     def _tell_wait(self, arc: OpenArc, state: RcmState | None) -> None:
         needs = needs_seen(state, arc.needs, arc.id) if state is not None else []
+        told, starts_in = self._estimate(arc, state)
+        start = ""
+        if told:
+            start = "no start can be foretold" if starts_in is None else f"starts in {span(starts_in)}"
         # A sharable RC has holders who are in nobody's way, unless the reason names it.
         in_way = [need for need in needs if need.holds and (not need.sharable or need.rc in arc.reason)]
         ahead = f", {arc.ahead} ahead" if arc.ahead else ""
         self.show(
-            f"{arc.name} waits {span(_since(arc))}{ahead}: {arc.reason}",
+            f"{arc.name} waits {span(_since(arc))}{ahead}{start and f', {start}'}: {arc.reason}",
             *(f"  {need.text()}" for need in in_way),
         )
+        # Without the estimate: it changes all the time.
         now = (arc.state, arc.reason, arc.ahead)
         if self._watched or self._said == now:
             return
         self._said = now
-        who = "".join(f"; {need.text()}" for need in in_way)
+        more = "".join(f"; {text}" for text in (start, *(need.text() for need in in_way)) if text)
         details = {
             "id": arc.id,
             "reason": arc.reason,
             "ahead": arc.ahead,
+            "starts_in": starts_in,
             "needs": [need.as_json() for need in needs],
         }
-        self.event("waits", f"{arc.name} waits{ahead}: {arc.reason}{who}", details)
+        self.event("waits", f"{arc.name} waits{ahead}: {arc.reason}{more}", details)
+
+    def _estimate(self, arc: OpenArc, state: RcmState | None) -> tuple[bool, float | None]:
+        """Whether the RCM told how `arc` waits; in how many seconds it will start, if that is foretold."""
+        for view in state.queue if state is not None else []:
+            if (view.client, view.id) == (self._client, arc.id):
+                return True, None if view.starts_in is None else round(view.starts_in, 3)
+        return False, None
 
     async def follow_hold(self, arc: OpenArc) -> None:
         """Shows how long a hold without a command goes on, until cancelled."""
