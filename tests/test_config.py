@@ -16,6 +16,7 @@ import pytest
 
 from zscout import config, strict
 from zscout.scheduling.model import SECOND
+from zscout.scheduling.policy import Policy
 from zscout.strict import BadInput, Where
 
 NAME_RULE = 'write 1 to 64 letters A to Z, digits, "_", "." or "-"'
@@ -39,7 +40,8 @@ BAD_FLEETS = {
     "[flet]": "flet: unknown key; did you mean fleet?",
     "[fleet]\ncandiates = []": "fleet.candiates: unknown key; did you mean candidates?",
     "[limits]\nmax_needed = 1": "limits.max_needed: unknown key; did you mean max_needs or max_queued?",
-    "[fleet]\nzzz = 1": "fleet.zzz: unknown key; known here: candidates, name, operator_priority, strategy",
+    "[fleet]\nzzz = 1": "fleet.zzz: unknown key; known here: candidates, name, operator_priority, "
+    "patience, preempt, promise, strategy",
     '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: fleet, limits, mesh, timing',
     'fleet = "lab"': 'fleet: is the text "lab"; write a table, under [fleet]',
     "[[fleet]]": "fleet: is a list; write a table, under [fleet]",
@@ -57,6 +59,20 @@ BAD_FLEETS = {
     f"[fleet]\ncandidates = {['a'] * 1001}": "fleet.candidates: has 1,001 entries; at most 1,000 are allowed",
     '[fleet]\nstrategy = "fifo"': (
         'fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"'
+    ),
+    '[fleet]\npreempt = "never"': 'fleet.preempt: is the text "never"; write "after_min_runtime" or "always"',
+    "[fleet]\npatience = -1": "fleet.patience: is -1 s; write 0 to 31622400 seconds",
+    "[fleet]\npatience = nan": "fleet.patience: is NaN s; write 0 to 31622400 seconds",
+    '[fleet]\npromise = "all"\npatience = 0': (
+        'fleet.promise: is "all", but only "adaptive" with some patience promises anything; '
+        'write strategy = "adaptive" and a patience above 0, or promise = "equals"'
+    ),
+    '[fleet]\npromise = "all"\nstrategy = "optimal"': (
+        'fleet.promise: is "all", but only "adaptive" with some patience promises anything; '
+        'write strategy = "adaptive" and a patience above 0, or promise = "equals"'
+    ),
+    "[limits]\nmax_running_per_host = -1": (
+        "limits.max_running_per_host: is -1; write a whole number from 0 to 100000"
     ),
     "[fleet]\noperator_priority = -1": (
         "fleet.operator_priority: is -1; write a whole number from 0 to 1000000000"
@@ -229,9 +245,10 @@ def test_an_empty_fleet_file_means_the_defaults() -> None:
     assert (made.name, made.candidates, made.strategy, made.operator_priority) == (
         "zscout",
         (),
-        "priority",
+        "adaptive",
         10,
     )
+    assert made.policy == Policy()
     assert made.mesh == config.Mesh(
         listen=(),
         connect=(),
@@ -250,8 +267,11 @@ def test_every_key_of_a_fleet_file() -> None:
         [fleet]
         name = "lab"
         candidates = ["anvil", "bench"]
-        strategy = "priority"
+        strategy = "adaptive"
         operator_priority = 7
+        preempt = "after_min_runtime"
+        patience = 2.5
+        promise = "all"
         [mesh]
         listen = ["tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"]
         connect = ["quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"]
@@ -264,6 +284,7 @@ def test_every_key_of_a_fleet_file() -> None:
         max_needs = 2
         max_requests_per_client = 3
         max_payload = 4096
+        max_running_per_host = 5
         [timing]
         heartbeat = 0.1
         hold_lease = 5
@@ -274,8 +295,8 @@ def test_every_key_of_a_fleet_file() -> None:
     assert made == config.Fleet(
         name="lab",
         candidates=("anvil", "bench"),
-        strategy="priority",
-        operator_priority=7,
+        strategy="adaptive",
+        policy=Policy("after_min_runtime", 7, 5 * SECOND // 2, "all", 5),
         mesh=config.Mesh(
             listen=("tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"),
             connect=("quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"),
@@ -284,7 +305,7 @@ def test_every_key_of_a_fleet_file() -> None:
             interface="eth0,wlan0",
             lease=2.0,
         ),
-        limits=config.Limits(1, 2, 3, 4096),
+        limits=config.Limits(1, 2, 3, 4096, 5),
         timing=config.Timing(SECOND // 10, 5 * SECOND, 3 * SECOND // 10, 5 * SECOND // 4),
     )
     assert isinstance(made.mesh.lease, float)

@@ -20,6 +20,7 @@ from msgspec import Meta, Struct, structs
 from zscout.endpoints import check_links, check_multicast, ip_of
 from zscout.keyexpr import valid_name
 from zscout.scheduling.model import SECOND, Ns
+from zscout.scheduling.policy import OPERATOR_PRIORITY, PATIENCE, Policy, Preempt, Promise
 from zscout.scheduling.strategies import StrategyName
 from zscout.strict import (
     BadInput,
@@ -74,6 +75,8 @@ class Limits(Struct, frozen=True, forbid_unknown_fields=True):
     """ARCs of one client, waiting or running."""
     max_payload: Annotated[int, Meta(ge=1_024, le=16_777_216)] = 65_536
     """Bytes in one message."""
+    max_running_per_host: Annotated[int, Meta(ge=0, le=100_000)] = 0
+    """ARCs of all clients of one host that may run at one time; an operator's do not count. 0: any number."""
 
 
 class Timing(Struct, frozen=True):
@@ -96,11 +99,15 @@ class Fleet(Struct, frozen=True):
     candidates: tuple[str, ...]
     """Hosts whose nodes may lead, best first; empty: every node, by name."""
     strategy: StrategyName
-    operator_priority: int
-    """ARCs of this priority and above are an operator's."""
+    policy: Policy
     mesh: Mesh
     limits: Limits
     timing: Timing
+
+    @property
+    def operator_priority(self) -> int:
+        """ARCs of this priority and above are an operator's."""
+        return self.policy.operator_priority
 
 
 class RcSpec(Struct, frozen=True):
@@ -146,8 +153,11 @@ class Node(Struct, frozen=True):
 class _FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     name: str = DEFAULT_FLEET_NAME
     candidates: Annotated[tuple[str, ...], Meta(max_length=MAX_CANDIDATES)] = ()
-    strategy: StrategyName = "priority"
-    operator_priority: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 10
+    strategy: StrategyName = "adaptive"
+    operator_priority: Annotated[int, Meta(ge=0, le=1_000_000_000)] = OPERATOR_PRIORITY
+    preempt: Preempt = "always"
+    patience: Decimal = Decimal(PATIENCE) / SECOND
+    promise: Promise = "equals"
 
 
 class _TimingTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -248,10 +258,27 @@ def _fleet(file: _FleetFile, top: Where) -> Fleet:
         name=table.name,
         candidates=table.candidates,
         strategy=table.strategy,
-        operator_priority=table.operator_priority,
+        policy=_policy(table, file.limits, at),
         mesh=mesh,
         limits=file.limits,
         timing=_timing(file.timing, mesh.lease, top / "timing"),
+    )
+
+
+def _policy(table: _FleetTable, limits: Limits, at: Where) -> Policy:
+    year = Decimal(366 * 24 * 3600)
+    patience = seconds_to_ns(table.patience, at / "patience", high=year)
+    if table.promise != "equals" and (table.strategy != "adaptive" or not patience):
+        raise (at / "promise").bad(
+            f'is "{table.promise}", but only "adaptive" with some patience promises anything',
+            'write strategy = "adaptive" and a patience above 0, or promise = "equals"',
+        )
+    return Policy(
+        preempt=table.preempt,
+        operator_priority=table.operator_priority,
+        patience=patience or None,
+        promise=table.promise,
+        max_running_per_host=limits.max_running_per_host or None,
     )
 
 

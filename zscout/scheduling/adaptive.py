@@ -27,7 +27,7 @@ from zscout.scheduling.model import ArcId, Ns, RcName
 from zscout.scheduling.packing import Item, Problem, numbers, pack
 from zscout.scheduling.parts import Part, parts_in_play
 from zscout.scheduling.priority import Actions
-from zscout.scheduling.reservations import PATIENCE, Reservations
+from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.votes import HolderSet, Votes
 
 WORK: Final = 20_000
@@ -126,9 +126,7 @@ class _Search:
 class Adaptive:
     """One run of the strategy. It keeps unfinished searches, so each core has its own."""
 
-    def __init__(self, patience: Ns | None = PATIENCE) -> None:
-        """`patience`: time in ns after which nobody passes an ARC that waits; None: whoever may."""
-        self.patience = patience
+    def __init__(self) -> None:
         self.statistics = Statistics()
         self._reserved: Reservations | None = None
         self._searches: dict[ArcId, _Search] = {}
@@ -139,10 +137,6 @@ class Adaptive:
         self._unfinished: list[_Search] = []
         self._seen: tuple[int, ...] = ()
         """The situation in which they are unfinished."""
-
-    def afresh(self) -> Adaptive:
-        """Another run with the same settings."""
-        return Adaptive(self.patience)
 
     def __call__(self, floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
         """One pass at `now`."""
@@ -163,10 +157,11 @@ class Adaptive:
     def _reserve(self, floor: Floor, votes: Votes, now: Ns) -> Reservations | None:
         """What is kept for the owed in this pass; those who were held back by what is kept no more are
         looked at again."""
-        if self.patience is None:
+        patience = floor.policy.patience
+        if patience is None:
             return None
         before = self._reserved
-        reserved = self._reserved = Reservations(floor, votes, now, self.patience)
+        reserved = self._reserved = Reservations(floor, votes, now, patience)
         if before is not None:
             floor.waits.freed |= reserved.changed(before)
         return reserved
@@ -306,9 +301,9 @@ def _wish(earlier: list[_Search], arcs: list[ArcId]) -> int:
 
 
 def _pairs(part: Part, chosen: int) -> dict[int, int]:
-    pairs = dict.fromkeys(part.priorities, 0)
+    pairs = dict.fromkeys(sorted({arc.priority for arc in part.arcs}, reverse=True), 0)
     for number in numbers(chosen):
         item = part.items[number]
         if not item.spent:
-            pairs[part.priorities[item.level]] += item.width
+            pairs[part.arcs[number].priority] += item.width
     return pairs

@@ -57,6 +57,7 @@ from zscout.scheduling.model import (
     Request,
     Term,
 )
+from zscout.scheduling.policy import DEFAULT, Policy
 from zscout.scheduling.priority import Strategy
 from zscout.scheduling.votes import HolderSet, Votes
 
@@ -64,9 +65,9 @@ from zscout.scheduling.votes import HolderSet, Votes
 class Core:
     """All scheduling state of one fleet, and the rules by which it changes."""
 
-    def __init__(self, strategy: Strategy = priority.run_pass) -> None:
-        self.strategy = strategy
-        self.floor = Floor()
+    def __init__(self, strategy: Strategy = priority.run_pass, policy: Policy = DEFAULT) -> None:
+        self.strategy, self.policy = strategy, policy
+        self.floor = Floor(policy)
         self.votes = Votes()
         self.term: Term = NO_TERM
         self.seq = 0
@@ -165,7 +166,8 @@ class Core:
             place = Place(self.term, self._arrivals)
         elif place.term == self.term:
             self._arrivals = max(self._arrivals, place.arrival)
-        return Arc(request, place, self.floor.mask(iter(request.needs)))
+        band = self.policy.band(request.priority)
+        return Arc(request, place, self.floor.mask(iter(request.needs)), band=band)
 
     def _give_up(self, arc_id: ArcId, outcome: Outcome, reason: str) -> None:
         arc = self.floor.arc(arc_id)
@@ -207,7 +209,7 @@ class Core:
             if self.floor.arc(held.request.arc) is not None:
                 continue
             arc = self._new_arc(held.request, held.place)
-            hold = Hold(held.grant, held.start, held.end)
+            hold = Hold(held.grant, held.start, held.end, self.policy.shield(due=False))
             absent = [rc.name for rc in self.floor.of(arc.mask & ~self.floor.present)]
             taken = [rc.name for rc in self.floor.of(arc.mask & self.floor.busy)]
             over = held.end <= self._now
@@ -238,7 +240,10 @@ class Core:
 
     def start(self, arc: Arc) -> None:
         grant = self._next_grant()
-        hold = Hold(grant, self._now, self._now + arc.request.min_runtime)
+        patience = self.policy.patience
+        due = arc.owed and patience is not None and self._now - arc.since >= patience
+        shield = self.policy.shield(due=due)
+        hold = Hold(grant, self._now, self._now + arc.request.min_runtime, shield)
         self._take(arc, hold)
         self._effects.append(self._granted(arc, hold))
 

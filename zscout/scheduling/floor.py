@@ -5,17 +5,20 @@ Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
 from zscout.scheduling.model import Arc, ArcId, ClientId, Hold, Ns, Rc, RcName
+from zscout.scheduling.policy import DEFAULT, Policy, owner_of
 from zscout.scheduling.waits import Waits
 
 
 class Floor:
     """The RCs, the ARCs and the holds between them. Every change goes through its methods."""
 
-    def __init__(self) -> None:
+    def __init__(self, policy: Policy = DEFAULT) -> None:
+        self.policy = policy
         self.rcs: dict[RcName, Rc] = {}
         self.queued: dict[ArcId, Arc] = {}
         self.running: dict[ArcId, Arc] = {}
@@ -26,6 +29,8 @@ class Floor:
         self.busy = 0
         """Bits of the exclusive RCs that somebody holds."""
         self.waits = Waits()
+        self.owners: Counter[str] = Counter()
+        """How many ARCs of each owner run."""
         self._by_bit: list[Rc] = []
         self._clients: dict[ClientId, dict[ArcId, Arc]] = {}
         self.turns = 0
@@ -99,7 +104,9 @@ class Floor:
     def hand_over(self, arc: Arc, to: ClientId) -> None:
         """A running ARC goes on under another client."""
         self.forget(arc)
+        self._count_out(arc)
         arc.request = replace(arc.request, client=to)
+        self.owners[owner_of(to)] += 1
         self._clients.setdefault(to, {})[arc.id] = arc
 
     def start(self, arc: Arc, hold: Hold, now: Ns) -> None:
@@ -107,6 +114,7 @@ class Floor:
         arc.hold, arc.reason, arc.since, arc.turn = hold, "", now, self._turn()
         self.running[arc.id] = arc
         self.waits.stirred |= arc.mask
+        self.owners[owner_of(arc.request.client)] += 1
         for rc in arc.rcs:
             rc.holders[arc.id] = arc
         self.busy |= arc.mask & ~self.sharable
@@ -116,6 +124,7 @@ class Floor:
         hold = arc.hold
         assert hold is not None, arc.id  # noqa: S101
         del self.running[arc.id]
+        self._count_out(arc)
         arc.hold = None
         for rc in arc.rcs:
             del rc.holders[arc.id]
@@ -126,6 +135,19 @@ class Floor:
     def overstayed(self, arc: Arc) -> None:
         """A kept hold has had its minimum runtime: from now on it yields to its equals."""
         self.waits.freed |= arc.mask
+
+    def room(self, arc: Arc) -> int | None:
+        """How many more ARCs of its owner may run, if `arc` is bound by a quota."""
+        quota = self.policy.max_running_per_host
+        if quota is None or self.policy.operator(arc.priority):
+            return None
+        return max(0, quota - self.owners[owner_of(arc.request.client)])
+
+    def _count_out(self, arc: Arc) -> None:
+        owner = owner_of(arc.request.client)
+        self.owners[owner] -= 1
+        if not self.owners[owner]:
+            del self.owners[owner]
 
     def _turn(self) -> int:
         self.turns += 1
@@ -149,6 +171,8 @@ class Floor:
             if not rc.sharable:
                 check(len(rc.holders) <= 1, f"{rc.name} has two holders: {sorted(rc.holders)}")
                 busy |= rc.bit if rc.holders else 0
+        counted = Counter(owner_of(arc.request.client) for arc in self.running.values())
+        check(counted == self.owners, "the owners' ARCs are miscounted")
         check(busy == self.busy, "the mask of busy RCs is wrong")
         for breach in self.waits.validate(self.queued):
             check(False, breach)

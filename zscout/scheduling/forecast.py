@@ -39,7 +39,7 @@ class _Player:
     def __init__(self, core: Core, now: Ns) -> None:
         self.real, self.now = core, now
         # It keeps unfinished searches: the forecast must not meddle with them.
-        self.core = Core(core.strategy.afresh() if isinstance(core.strategy, Adaptive) else core.strategy)
+        self.core = Core(Adaptive() if isinstance(core.strategy, Adaptive) else core.strategy, core.policy)
         self.result = Forecast()
         self.ends: dict[ArcId, Ns] = {}
 

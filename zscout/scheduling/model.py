@@ -88,6 +88,8 @@ class Hold:
     grant: Grant
     start: Ns
     end: Ns
+    shield: int | None = None
+    """Below this priority nobody takes it before `end`; None: any higher priority does."""
 
 
 @dataclass(slots=True, eq=False)
@@ -122,6 +124,8 @@ class Arc:
     """Where a firm obstacle lay under what was off limits at that visit, as bits."""
     asked: bool = False
     """Whether that visit waits for votes of its own."""
+    band: int = 0
+    """Which priorities it waits its turn with (`Policy.band`)."""
     owed: bool = False
     """Whether it has waited longer than the fleet's patience (`reservations.py`)."""
 
@@ -139,9 +143,17 @@ class Arc:
 
     def yields_to(self, other: Arc, now: Ns) -> bool:
         """Whether `other` may take what this running ARC holds."""
-        if self.priority != other.priority:
-            return self.priority < other.priority
-        return self.overstays(now)
+        return self.yields_at(other.priority, now)
+
+    def yields_at(self, priority: int, now: Ns) -> bool:
+        """Whether any ARC of this priority may."""
+        if self.priority >= priority:
+            return self.priority == priority and self.overstays(now)
+        return not self.shielded(now) or (self.hold is not None and priority >= (self.hold.shield or 0))
+
+    def shielded(self, now: Ns) -> bool:
+        """Whether its hold is out of reach for some of those above it in priority."""
+        return self.hold is not None and self.hold.shield is not None and now < self.hold.end
 
 
 @dataclass(slots=True, eq=False)

@@ -8,11 +8,14 @@ with it, and the cost is that of the parts.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from operator import attrgetter
 
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, ArcId, Ns, Rc
 from zscout.scheduling.packing import Item, Problem
+from zscout.scheduling.policy import owner_of
 from zscout.scheduling.priority import Actions
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.votes import HolderSet, Votes
@@ -26,6 +29,10 @@ def parts_in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | 
 
 def in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None) -> list[Arc]:
     """Those who might start in this pass, and those who might have to end for them."""
+    rooms: Counter[str] = Counter()
+    """ARCs of each owner that might start."""
+    quota = floor.policy.max_running_per_host is not None
+    shields = any(arc.shielded(now) for arc in floor.running.values())
     yielded = 0
     """Sharable RCs at which one passes those who are owed: whether a second could as well was not asked."""
     levels: dict[int, list[Arc]] = {}
@@ -48,12 +55,12 @@ def in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None =
             above += 1
         here = firm
         for holder in holders[above:]:
-            if holder.request.priority < level:
+            if holder.priority < level and not shields:
                 break
-            if not holder.overstays(now):
+            if not holder.yields_at(level, now):
                 here |= holder.mask & exclusive
         shut = here & ~loose
-        for arc in levels[level]:
+        for arc in sorted(levels[level], key=attrgetter("rank")) if quota else levels[level]:
             if arc.mask & shut or _refused(floor, votes, now, arc, movable):
                 continue
             if reserved is not None and arc.mask & reserved.bits:
@@ -62,6 +69,12 @@ def in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None =
                     continue
                 if not arc.owed:
                     yielded |= shared
+            room = floor.room(arc)
+            if room is not None:
+                owner = owner_of(arc.request.client)
+                if rooms[owner] >= room:
+                    continue
+                rooms[owner] += 1
             found.append(arc)
             for rc in floor.of(arc.mask & (floor.busy | floor.sharable)):
                 for holder in rc.holders.values():
@@ -111,6 +124,19 @@ def apart(arcs: Iterable[Arc]) -> list[list[Arc]]:
     return list(groups.values())
 
 
+def _grade(arc: Arc, first: set[ArcId], now: Ns) -> tuple[int, int]:
+    """What sorts ARCs into levels, the best smallest: first their priority. A shielded hold counts for more,
+    as only those above its shield may end it. Where some are to go `first`, they go before their equals, but
+    not before those who run: equals are not displaced."""
+    if arc.hold is not None and arc.hold.shield is not None and arc.shielded(now):
+        return min(-arc.priority, 1 - arc.hold.shield), 0
+    if arc.hold is not None:
+        later = bool(first) and arc.overstays(now)
+    else:
+        later = bool(first) and arc.id not in first
+    return -arc.priority, 2 if later else 1
+
+
 class Part:
     """ARCs that are decided together, and what the RCs have said about them."""
 
@@ -118,23 +144,16 @@ class Part:
         self, floor: Floor, votes: Votes, now: Ns, arcs: list[Arc], reserved: Reservations | None = None
     ) -> None:
         self.floor, self.votes, self.now = floor, votes, now
-        # Who is due goes before its equals, but not before those who run: equals are not displaced.
-        later = set()
-        if reserved is not None and any(reserved.first(arc) for arc in arcs):
-            later = {
-                arc.id
-                for arc in arcs
-                if (arc.overstays(now) if arc.hold is not None else not reserved.first(arc))
-            }
-            arcs = sorted(arcs, key=lambda arc: (-arc.priority, arc.id in later, arc.rank))
-        self.arcs = arcs
+        first = {arc.id for arc in arcs if reserved is not None and reserved.first(arc)}
+        graded = sorted((_grade(arc, first, now), arc.rank, arc) for arc in arcs)
+        self.arcs = [arc for _, _, arc in graded]
         """Best first."""
         self.mask = 0
         """All that they need or hold."""
         for arc in arcs:
             self.mask |= arc.mask
-        grades = [(-arc.priority, arc.id in later) for arc in arcs]
-        levels = {grade: level for level, grade in enumerate(sorted(set(grades)))}
+        grades = [grade for grade, _, _ in graded]
+        levels = {grade: level for level, grade in enumerate(dict.fromkeys(grades))}
         exclusive = ~floor.sharable
         self.items = [
             Item(
@@ -144,11 +163,9 @@ class Part:
                 standing=arc.hold is not None,
                 spent=arc.overstays(now),
             )
-            for arc, grade in zip(arcs, grades, strict=True)
+            for arc, grade in zip(self.arcs, grades, strict=True)
         ]
-        self.priorities = [-priority for priority, _ in levels]
-        """By level."""
-        self._number = {arc.id: number for number, arc in enumerate(arcs)}
+        self._number = {arc.id: number for number, arc in enumerate(self.arcs)}
         self.sharables = list(floor.of(self.mask & floor.sharable))
         vetoes = {rc.name: set(self._vetoes(rc)) for rc in self.sharables}
         self.barred = set().union(*vetoes.values())

@@ -42,7 +42,7 @@ from typing import Protocol, TypeAlias
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, Ns, Rank, Rc
 from zscout.scheduling.reservations import Bar, Reservations
-from zscout.scheduling.visit import Admitted, Open, Refused, Visit, absence, listed
+from zscout.scheduling.visit import Admitted, Open, Refused, Visit, absence, listed, over_quota
 from zscout.scheduling.votes import HolderSet, Votes
 
 __all__ = ["UNSETTLED", "Actions", "Strategy", "Visit", "absence", "run_full_pass", "run_pass"]
@@ -152,6 +152,11 @@ class Pass:
     def _visit(self, arc: Arc) -> None:
         visit = Visit(self.floor, self.votes, self.now, arc)
         decision = visit.obstacle_outside(self.off_limits)
+        if decision is None and self.floor.room(arc) == 0:
+            # Whoever of its owner's ends, may let it go: no RC tells.
+            self.waits.reopen(arc)
+            self.actions.wait(arc, over_quota(self.floor, arc))
+            return
         bar = self.reserved.bar(arc) if decision is None and self.reserved is not None else None
         if bar is not None:
             self._hold_back(arc, bar)

@@ -11,6 +11,7 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked, WakeAt
 from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
 from zscout.scheduling.model import ArcId, Ns, RcName
+from zscout.scheduling.policy import DEFAULT, Policy
 from zscout.scheduling.priority import Strategy
 from zscout.scheduling.workload import Workload, excess
 
@@ -38,18 +39,21 @@ Watcher = Callable[[Ns, Core, list[Effect]], None]
 
 
 def replay(
-    workload: Workload, watch: Watcher | None = None, *, strategy: Strategy = priority.run_pass
+    workload: Workload,
+    watch: Watcher | None = None,
+    *,
+    strategy: Strategy = priority.run_pass,
+    policy: Policy = DEFAULT,
 ) -> Replay:
     """Runs the workload to its end. `watch` sees the core after each batch, for tests and recorders.
 
     What is kept past its minimum runtime ends when nothing else is left to come."""
-    return _Player(workload, watch, strategy).play()
+    return _Player(workload, watch, Core(strategy, policy)).play()
 
 
 class _Player:
-    def __init__(self, workload: Workload, watch: Watcher | None, strategy: Strategy) -> None:
-        self.workload, self.watch = workload, watch
-        self.core = Core(strategy)
+    def __init__(self, workload: Workload, watch: Watcher | None, core: Core) -> None:
+        self.workload, self.watch, self.core = workload, watch, core
         self.capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
         self.open: dict[ArcId, Granted] = {}
         self.holds: list[HoldRecord] = []

@@ -20,11 +20,10 @@ import math
 from typing import Final, NamedTuple
 
 from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import SECOND, Arc, Ns, Rc
+from zscout.scheduling.model import Arc, Ns, Rc
+from zscout.scheduling.policy import owner_of
 from zscout.scheduling.votes import HolderSet, Votes
 
-PATIENCE: Final[Ns] = 130 * SECOND
-"""Default, in ns. Measured: `docs/study.md`."""
 MAX_OWED: Final = 256
 """ARCs that are kept a place at one time; those owed after them follow as these start."""
 
@@ -52,6 +51,7 @@ class Reservations:
     """What is kept for whom at one instant: for those of `floor.waits.owed`."""
 
     def __init__(self, floor: Floor, votes: Votes, now: Ns, patience: Ns) -> None:
+        """`patience` in ns."""
         self._floor, self._votes, self._now = floor, votes, now
         self._patience = patience
         self.claims: dict[int, list[Claim]] = {}
@@ -67,7 +67,7 @@ class Reservations:
     def _reserve(self, arc: Arc) -> None:
         if arc.mask & ~self._floor.present:
             return
-        start = max(self._free_from(rc, arc) for rc in arc.rcs)
+        start = max(self._within_quota(arc), *(self._free_from(rc, arc) for rc in arc.rcs))
         if math.isinf(start):
             return
         claim = Claim(arc, max(int(start), self.due(arc)))
@@ -77,6 +77,14 @@ class Reservations:
                 claims.append(claim)
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), claim.start + arc.request.min_runtime)
         self.bits |= arc.mask
+
+    def _within_quota(self, arc: Arc) -> float:
+        """When its owner has room for `arc`."""
+        if self._floor.room(arc) != 0:
+            return self._now
+        owner = owner_of(arc.request.client)
+        own = (one for one in self._floor.running.values() if owner_of(one.request.client) == owner)
+        return min(math.inf if one.hold is None or one.request.keep else one.hold.end for one in own)
 
     def _free_from(self, rc: Rc, arc: Arc) -> float:
         """When `rc` has room for `arc` at the latest; infinite where nobody can tell."""
@@ -115,7 +123,7 @@ class Reservations:
                 if claim.creditor is arc:
                     break
                 before.append(claim.creditor)
-                if bars is None and arc.priority <= claim.creditor.priority and done > claim.start:
+                if bars is None and arc.band <= claim.creditor.band and done > claim.start:
                     bars = claim
             if bars is None:
                 continue

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, ArcId, Ns, Rc
+from zscout.scheduling.policy import owner_of
 from zscout.scheduling.votes import HolderSet, Votes
 
 SHOWN = 3
@@ -166,6 +167,12 @@ def absence(floor: Floor, arc: Arc) -> str:
     """Which RCs of `arc` are not there, in words; empty if all are."""
     absent = [rc.name for rc in arc.rcs if not rc.present]
     return f"{listed(absent)} not on the mesh" if absent else ""
+
+
+def over_quota(floor: Floor, arc: Arc) -> str:
+    """That its owner has no room for `arc`, in words."""
+    owner, quota = owner_of(arc.request.client), floor.policy.max_running_per_host
+    return f"host {owner} has {quota} ARCs running, its quota"
 
 
 def listed(names: list[str]) -> str:

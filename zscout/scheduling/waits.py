@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Mapping
+from operator import itemgetter
 
 from zscout.scheduling.model import Arc, ArcId, Ns, Rank, Rc
 
@@ -34,7 +35,7 @@ class Waits:
         self._patient: list[tuple[Ns, ArcId]] = []
         """Those who wait and are not owed yet, by the time since when they do."""
         self.owed: list[tuple[int, Ns, ArcId]] = []
-        """The others: by priority (negated), then by the same."""
+        """The others: by band of priorities (negated), then by the same."""
 
     def add(self, arc: Arc) -> None:
         """A newcomer, open."""
@@ -52,9 +53,9 @@ class Waits:
             del self._patient[bisect_left(self._patient, (arc.since, arc.id))]
         self._leave(arc)
 
-    def ripen(self, before: Ns, queued: Mapping[ArcId, Arc]) -> None:
-        """Who has waited since before then is owed from now on."""
-        ripe = bisect_left(self._patient, (before, ""))
+    def ripen(self, since: Ns, queued: Mapping[ArcId, Arc]) -> None:
+        """Who has waited since then or longer is owed from now on."""
+        ripe = bisect_right(self._patient, since, key=itemgetter(0))
         for _, arc_id in self._patient[:ripe]:
             arc = queued[arc_id]
             arc.owed = True
@@ -120,4 +121,4 @@ class Waits:
 
 
 def _claim(arc: Arc) -> tuple[int, Ns, ArcId]:
-    return -arc.priority, arc.since, arc.id
+    return -arc.band, arc.since, arc.id

@@ -53,7 +53,7 @@ class Rcm:
     def __init__(self, mesh: Mesh, fleet: Fleet, term: Term, on_newer: Callable[[Term], None]) -> None:
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self._on_newer = on_newer
-        self.core = Core(STRATEGIES[fleet.strategy]())
+        self.core = Core(STRATEGIES[fleet.strategy](), fleet.policy)
         self._gains = 0
         self.notices = Notices(mesh, self.core, term)
         self.presence = Presence(mesh, fleet, self)

@@ -1,0 +1,183 @@
+"""Bounded waiting: the promise of docs/scheduling.md, reckoned here from the workload and the holds alone."""
+
+from __future__ import annotations
+
+import random
+from fractions import Fraction
+
+import pytest
+
+from tests.scheduling.invariants import Ledger
+from zscout.scheduling.adaptive import Adaptive
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Effect
+from zscout.scheduling.events import Asked, LeadTaken, RcJoined, Tick, Waiting
+from zscout.scheduling.model import NO_TERM, SECOND, Ns, Params, Place, RcName, Request, Term
+from zscout.scheduling.policy import Policy
+from zscout.scheduling.replay import Replay, replay
+from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
+
+RUNS = 10_000
+PATIENCE = 6 * SECOND
+POLICY = Policy(patience=PATIENCE)
+RADIO = WorkloadRc("radio/rf", sharable=True, capacity={"rate": Fraction(10)})
+
+
+def workload(seed: int) -> Workload:
+    """A busy stream of one priority: ARCs of any width, some of all RCs there are, half the time a radio."""
+    draw = random.Random(seed)  # noqa: S311
+    robots = [f"robot/r{number}" for number in range(draw.randint(2, 5))]
+    radio = draw.random() < 0.5
+    arrivals, at = [], 0
+    for number in range(draw.randint(10, 30)):
+        width = len(robots) if draw.random() < 0.15 else draw.randint(1, min(3, len(robots)))
+        needs: dict[RcName, Params] = {rc: {} for rc in draw.sample(robots, width)}
+        if radio and draw.random() < 0.7:
+            needs[RADIO.name] = {"rate": Fraction(draw.randint(1, 9))}
+        runtime = draw.choice((draw.randint(1, 10), draw.randint(1, 60))) * SECOND // 10
+        request = Request(f"a{number}", "study/client", needs, 1, runtime)
+        arrivals.append(Arrival(at, request))
+        at += draw.randint(0, 2 * runtime * width // len(robots) // SECOND * SECOND // 2 + SECOND // 2)
+    rcs = (*map(WorkloadRc, robots), *((RADIO,) if radio else ()))
+    return Workload(rcs, tuple(arrivals))
+
+
+def check_bound(workload: Workload, played: Replay, patience: Ns) -> int:
+    """Raises AssertionError for an ARC that waited longer than promised; how many had to be patient."""
+    starts = {hold.arc: hold.start for hold in played.holds}
+    longest = max(arrival.request.min_runtime for arrival in workload.arrivals)
+    tried = 0
+    for arrival in workload.arrivals:
+        arc, since = arrival.request, arrival.at
+        waited = starts[arc.arc] - since
+        tried += waited > patience
+        # Who came before it, still waits when it begins to be owed, and is linked to it by RCs.
+        before = {
+            other.request.arc: other.request
+            for other in workload.arrivals
+            if other.at <= since and starts[other.request.arc] >= since + patience // 2 and other != arrival
+        }
+        linked: dict[str, Request] = {arc.arc: arc}
+        while found := [
+            one
+            for one in before.values()
+            if one.arc not in linked
+            and any(one.needs.keys() & other.needs.keys() for other in linked.values())
+        ]:
+            linked |= {one.arc: one for one in found}
+        ahead = sum(one.min_runtime for one in linked.values() if one is not arc)
+        bound = max(patience, patience // 2 + longest) + ahead
+        assert waited <= bound, f"{arc.arc} waited {waited / SECOND} s, promised are {bound / SECOND}"
+    return tried
+
+
+@pytest.mark.parametrize("part", range(20))
+def test_nobody_waits_longer_than_promised(part: int) -> None:
+    tried = 0
+    for seed in range(part * RUNS // 20, (part + 1) * RUNS // 20):
+        work = workload(seed)
+        played = replay(work, strategy=Adaptive(), policy=POLICY)
+        assert not played.unserved
+        tried += check_bound(work, played, PATIENCE)
+    assert tried > RUNS // 20, "hardly anybody had to wait for his patience: these runs prove nothing"
+
+
+def test_the_bound_is_one_that_priority_breaks() -> None:
+    broken = 0
+    for seed in range(300):
+        work = workload(seed)
+        try:
+            check_bound(work, replay(work), PATIENCE)
+        except AssertionError:
+            broken += 1
+    assert broken > 3
+
+
+def narrow_stream(robots: int, *, runtime: Ns, until: Ns) -> Workload:
+    """A wide ARC of all robots comes at 1 s into an endless stream of narrow ones that never leaves them all
+    free at one time."""
+    names = [f"robot/r{number}" for number in range(robots)]
+    arrivals = [Arrival(SECOND, Request("wide", "study/wide", {rc: {} for rc in names}, 1, 2 * runtime))]
+    for number, rc in enumerate(names):
+        at = number * runtime // robots
+        count = 0
+        while at < until:
+            arrivals.append(Arrival(at, Request(f"n{number}-{count}", "study/n", {rc: {}}, 1, runtime)))
+            at, count = at + runtime, count + 1
+    return Workload(tuple(map(WorkloadRc, names)), tuple(sorted(arrivals, key=lambda one: one.at)))
+
+
+def test_the_wide_one_gets_its_turn() -> None:
+    runtime, until = 3 * SECOND, 100 * SECOND
+    work = narrow_stream(6, runtime=runtime, until=until)
+
+    def start(played: Replay) -> Ns:
+        return next(hold.start for hold in played.holds if hold.arc == "wide")
+
+    assert start(replay(work)) >= until, "the stream should starve it under the letter of the paper"
+    assert start(replay(work, strategy=Adaptive(), policy=Policy(patience=None))) >= until
+    wide = start(replay(work, strategy=Adaptive(), policy=POLICY))
+    # It starts the moment it is due: the last of the stream were over by then.
+    assert wide == SECOND + PATIENCE
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_reservations_keep_every_other_promise(seed: int) -> None:
+    """Priorities, votes and preemption besides: never two holders, never half a gang, nobody in vain."""
+    draw = random.Random(seed)  # noqa: S311
+    work = workload(seed)
+    arrivals = tuple(
+        Arrival(
+            one.at,
+            Request(
+                one.request.arc,
+                one.request.client,
+                one.request.needs,
+                draw.randint(1, 3),
+                one.request.min_runtime,
+                keep=draw.random() < 0.1,
+            ),
+        )
+        for one in work.arrivals
+    )
+    ledger = Ledger(work.rcs, [one.request for one in arrivals])
+
+    def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
+        ledger.take(now, core, effects)
+
+    played = replay(Workload(work.rcs, arrivals), watch, strategy=Adaptive(), policy=POLICY)
+    assert not played.unserved
+
+
+TERM = Term(1, "rcm/a")
+
+
+def test_who_has_waited_under_another_rcm_goes_on_waiting_not_anew() -> None:
+    core = Core(Adaptive(), POLICY)
+    now = 100 * SECOND
+    wide = Request("wide", "h/c", {"robot/a": {}, "robot/b": {}}, 1, SECOND)
+    long = Request("long", "h/c", {"robot/a": {}}, 1, 10 * SECOND)
+    waiting = (Waiting(wide, Place(NO_TERM, 1), now - PATIENCE),)
+    core.handle(now, RcJoined("robot/b", sharable=False), LeadTaken(TERM, (), waiting))
+    # Nobody is kept a place that an absent RC leaves open for who knows how long.
+    core.handle(now, RcJoined("robot/a", sharable=False), Asked(long))
+    assert core.floor.running.keys() == {"wide"}
+    core.handle(now + SECOND, Tick())
+    assert core.floor.running.keys() == {"long"}
+
+
+def test_higher_priority_is_not_held_back() -> None:
+    core = Core(Adaptive(), POLICY)
+    core.handle(0, RcJoined("robot/a", sharable=False), RcJoined("robot/b", sharable=False))
+    wide = Request("wide", "h/c", {"robot/a": {}, "robot/b": {}}, 1, SECOND)
+    core.handle(0, Asked(Request("first", "h/c", {"robot/a": {}}, 1, 60 * SECOND)))
+    core.handle(0, Asked(wide))
+    now = 55 * SECOND
+    core.handle(now, Asked(Request("equal", "h/c", {"robot/b": {}}, 1, 10 * SECOND)))
+    core.handle(now, Asked(Request("lower", "h/c", {"robot/b": {}}, 0, 10 * SECOND)))
+    assert core.floor.running.keys() == {"first"}
+    assert core.reason(core.floor.queued["equal"]).startswith("robot/b is kept for wide")
+    core.handle(now, Asked(Request("short", "h/c", {"robot/b": {}}, 1, 5 * SECOND)))
+    assert core.floor.running.keys() == {"first", "short"}
+    core.handle(now, Asked(Request("higher", "h/c", {"robot/b": {}}, 2, 10 * SECOND)))
+    assert core.floor.running.keys() == {"first", "higher"}
