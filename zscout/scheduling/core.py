@@ -209,7 +209,7 @@ class Core:
             if self.floor.arc(held.request.arc) is not None:
                 continue
             arc = self._new_arc(held.request, held.place)
-            hold = Hold(held.grant, held.start, held.end, self.policy.shield(due=False))
+            hold = Hold(held.grant, held.start, held.end, self.policy.shield(owed=False))
             absent = [rc.name for rc in self.floor.of(arc.mask & ~self.floor.present)]
             taken = [rc.name for rc in self.floor.of(arc.mask & self.floor.busy)]
             over = held.end <= self._now
@@ -240,9 +240,7 @@ class Core:
 
     def start(self, arc: Arc) -> None:
         grant = self._next_grant()
-        patience = self.policy.patience
-        due = arc.owed and patience is not None and self._now - arc.since >= patience
-        shield = self.policy.shield(due=due)
+        shield = self.policy.shield(owed=arc.owed)
         hold = Hold(grant, self._now, self._now + arc.request.min_runtime, shield)
         self._take(arc, hold)
         self._effects.append(self._granted(arc, hold))

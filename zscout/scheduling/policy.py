@@ -26,7 +26,7 @@ class Policy:
     patience: Ns | None = PATIENCE
     """`adaptive`: time in ns after which an ARC that waits is due (`reservations.py`); None: never."""
     promise: Promise = "equals"
-    """Whom those who are due are protected from: equal and lower priority, or all but operators. With `all`,
+    """Whom those who are owed are protected from: equal and lower priority, or all but operators. With `all`,
     what they are granted at last is theirs for its minimum runtime, too."""
     max_running_per_host: int | None = None
     """ARCs that the clients of one host may have running at one time; None: any number."""
@@ -38,9 +38,9 @@ class Policy:
         """Priorities of one band wait for each other's due."""
         return priority if self.promise == "equals" or self.operator(priority) else self.operator_priority - 1
 
-    def shield(self, *, due: bool) -> int | None:
+    def shield(self, *, owed: bool) -> int | None:
         """Below which priority nobody takes a hold before its minimum runtime is over; None: no such rule."""
-        shielded = self.preempt == "after_min_runtime" or (due and self.promise == "all")
+        shielded = self.preempt == "after_min_runtime" or (owed and self.promise == "all")
         return self.operator_priority if shielded else None
 
 
