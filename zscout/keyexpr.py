@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import re
 import secrets
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 MAX_NAME = 64
 NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
+_CHUNK = rf"(?:\*|(?=[^/#]*\$\*)(?:[A-Za-z0-9_.-]|\$\*){{1,{MAX_NAME}}}|[A-Za-z0-9_.-]{{1,{MAX_NAME}}})"
+_PATTERN = re.compile(rf"{_CHUNK}/{_CHUNK}(?:#[1-9][0-9]?)?")
 ROOT = "zscout"
 REMEMBERED = 4_096
 """Valid names that are not looked at again."""
@@ -40,6 +43,34 @@ def check_rc(name: str) -> str:
     check_name(kind, "RC kind")
     check_name(rest, "RC name")
     return name
+
+
+def is_pattern(need: str) -> bool:
+    """Whether a need is met by any RC whose name matches, not by one that it names."""
+    return "*" in need
+
+
+@lru_cache(REMEMBERED)
+def check_need(need: str) -> str:
+    """`need` itself if it names an RC or is a pattern: `kind/name` with `*` or `$*` in it, and `#2`, `#3` and
+    so on behind it where one ARC needs several by one pattern. Raises BadName otherwise."""
+    if not is_pattern(need):
+        return check_rc(need)
+    if _PATTERN.fullmatch(need) is None:
+        raise BadName(
+            f"need {need[:130]!r} is not valid: write kind/name with * for a whole name or $* for a part of "
+            "one, like framegrabber/*, and #2, #3 and so on behind it for a second and third"
+        )
+    return need
+
+
+@lru_cache(REMEMBERED)
+def matcher(need: str) -> Callable[[str], bool]:
+    """Tells whether an RC's name matches a pattern, as Zenoh's key expressions do."""
+    pattern = need.partition("#")[0]
+    parts = (re.escape(part).replace(r"\$\*", "[^/]*").replace(r"\*", "[^/]+") for part in pattern.split("/"))
+    expression = re.compile("/".join(parts))
+    return lambda name: expression.fullmatch(name) is not None
 
 
 def valid_name(text: str) -> str:

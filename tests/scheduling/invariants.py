@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping
 from fractions import Fraction
 
 from tests.scheduling.oracle import Contender, Oracle
+from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Queued, Revoked
-from zscout.scheduling.model import NO_TERM, ArcId, Grant, Ns, RcName, Request
+from zscout.scheduling.model import NO_TERM, ArcId, Grant, Ns, Params, RcName, Request
 from zscout.scheduling.workload import WorkloadRc, excess
 
 
@@ -52,7 +53,10 @@ class Ledger:
     def _granted(self, effect: Granted) -> None:
         request = self.requests[effect.arc]
         assert effect.arc not in self.open, f"{effect.arc} is granted twice"
-        assert set(effect.rcs) == set(request.needs), f"{effect.arc} is granted a part of its needs"
+        assert len(effect.rcs) == len(request.needs), f"{effect.arc} is granted a part of its needs"
+        for need in request.needs:
+            meets = matcher(need) if is_pattern(need) else need.__eq__
+            assert any(map(meets, effect.rcs)), f"{effect.arc} is granted nothing for {need}"
         assert effect.grant > self.newest, "grants do not grow"
         assert (effect.end is None) == request.keep
         assert effect.end is None or effect.end == effect.start + request.min_runtime
@@ -65,7 +69,7 @@ class Ledger:
         for rc in effect.rcs:
             holders = self.holders(rc)
             if rc in self.capacity:
-                shares = [(arc, self.requests[arc].needs[rc]) for arc in holders]
+                shares = [(arc, _asked_of(self.requests[arc], rc)) for arc in holders]
                 assert not excess(self.capacity[rc], shares), f"{rc} can't carry {holders}"
             else:
                 assert holders == [effect.arc], f"{rc} has the holders {holders}"
@@ -92,6 +96,13 @@ class Ledger:
         else:
             assert request.keep
             assert taker.priority >= request.priority, "lower priority displaces a kept hold"
+
+
+def _asked_of(request: Request, rc: RcName) -> Params:
+    found = request.needs.get(rc)
+    if found is not None:
+        return found
+    return next(params for need, params in request.needs.items() if is_pattern(need) and matcher(need)(rc))
 
 
 def check_settled(now: Ns, core: Core, rcs: Iterable[WorkloadRc]) -> None:

@@ -150,7 +150,7 @@ class Chaos:
         term = Term(old.term.counter + 1, "rcm/b") if old.term != NO_TERM else Term(1, "rcm/a")
         self.core, self.waiting, self.late = self.new_core(), [], []
         standing = tuple(
-            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end)
+            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
             for arc in old.floor.running.values()
             if arc.hold is not None
         )

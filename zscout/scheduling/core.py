@@ -15,6 +15,7 @@ from __future__ import annotations
 import heapq
 from dataclasses import replace
 
+from zscout.keyexpr import is_pattern
 from zscout.scheduling import priority
 from zscout.scheduling.effects import (
     Dropped,
@@ -167,7 +168,12 @@ class Core:
         elif place.term == self.term:
             self._arrivals = max(self._arrivals, place.arrival)
         band = self.policy.band(request.priority)
-        return Arc(request, place, self.floor.mask(iter(request.needs)), band=band)
+        named = self.floor.mask(need for need in request.needs if not is_pattern(need))
+        slots = tuple(need for need in request.needs if is_pattern(need))
+        arc = Arc(request, place, named, band=band, slots=slots, named=named)
+        if slots:
+            self.floor.unbind(arc)
+        return arc
 
     def _give_up(self, arc_id: ArcId, outcome: Outcome, reason: str) -> None:
         arc = self.floor.arc(arc_id)
@@ -209,6 +215,8 @@ class Core:
             if self.floor.arc(held.request.arc) is not None:
                 continue
             arc = self._new_arc(held.request, held.place)
+            if arc.slots:
+                self.floor.bind(arc, held.bound)
             hold = Hold(held.grant, held.start, held.end, self.policy.shield(owed=False))
             absent = [rc.name for rc in self.floor.of(arc.mask & ~self.floor.present)]
             taken = [rc.name for rc in self.floor.of(arc.mask & self.floor.busy)]
@@ -265,7 +273,7 @@ class Core:
         if number is None:
             return
         arcs = (self.floor.arc(holder) for holder in sorted(holders))
-        params = {arc.id: arc.request.needs[rc.name] for arc in arcs if arc is not None}
+        params = {arc.id: self.floor.params(arc, rc) for arc in arcs if arc is not None}
         self._effects.append(Propose(self._cause, number, rc.name, params))
 
     def again(self) -> None:
@@ -292,7 +300,7 @@ class Core:
 
     def _forget(self, arc: Arc) -> None:
         self.floor.forget(arc)
-        for rc in self.floor.of(arc.mask & self.floor.sharable):
+        for rc in self.floor.of(self.floor.everywhere(arc) & self.floor.sharable):
             self.votes.forget_arc(rc.name, arc.id)
 
     def number(self) -> int:
@@ -305,14 +313,14 @@ class Core:
 
     def _granted(self, arc: Arc, hold: Hold) -> Granted:
         end = None if arc.request.keep else hold.end
-        rcs = tuple(sorted(arc.request.needs))
+        rcs = tuple(sorted(arc.needs))
         return Granted(self._cause, arc.id, arc.request.client, hold.grant, rcs, hold.start, end)
 
     def _revocation(
         self, arc: Arc, hold: Hold, outcome: Outcome, reason: str, *, requeued: bool, by: ArcId | None = None
     ) -> Revoked:
         self.number()
-        rcs = tuple(sorted(arc.request.needs))
+        rcs = tuple(sorted(arc.needs))
         client = arc.request.client
         return Revoked(self._cause, arc.id, client, hold.grant, rcs, outcome, reason, requeued, by)
 

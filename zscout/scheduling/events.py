@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
-from zscout.scheduling.model import ArcId, ClientId, Grant, Ns, Place, RcName, Request, Term
+from zscout.keyexpr import is_pattern, matcher
+from zscout.scheduling.model import ArcId, ClientId, Grant, Need, Ns, Place, RcName, Request, Term
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,13 @@ class Standing:
     grant: Grant
     start: Ns
     end: Ns
+    bound: Mapping[Need, RcName] = field(default_factory=dict)
+    """By each pattern of its needs: the RC that it holds."""
+
+    def __post_init__(self) -> None:
+        patterns = {need for need in self.request.needs if is_pattern(need)}
+        if patterns != self.bound.keys() or not all(matcher(need)(rc) for need, rc in self.bound.items()):
+            raise ValueError(f"what ARC {self.request.arc} holds for its patterns is not told, or told wrong")
 
 
 class Waiting(NamedTuple):

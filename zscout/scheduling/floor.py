@@ -6,10 +6,11 @@ Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
-from zscout.scheduling.model import Arc, ArcId, ClientId, Hold, Ns, Rc, RcName
+from zscout.keyexpr import is_pattern, matcher
+from zscout.scheduling.model import Arc, ArcId, ClientId, Hold, Need, Ns, Params, Rc, RcName
 from zscout.scheduling.policy import DEFAULT, Policy, owner_of
 from zscout.scheduling.waits import Waits
 
@@ -29,6 +30,9 @@ class Floor:
         self.busy = 0
         """Bits of the exclusive RCs that somebody holds."""
         self.waits = Waits()
+        self.flexible: dict[ArcId, Arc] = {}
+        """Those of the queued that need an RC by pattern."""
+        self._matching: dict[Need, list[Rc]] = {}
         self.owners: Counter[str] = Counter()
         """How many ARCs of each owner run."""
         self._by_bit: list[Rc] = []
@@ -42,7 +46,50 @@ class Floor:
         if rc is None:
             rc = self.rcs[name] = Rc(name, 1 << len(self._by_bit))
             self._by_bit.append(rc)
+            self._matching.clear()
         return rc
+
+    def matching(self, need: Need) -> list[Rc]:
+        """The RCs that meet a pattern, as far as they are known, present or not."""
+        found = self._matching.get(need)
+        if found is None:
+            matches = matcher(need)
+            found = self._matching[need] = [rc for rc in self.rcs.values() if matches(rc.name)]
+        return found
+
+    def bind(self, arc: Arc, bound: Mapping[Need, RcName]) -> None:
+        """Gives the patterns of an ARC that does not run these RCs, one for each."""
+        if arc.bound == bound:
+            return
+        wanted = arc.request.needs
+        arc.bound = bound
+        arc.needs = {bound.get(need, need): params for need, params in wanted.items()}
+        arc.mask = arc.named | self.mask(iter(bound.values()))
+        arc.rcs = tuple(self.of(arc.mask))
+
+    def params(self, arc: Arc, rc: Rc) -> Params:
+        """What an ARC would ask of an RC, whether it is bound to it at present or not."""
+        found = arc.needs.get(rc.name)
+        if found is None:
+            meets = (need for need in arc.slots if rc in self.matching(need))
+            found = arc.request.needs[next(meets)]
+        return found
+
+    def everywhere(self, arc: Arc) -> int:
+        """Bits of all RCs that an ARC could hold."""
+        bits = arc.mask
+        for need in arc.slots:
+            for rc in self.matching(need):
+                bits |= rc.bit
+        return bits
+
+    def unbind(self, arc: Arc) -> None:
+        """There is no RC for some pattern of the ARC."""
+        if arc.rcs and not arc.bound:
+            return
+        arc.bound, arc.mask = {}, arc.named
+        arc.needs = {need: params for need, params in arc.request.needs.items() if not is_pattern(need)}
+        arc.rcs = tuple(self.of(arc.mask))
 
     def known(self) -> int:
         """Bits of all RCs that were ever named."""
@@ -81,12 +128,17 @@ class Floor:
         arc.since, arc.turn = since, self._turn()
         arc.rcs = arc.rcs or tuple(self.of(arc.mask))
         self.queued[arc.id] = arc
+        if arc.slots:
+            self.flexible[arc.id] = arc
+        self._count_wanted(arc, 1)
         self.waits.add(arc)
         self._clients.setdefault(arc.request.client, {})[arc.id] = arc
 
     def drop(self, arc: Arc) -> None:
         """A queued ARC waits no more, and runs neither."""
         del self.queued[arc.id]
+        self.flexible.pop(arc.id, None)
+        self._count_wanted(arc, -1)
         self.waits.remove(arc)
 
     def forget(self, arc: Arc) -> None:
@@ -143,6 +195,10 @@ class Floor:
             return None
         return max(0, quota - self.owners[owner_of(arc.request.client)])
 
+    def _count_wanted(self, arc: Arc, by: int) -> None:
+        for rc in self.of(arc.named) if arc.slots else arc.rcs:
+            rc.wanted += by
+
     def _count_out(self, arc: Arc) -> None:
         owner = owner_of(arc.request.client)
         self.owners[owner] -= 1
@@ -161,18 +217,29 @@ class Floor:
         for arc in self.running.values():
             check(arc.hold is not None, f"{arc.id} runs without a hold")
             check(arc.mask & ~self.present == 0, f"{arc.id} holds an absent RC")
+            check(arc.bound.keys() == set(arc.slots), f"{arc.id} runs and is not bound")
+            for need, rc_name in arc.bound.items():
+                check(matcher(need)(rc_name), f"{arc.id} has {rc_name} for {need}")
+            check(len(arc.needs) == len(arc.request.needs), f"{arc.id} has one RC for two needs")
             for rc in self.of(arc.mask):
                 check(rc.holders.get(arc.id) is arc, f"{arc.id} holds only a part: not {rc.name}")
         busy = 0
         for rc in self.rcs.values():
             for holder in rc.holders:
                 check(holder in self.running, f"{rc.name} is held by {holder}, which does not run")
-                check(rc.name in self.running[holder].request.needs, f"{holder} did not ask for {rc.name}")
+                check(rc.name in self.running[holder].needs, f"{holder} did not ask for {rc.name}")
             if not rc.sharable:
                 check(len(rc.holders) <= 1, f"{rc.name} has two holders: {sorted(rc.holders)}")
                 busy |= rc.bit if rc.holders else 0
         counted = Counter(owner_of(arc.request.client) for arc in self.running.values())
         check(counted == self.owners, "the owners' ARCs are miscounted")
+        wanted = Counter(
+            name for arc in self.queued.values() for name in arc.request.needs if name in self.rcs
+        )
+        for rc in self.rcs.values():
+            check(rc.wanted == wanted[rc.name], f"{rc.name} is wanted by {wanted[rc.name]}, not {rc.wanted}")
+        flexible = {arc.id for arc in self.queued.values() if arc.slots}
+        check(flexible == self.flexible.keys(), "those who wait by pattern are not those known")
         check(busy == self.busy, "the mask of busy RCs is wrong")
         for breach in self.waits.validate(self.queued):
             check(False, breach)

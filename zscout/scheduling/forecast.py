@@ -62,7 +62,7 @@ class _Player:
         floor = self.real.floor
         joined = [RcJoined(rc.name, rc.sharable) for rc in floor.rcs.values() if rc.present]
         standing = tuple(
-            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end)
+            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
             for arc in floor.running.values()
             if arc.hold is not None
         )

@@ -17,6 +17,8 @@ ClientId: TypeAlias = str
 """Names the program behind requests: `<host>/<client>` on the mesh."""
 RcName: TypeAlias = str
 """`kind/name` of a resource controller."""
+Need: TypeAlias = str
+"""What a request asks for: the name of an RC, or a pattern such as `framegrabber/*`."""
 Ns: TypeAlias = int
 """Whole nanoseconds."""
 Params: TypeAlias = Mapping[str, Fraction]
@@ -57,11 +59,13 @@ Rank: TypeAlias = tuple[int, Ns, Place, ArcId]
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0)."""
+    """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0).
+
+    A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`)."""
 
     arc: ArcId
     client: ClientId
-    needs: Mapping[RcName, Params]
+    needs: Mapping[Need, Params]
     priority: int
     min_runtime: Ns
     keep: bool = False
@@ -99,7 +103,7 @@ class Arc:
     request: Request
     place: Place
     mask: int
-    """Bits of the needed RCs, sharable or not (see `Floor.rc`)."""
+    """Bits of the needed RCs, sharable or not (see `Floor.rc`); of a pattern, the RC that it is bound to."""
     hold: Hold | None = None
     reason: str = ""
     """Why it waits, in the words last told; empty while it runs. `Core.reason` has those of now."""
@@ -126,16 +130,31 @@ class Arc:
     """Whether that visit waits for votes of its own."""
     band: int = 0
     """Which priorities it waits its turn with (`Policy.band`)."""
+    slots: tuple[Need, ...] = ()
+    """Those of its needs that are patterns."""
+    named: int = 0
+    """Bits of the others."""
+    bound: Mapping[Need, RcName] = field(default_factory=dict)
+    """The RC that each pattern is bound to (`patterns.py`): while it runs, and for the time of a visit. Empty
+    if there are none to be bound to."""
+    needs: Mapping[RcName, Params] = field(init=False)
+    """By RC: what it holds, or would as it is bound."""
     owed: bool = False
     """Whether it has waited longer than the fleet's patience (`reservations.py`)."""
 
     def __post_init__(self) -> None:
         self.id, self.priority = self.request.arc, self.request.priority
         self.rank = (-self.priority, self.request.min_runtime, self.place, self.id)
+        self.needs = self.request.needs
 
     @property
     def name(self) -> str:
         return self.request.name
+
+    @property
+    def unbound(self) -> bool:
+        """Whether some pattern of its needs has no RC."""
+        return bool(self.slots) and not self.bound
 
     def overstays(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may displace it then."""
@@ -165,5 +184,7 @@ class Rc:
     present: bool = False
     sharable: bool = False
     holders: dict[ArcId, Arc] = field(default_factory=dict)
+    wanted: int = 0
+    """How many of the queued ARCs name it."""
     watchers: list[Rank] = field(default_factory=list)
     """Ranks of the queued ARCs that watch this RC, best first."""

@@ -15,6 +15,7 @@ from operator import attrgetter
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, ArcId, Ns, Rc
 from zscout.scheduling.packing import Item, Problem
+from zscout.scheduling.patterns import bind_all
 from zscout.scheduling.policy import owner_of
 from zscout.scheduling.priority import Actions
 from zscout.scheduling.reservations import Reservations
@@ -23,6 +24,8 @@ from zscout.scheduling.votes import HolderSet, Votes
 
 def parts_in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None) -> list[Part]:
     """The parts in which somebody could start; best-ranked first."""
+    if floor.flexible:
+        bind_all(floor, votes, now, reserved)
     arcs = in_play(floor, votes, now, reserved)
     return [Part(floor, votes, now, members, reserved) for members in apart(arcs)] if arcs else []
 
@@ -38,7 +41,7 @@ def in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None =
     levels: dict[int, list[Arc]] = {}
     absent = ~floor.present
     for arc in floor.queued.values():
-        if not arc.mask & absent:
+        if not arc.mask & absent and not arc.unbound:
             levels.setdefault(arc.request.priority, []).append(arc)
     exclusive = ~floor.sharable
     holders = sorted(floor.running.values(), key=lambda arc: -arc.request.priority)

@@ -26,6 +26,7 @@ is passed over only where its visit would again come to "waits", stopping nobody
   an RC accepts it accepts of every subset. When the RC becomes off limits, its watchers below are visited.
 - It is *asleep* before a silent RC. Its visit reads nothing outside its footprint; it is visited when
   anything within changes, is answered or becomes off limits, and when the silent RC may be asked again.
+- Who needs RCs by pattern is always visited, unless an RC that it names keeps it out.
 - It is *held back* from an RC that is kept for another (`reservations.py`); it watches that RC until other
   claims stand there.
 - It is *open*, but nothing within its footprint has changed. Then it is stopped again, if what it would
@@ -35,12 +36,13 @@ is passed over only where its visit would again come to "waits", stopping nobody
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from operator import attrgetter
-from typing import Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias
 
 from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import Arc, Ns, Rank, Rc
+from zscout.scheduling.model import Arc, Need, Ns, Rank, Rc, RcName
+from zscout.scheduling.patterns import Binder
 from zscout.scheduling.reservations import Bar, Reservations
 from zscout.scheduling.visit import Admitted, Open, Refused, Visit, absence, listed, over_quota
 from zscout.scheduling.votes import HolderSet, Votes
@@ -48,6 +50,8 @@ from zscout.scheduling.votes import HolderSet, Votes
 __all__ = ["UNSETTLED", "Actions", "Strategy", "Visit", "absence", "run_full_pass", "run_pass"]
 
 UNSETTLED = "votes are out"
+TRIES = 16
+"""Bindings that one visit tries."""
 TOLD = 4
 """How many of those who watch an RC are told at once that its holder is another; the rest see it when they
 ask. In a long queue every grant would else be news to everyone."""
@@ -67,6 +71,8 @@ class Actions(Protocol):
         """Asks for another pass at once: the strategy needs more time, and others shall have their turn."""
         ...
 
+
+_Verdict: TypeAlias = Refused | Open | Admitted | Bar | Literal["off limits", "over quota"]
 
 Strategy: TypeAlias = Callable[[Floor, Votes, Ns, Actions], None]
 """One pass: reads the floor and the votes, and acts."""
@@ -150,27 +156,89 @@ class Pass:
         self.waits.stirred |= self._done
 
     def _visit(self, arc: Arc) -> None:
-        visit = Visit(self.floor, self.votes, self.now, arc)
-        decision = visit.obstacle_outside(self.off_limits)
-        if decision is None and self.floor.room(arc) == 0:
-            # Whoever of its owner's ends, may let it go: no RC tells.
+        if arc.slots:
+            self._visit_flexible(arc)
+        else:
+            visit = Visit(self.floor, self.votes, self.now, arc)
+            self._carry_out(arc, visit, self._judge(arc, visit))
+
+    def _visit_flexible(self, arc: Arc) -> None:
+        """Tries one binding after the other, the best first, until one lets the ARC start or asks votes."""
+        binder = Binder(self.floor, self.votes, self.now, self.reserved)
+        without, tries = 0, 0
+        best: tuple[Mapping[Need, RcName], _Verdict] | None = None
+        while tries < TRIES and binder.bind(arc, without):
+            tries += 1
+            visit = Visit(self.floor, self.votes, self.now, arc)
+            verdict = self._judge(arc, visit)
+            blame = self._blame(arc, visit, verdict)
+            best = best or (arc.bound, verdict)
+            if not blame:
+                best = arc.bound, verdict
+                break
+            without |= blame
+        if best is None:
+            self.floor.unbind(arc)
             self.waits.reopen(arc)
-            self.actions.wait(arc, over_quota(self.floor, arc))
+            self.actions.wait(arc, f"no RC on the mesh is left for {listed(sorted(arc.slots))}")
             return
-        bar = self.reserved.bar(arc) if decision is None and self.reserved is not None else None
+        self.floor.bind(arc, best[0])
+        self._carry_out(arc, Visit(self.floor, self.votes, self.now, arc), best[1])
+
+    def _blame(self, arc: Arc, visit: Visit, verdict: _Verdict) -> int:
+        """Bits of those RCs of a binding that keep the ARC out, where others might not."""
+        match verdict:
+            case Refused(rc) | Bar(rc, _, None):
+                bits = rc.bit
+            case "off limits":
+                bits = self.off_limits
+                for rc in arc.rcs:
+                    if any(holder.mask & self.off_limits for holder in rc.holders.values()):
+                        bits |= rc.bit
+            case Open(questions):
+                bits = sum(rc.bit for rc, _ in questions if self.votes.silent(rc.name))
+            case _:
+                bits = 0
+        return bits & arc.mask & ~arc.named
+
+    def _judge(self, arc: Arc, visit: Visit) -> _Verdict:
+        """What a visit comes to, as things stand."""
+        refused = visit.obstacle_outside(self.off_limits)
+        if refused is not None:
+            return refused
+        if self.floor.room(arc) == 0:
+            return "over quota"
+        bar = self.reserved.bar(arc) if self.reserved is not None else None
         if bar is not None:
-            self._hold_back(arc, bar)
-            return
-        if decision is None and self.off_limits and visit.footprint() & self.off_limits:
-            self._put_off(arc, visit, asked=False)
-            self.actions.wait(arc, UNSETTLED, settled=False)
-            return
-        match decision or visit.decide():
+            return bar
+        if self.off_limits and visit.footprint() & self.off_limits:
+            return "off limits"
+        return visit.decide()
+
+    def _carry_out(self, arc: Arc, visit: Visit, verdict: _Verdict) -> None:
+        match verdict:
             case Refused(rc, reason):
-                self.waits.watch(arc, rc)
-                self.actions.wait(arc, reason)
+                self._watch(arc, rc)
+                self.actions.wait(arc, self._in_words(arc, rc, reason))
+            case Bar(rc, _, ask) if ask is not None:
+                self.waits.reopen(arc)
+                self.actions.wait(arc, UNSETTLED, settled=False)
+                self.actions.propose(rc, ask)
+            case Bar(rc):
+                self._watch(arc, rc)
+                self.actions.wait(arc, self._in_words(arc, rc, verdict.reason))
+            case "over quota":
+                # Whoever of its owner's ends may let it go: no RC tells.
+                self.waits.reopen(arc)
+                self.actions.wait(arc, over_quota(self.floor, arc))
+            case "off limits":
+                self._put_off(arc, visit, asked=False)
+                self.actions.wait(arc, UNSETTLED, settled=False)
             case Open(questions) if silent := [ask for ask in questions if self.votes.silent(ask[0].name)]:
-                self.waits.sleep(arc, visit.footprint())
+                if arc.slots:
+                    self.waits.reopen(arc)
+                else:
+                    self.waits.sleep(arc, visit.footprint())
                 self.actions.wait(arc, f"{listed([rc.name for rc, _ in silent])} does not answer")
                 for rc, holders in silent:
                     self.actions.propose(rc, holders)
@@ -186,19 +254,24 @@ class Pass:
                 self.actions.start(arc)
                 self._done |= self._rouse(arc.rank)
 
-    def _hold_back(self, arc: Arc, bar: Bar) -> None:
-        """Another is owed what `arc` would take."""
-        if bar.ask is None:
-            self.waits.watch(arc, bar.rc)
-            self.actions.wait(arc, bar.reason)
-        else:
+    def _watch(self, arc: Arc, rc: Rc) -> None:
+        """`rc` keeps `arc` out, by itself unless the ARC could do with another."""
+        if arc.slots and rc.bit & ~arc.named:
             self.waits.reopen(arc)
-            self.actions.wait(arc, UNSETTLED, settled=False)
-            self.actions.propose(bar.rc, bar.ask)
+        else:
+            self.waits.watch(arc, rc)
+
+    def _in_words(self, arc: Arc, rc: Rc, reason: str) -> str:
+        need = next((need for need, name in arc.bound.items() if name == rc.name), None)
+        return reason if need is None else f"no {need} is to be had: {reason}"
 
     def _put_off(self, arc: Arc, visit: Visit, *, asked: bool) -> None:
         footprint = visit.footprint()
-        self.waits.reopen(arc, footprint, hidden=visit.hidden(), asked=asked)
+        if arc.slots:
+            # It is looked at again whatever happens: another RC may do.
+            self.waits.reopen(arc)
+        else:
+            self.waits.reopen(arc, footprint, hidden=visit.hidden(), asked=asked)
         self._bar(footprint, arc.rank)
 
     def _stopped_again(self, arc: Arc) -> bool:

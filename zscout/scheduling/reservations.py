@@ -65,18 +65,29 @@ class Reservations:
             self._reserve(floor.queued[arc])
 
     def _reserve(self, arc: Arc) -> None:
-        if arc.mask & ~self._floor.present:
+        rcs = self._rcs(arc)
+        if not all(rc.present for rc in rcs):
             return
-        start = max(self._within_quota(arc), *(self._free_from(rc, arc) for rc in arc.rcs))
+        start = max(self._within_quota(arc), *(self._free_from(rc, arc) for rc in rcs))
         if math.isinf(start):
             return
         claim = Claim(arc, max(int(start), self.due(arc)))
-        for rc in arc.rcs:
+        for rc in rcs:
             claims = self.claims.setdefault(rc.bit, [])
             if rc.sharable or not claims:
                 claims.append(claim)
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), claim.start + arc.request.min_runtime)
-        self.bits |= arc.mask
+            self.bits |= rc.bit
+
+    def _rcs(self, arc: Arc) -> list[Rc]:
+        """What it is to have: of those that meet a pattern, the one that has room for it first. An RC that is
+        not there stands for a pattern that none is left for."""
+        rcs = list(self._floor.of(arc.named)) if arc.slots else list(arc.rcs)
+        for need in arc.slots:
+            left = [rc for rc in self._floor.matching(need) if rc.present and rc not in rcs]
+            nothing = Rc(need, 0)
+            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc), rc.bit), default=nothing))
+        return rcs
 
     def _within_quota(self, arc: Arc) -> float:
         """When its owner has room for `arc`."""
@@ -135,6 +146,15 @@ class Reservations:
                 asked = known is None and not self._votes.silent(rc.name)
                 return Bar(rc, bars.creditor, together if asked else None)
         return None
+
+    def keeps(self, rc: Rc, arc: Arc) -> bool:
+        """Whether `rc`, exclusive, is kept for another who goes before `arc`."""
+        claims = self.claims.get(rc.bit, ())
+        done = self._now + arc.request.min_runtime
+        return any(
+            claim.creditor is not arc and arc.band <= claim.creditor.band and done > claim.start
+            for claim in claims[:1]
+        )
 
     def changed(self, earlier: Reservations) -> int:
         """Bits of the RCs at which other claims stand now than then."""

@@ -25,7 +25,9 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
+from zscout.keyexpr import is_pattern
 from zscout.scheduling.model import Params, RcName, Request
+from zscout.scheduling.patterns import check_patterns
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.strict import Where, amounts, check_unique, parse_toml, quoted, seconds_to_ns
 
@@ -78,6 +80,10 @@ def parse_workload(text: str, source: str) -> Workload:
 
 def _rc(rc: _Rc, where: Where) -> WorkloadRc:
     _check_text(rc.name, where / "name")
+    if is_pattern(rc.name):
+        raise (where / "name").bad(
+            f"{quoted(rc.name)} is a pattern", "leave out the *; only needs may have it"
+        )
     if rc.capacity is None:
         return WorkloadRc(rc.name, rc.sharable)
     if not rc.sharable:
@@ -99,6 +105,10 @@ def _arrival(arc: _Arc, where: Where) -> Arrival:
         _check_text(rc, where / "needs")
         _check_texts(parameters, where / "needs" / rc)
         needs[rc] = amounts(parameters, where / "needs" / rc)
+    try:
+        check_patterns(needs)
+    except ValueError as error:
+        raise (where / "needs").bad(str(error), "see zscout request --help") from None
     return Arrival(at, Request(arc.name, arc.name, needs, arc.priority, min_runtime))
 
 

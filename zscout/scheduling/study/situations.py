@@ -98,7 +98,7 @@ class Observer:
             return  # votes came: the instant goes on
         self.close()
         running = tuple(
-            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end)
+            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
             for arc in floor.running.values()
             if arc.hold is not None
         )

@@ -1,0 +1,284 @@
+"""Needs by pattern: any one RC that matches will do, under every strategy."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Iterator
+from fractions import Fraction
+
+import pytest
+
+from tests.scheduling.invariants import Ledger
+from zscout.keyexpr import is_pattern, matcher
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Effect, Granted, Propose
+from zscout.scheduling.events import (
+    Asked,
+    Event,
+    LeadTaken,
+    RcJoined,
+    RcLost,
+    Released,
+    Standing,
+    Tick,
+    Vote,
+    VoteOverdue,
+)
+from zscout.scheduling.model import SECOND, Arc, Grant, Ns, Params, Place, Request, Term
+from zscout.scheduling.patterns import check_patterns
+from zscout.scheduling.policy import Policy
+from zscout.scheduling.replay import replay
+from zscout.scheduling.strategies import STRATEGIES, StrategyName
+from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
+
+ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")
+TERM, NEXT = Term(1, "rcm/a"), Term(2, "rcm/b")
+
+
+def request(arc: str, *needs: str, priority: int = 1, seconds: int = 10, rate: int = 0) -> Request:
+    wanted: dict[str, Params] = {
+        need: {"rate": Fraction(rate)} if need.startswith("radio") else {} for need in needs
+    }
+    return Request(arc, "h/c", wanted, priority, seconds * SECOND)
+
+
+def core_of(strategy: StrategyName, *rcs: str) -> Core:
+    core = Core(STRATEGIES[strategy]())
+    core.handle(0, *(RcJoined(rc, sharable=rc.startswith("radio")) for rc in rcs))
+    return core
+
+
+def held(core: Core) -> dict[str, set[str]]:
+    return {arc.id: set(arc.needs) for arc in core.floor.running.values()}
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_any_free_one_will_do(strategy: StrategyName) -> None:
+    core = core_of(strategy, "fg/a", "fg/b", "robot/x")
+    core.handle(0, Asked(request("first", "fg/a")))
+    effects = core.handle(0, Asked(request("any", "fg/*", "robot/x")))
+    assert held(core) == {"first": {"fg/a"}, "any": {"fg/b", "robot/x"}}
+    assert [effect.rcs for effect in effects if isinstance(effect, Granted)] == [("fg/b", "robot/x")]
+    core.handle(0, Asked(request("third", "fg/*")))
+    assert core.floor.queued["third"].reason.startswith("no fg/* is to be had: needs fg/")
+    core.handle(SECOND, Released("first"))
+    assert held(core)["third"] == {"fg/a"}
+    core.validate()
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_several_are_counted_by_naming(strategy: StrategyName) -> None:
+    core = core_of(strategy, "fg/a", "fg/b", "fg/c")
+    core.handle(0, Asked(request("two", "fg/*", "fg/*#2")), Asked(request("also", "fg/*", "fg/*#2")))
+    assert len(held(core)) == 1
+    assert len(held(core)["two"]) == 2
+    core.handle(0, Asked(request("four", *(f"fg/*#{n}" for n in range(1, 5)))))
+    assert core.floor.queued["four"].reason == (
+        "no RC on the mesh is left for fg/*#1, fg/*#2, fg/*#3 and 1 more"
+    )
+    core.handle(0, RcJoined("fg/d", sharable=False))
+    assert sorted(held(core)) == ["also", "two"]
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_the_narrower_pattern_gets_what_only_it_can_use(strategy: StrategyName) -> None:
+    core = core_of(strategy, "fg/a1", "fg/b1")
+    core.handle(0, Asked(request("both", "fg/*", "fg/a$*")))
+    assert held(core) == {"both": {"fg/a1", "fg/b1"}}
+    assert core.floor.running["both"].bound == {"fg/*": "fg/b1", "fg/a$*": "fg/a1"}
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_what_others_name_is_left_to_them(strategy: StrategyName) -> None:
+    core = core_of(strategy, "fg/a", "fg/b", "robot/x")
+    core.handle(0, Asked(request("holds", "robot/x")))
+    core.handle(0, Asked(request("names", "fg/a", "robot/x")))
+    core.handle(0, Asked(request("any", "fg/*")))
+    assert held(core)["any"] == {"fg/b"}
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_of_those_that_yield_the_lowest_is_displaced(strategy: StrategyName) -> None:
+    core = core_of(strategy, "fg/a", "fg/b", "fg/c")
+    core.handle(
+        0,
+        Asked(request("two", "fg/a", priority=2)),
+        Asked(request("one", "fg/b", priority=1)),
+        Asked(request("three", "fg/c", priority=3)),
+    )
+    core.handle(SECOND, Asked(request("any", "fg/*", priority=3)))
+    assert held(core) == {"two": {"fg/a"}, "any": {"fg/b"}, "three": {"fg/c"}}
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_a_radio_that_refuses_sends_it_to_the_next(strategy: StrategyName) -> None:
+    core = core_of(strategy, "radio/a", "radio/b", "radio/c")
+    _answered(core, 0, {"radio/a": 10, "radio/b": 10}, Asked(request("loud", "radio/a", rate=8)))
+    _answered(core, 0, {"radio/a": 10, "radio/b": 10}, Asked(request("any", "radio/*", rate=5)))
+    assert held(core)["any"] in ({"radio/b"}, {"radio/c"})
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_a_silent_radio_keeps_nobody_who_could_do_with_another(strategy: StrategyName) -> None:
+    core = core_of(strategy, "radio/a", "radio/b")
+    events: list[Event] = [Asked(request("any", "radio/*", rate=5))]
+    asked = []
+    while events:
+        effects = core.handle(0, *events)
+        out = [effect for effect in effects if isinstance(effect, Propose)]
+        asked += [one.rc for one in out]
+        # The first that is asked never answers.
+        events = [
+            VoteOverdue(one.proposal) if one.rc == asked[0] else Vote(one.proposal, accept=True)
+            for one in out
+        ]
+    assert len(held(core)["any"]) == 1
+    assert asked[0] not in held(core)["any"]
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_a_hold_keeps_its_rc_over_a_change_of_rcm_and_may_have_another_after_a_loss(
+    strategy: StrategyName,
+) -> None:
+    core = Core(STRATEGIES[strategy]())
+    wanted = request("any", "fg/*")
+    stands = Standing(wanted, Place(TERM, 1), Grant(TERM, 1), 0, 10 * SECOND, {"fg/*": "fg/b"})
+    joined = [RcJoined(rc, sharable=False) for rc in ("fg/a", "fg/b")]
+    core.handle(SECOND, *joined, LeadTaken(NEXT, (stands,)))
+    assert held(core) == {"any": {"fg/b"}}
+    core.handle(2 * SECOND, RcLost("fg/b"))
+    assert held(core) == {"any": {"fg/a"}}
+
+
+def test_a_standing_hold_must_tell_what_it_holds() -> None:
+    for bound in ({}, {"fg/*": "robot/a"}, {"fg/*": "fg/a", "fg/*#2": "fg/b"}):
+        with pytest.raises(ValueError, match="what ARC any holds"):
+            Standing(request("any", "fg/*"), Place(TERM, 1), Grant(TERM, 1), 0, SECOND, bound)
+
+
+@pytest.mark.parametrize(
+    ("needs", "message"),
+    [
+        ({"fg/**": {}}, "not valid"),
+        ({"radio/*": {"rate": Fraction(1)}, "radio/*#2": {"rate": Fraction(2)}}, "different parameters"),
+        ({"radio/*": {"rate": Fraction(1)}, "*/rf0": {}}, "name its kind"),
+        ({"*/*": {"rate": Fraction(1)}}, "name its kind"),
+    ],
+)
+def test_what_no_request_may_ask(needs: dict[str, Params], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_patterns(needs)
+
+
+def test_the_owed_are_kept_one_that_matches() -> None:
+    policy = Policy(patience=6 * SECOND)
+    core = Core(STRATEGIES["adaptive"](), policy)
+    core.handle(0, *(RcJoined(rc, sharable=False) for rc in ("fg/a", "fg/b", "robot/x")))
+    core.handle(0, Asked(request("holds", "robot/x", seconds=20)))
+    core.handle(0, Asked(request("owed", "fg/*", "robot/x")))
+    core.handle(
+        15 * SECOND, Asked(request("one", "fg/*", seconds=30)), Asked(request("two", "fg/*", seconds=30))
+    )
+    assert sorted(core.floor.running) == ["holds", "one"]
+    core.handle(20 * SECOND, Tick())
+    assert sorted(core.floor.running) == ["one", "owed"]
+
+
+# At random
+
+
+def workload(seed: int) -> Workload:
+    draw = random.Random(seed)  # noqa: S311
+    grabbers = [f"fg/{letter}{number}" for letter in "ab" for number in range(draw.randint(1, 2))]
+    robots = [f"robot/r{number}" for number in range(draw.randint(1, 3))]
+    radios = [
+        WorkloadRc(f"radio/rf{number}", sharable=True, capacity={"rate": Fraction(10)}) for number in range(2)
+    ]
+    arrivals, at = [], 0
+    for number in range(draw.randint(5, 16)):
+        needs = draw.sample(grabbers, draw.randint(0, 1)) + draw.sample(robots, draw.randint(0, 1))
+        needs += draw.sample(
+            ["fg/*", "fg/*#2", "fg/a$*", "robot/*", "radio/*", "radio/rf0"], draw.randint(0, 3)
+        )
+        needs = [need for need in needs if need != "fg/*#2" or "fg/*" in needs] or ["robot/*"]
+        wanted = request(
+            f"a{number}",
+            *needs,
+            priority=draw.randint(1, 3),
+            seconds=draw.randint(1, 9),
+            rate=draw.randint(1, 6),
+        )
+        arrivals.append(Arrival(at, wanted))
+        at += draw.randint(0, 3) * SECOND
+    return Workload((*map(WorkloadRc, grabbers + robots), *radios), tuple(arrivals))
+
+
+def bindings(arc: Arc, rcs: list[str]) -> Iterator[set[str]]:
+    """All ways to meet an ARC's needs, by trying."""
+    choices = [
+        [rc for rc in rcs if matcher(need)(rc)] if is_pattern(need) else [need] for need in arc.request.needs
+    ]
+    for chosen in itertools.product(*choices):
+        if len(set(chosen)) == len(chosen):
+            yield set(chosen)
+
+
+def could_start(core: Core, arc: Arc, work: Workload) -> bool:
+    """Whether some choice of RCs is free as it stands: nobody has to give way, and every radio has room."""
+    capacity = {rc.name: rc.capacity["rate"] for rc in work.rcs if rc.sharable}
+    for chosen in bindings(arc, [rc.name for rc in work.rcs]):
+        free = True
+        for name in chosen:
+            holders = core.floor.rc(name).holders.values()
+            if name in capacity:
+                used = sum((holder.needs[name]["rate"] for holder in holders), Fraction(0))
+                rate = next(
+                    params["rate"] for need, params in arc.request.needs.items() if need.startswith("radio")
+                )
+                free &= used + rate <= capacity[name]
+            else:
+                free &= not holders
+        if free:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("strategy", ALL)
+@pytest.mark.parametrize("seed", range(150))
+def test_nobody_waits_while_some_choice_is_free(strategy: StrategyName, seed: int) -> None:
+    work = workload(seed)
+    ledger = Ledger(work.rcs, [one.request for one in work.arrivals])
+
+    def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
+        ledger.take(now, core, effects)
+        if next(core.votes.out(), None) is None:
+            for arc in core.floor.queued.values():
+                assert not could_start(core, arc, work), f"{arc.id} waits: {arc.reason}"
+
+    played = replay(work, watch, strategy=STRATEGIES[strategy](), policy=Policy(patience=None))
+    assert set(played.unserved) == {
+        one.request.arc
+        for one in work.arrivals
+        if not any(bindings(_arc(one.request), [rc.name for rc in work.rcs]))
+    }
+
+
+def _arc(wanted: Request) -> Arc:
+    return Arc(wanted, Place(TERM, 1), 0)
+
+
+def _answered(core: Core, now: Ns, capacity: dict[str, int], *events: Event) -> None:
+    """A batch with every vote that it takes: a radio of unknown capacity accepts all."""
+    batch = list(events)
+    while batch:
+        effects = core.handle(now, *batch)
+        batch = [
+            Vote(
+                effect.proposal,
+                accept=sum(params["rate"] for params in effect.holders.values())
+                <= capacity.get(effect.rc, 1000),
+            )
+            for effect in effects
+            if isinstance(effect, Propose)
+        ]
