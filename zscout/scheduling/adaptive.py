@@ -36,6 +36,8 @@ MAX_PACKED: Final = 60
 """Larger parts go to local search at once."""
 SLICE: Final = 150
 """Steps of local search in one pass: some 3 ms."""
+MAX_IN_PLAY: Final = 1_000
+"""Where more ARCs than that could start at one instant, `priority` decides."""
 MAX_STEPS: Final = 6_500
 MAX_SLICES: Final = 48
 """Passes for which one part is searched at most, begun anew or not."""
@@ -148,7 +150,7 @@ class Adaptive:
         before, self._searches, self._unfinished = self._searches, {}, []
         held = 0
         reserved = self._reserve(floor, votes, now)
-        for part in parts_in_play(floor, votes, now, reserved):
+        for part in parts_in_play(floor, votes, now, reserved, MAX_IN_PLAY):
             if not self._decide(part, before, actions):
                 held |= part.mask
         priority.run_pass(floor, votes, now, actions, off_limits=held, reserved=reserved)

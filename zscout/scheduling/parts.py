@@ -1,104 +1,28 @@
 """What a pass could change at all, in parts that can be decided apart.
 
-Most of a busy fleet is settled whatever a strategy does: who runs, and could only have to give way to ARCs
-that can't start, stays; who needs what such a one holds waits. The others are *in play*. Those of them that
-share no RC, not even by way of others, are decided apart: so a slow voter stops nobody who has nothing to do
-with it, and the cost is that of the parts.
+Those in play (`in_play.py`) that share no RC, not even by way of others, are decided apart: so a slow voter
+stops nobody who has nothing to do with it, and the cost is that of the parts.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
-from operator import attrgetter
 
 from zscout.scheduling.floor import Floor
+from zscout.scheduling.in_play import in_play
 from zscout.scheduling.model import Arc, ArcId, Ns, Rc
 from zscout.scheduling.packing import Item, Problem
-from zscout.scheduling.patterns import bind_all
-from zscout.scheduling.policy import owner_of
 from zscout.scheduling.priority import Actions
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.votes import HolderSet, Votes
 
 
-def parts_in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None) -> list[Part]:
-    """The parts in which somebody could start; best-ranked first."""
-    if floor.flexible:
-        bind_all(floor, votes, now, reserved)
-    arcs = in_play(floor, votes, now, reserved)
+def parts_in_play(
+    floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None, limit: int | None = None
+) -> list[Part]:
+    """The parts in which somebody could start, best-ranked first; none if more than `limit` ARCs could."""
+    arcs = in_play(floor, votes, now, reserved, limit)
     return [Part(floor, votes, now, members, reserved) for members in apart(arcs)] if arcs else []
-
-
-def in_play(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None) -> list[Arc]:
-    """Those who might start in this pass, and those who might have to end for them."""
-    rooms: Counter[str] = Counter()
-    """ARCs of each owner that might start."""
-    quota = floor.policy.max_running_per_host is not None
-    shields = any(arc.shielded(now) for arc in floor.running.values())
-    yielded = 0
-    """Sharable RCs at which one passes those who are owed: whether a second could as well was not asked."""
-    levels: dict[int, list[Arc]] = {}
-    absent = ~floor.present
-    for arc in floor.queued.values():
-        if not arc.mask & absent and not arc.unbound:
-            levels.setdefault(arc.request.priority, []).append(arc)
-    exclusive = ~floor.sharable
-    holders = sorted(floor.running.values(), key=lambda arc: -arc.request.priority)
-    firm = 0
-    """Exclusive RCs whose holders yield to nobody of the level at hand."""
-    above = 0
-    found: list[Arc] = []
-    movable: dict[ArcId, Arc] = {}
-    loose = 0
-    """Bits of what the movable hold."""
-    for level in sorted(levels, reverse=True):
-        while above < len(holders) and holders[above].request.priority > level:
-            firm |= holders[above].mask & exclusive
-            above += 1
-        here = firm
-        for holder in holders[above:]:
-            if holder.priority < level and not shields:
-                break
-            if not holder.yields_at(level, now):
-                here |= holder.mask & exclusive
-        shut = here & ~loose
-        for arc in sorted(levels[level], key=attrgetter("rank")) if quota else levels[level]:
-            if arc.mask & shut or _refused(floor, votes, now, arc, movable):
-                continue
-            if reserved is not None and arc.mask & reserved.bits:
-                shared = arc.mask & reserved.bits & floor.sharable
-                if shared & yielded or reserved.bar(arc) is not None:
-                    continue
-                if not arc.owed:
-                    yielded |= shared
-            room = floor.room(arc)
-            if room is not None:
-                owner = owner_of(arc.request.client)
-                if rooms[owner] >= room:
-                    continue
-                rooms[owner] += 1
-            found.append(arc)
-            for rc in floor.of(arc.mask & (floor.busy | floor.sharable)):
-                for holder in rc.holders.values():
-                    if holder.id not in movable and holder.yields_to(arc, now):
-                        movable[holder.id] = holder
-                        loose |= holder.mask
-    return [*found, *movable.values()]
-
-
-def _refused(floor: Floor, votes: Votes, now: Ns, arc: Arc, movable: dict[ArcId, Arc]) -> bool:
-    """Whether an RC has vetoed the ARC beside those who stay in any case, or is silent about that."""
-    for rc in floor.of(arc.mask & floor.sharable):
-        stay = [
-            holder.id
-            for holder in rc.holders.values()
-            if holder.id not in movable and not holder.yields_to(arc, now)
-        ]
-        answer = votes.known(rc.name, frozenset((*stay, arc.id)))
-        if votes.silent(rc.name) if answer is None else not answer.accept:
-            return True
-    return False
 
 
 def apart(arcs: Iterable[Arc]) -> list[list[Arc]]:
