@@ -180,8 +180,6 @@ class Adaptive:
 
     def _decide(self, part: Part, before: dict[ArcId, _Search], actions: Actions) -> bool:
         """Takes the better set of a part, or leaves it to `priority`. False: it is off limits for now."""
-        if not part.sharables and sum(arc.hold is None for arc in part.arcs) < 2:
-            return True
         earlier = list({id(one): one for arc in part.arcs if (one := before.get(arc.id))}.values())
         while (search := self._search(part, earlier)) is not None:
             self._searches.update(dict.fromkeys(search.arcs, search))

@@ -20,9 +20,15 @@ from zscout.scheduling.votes import HolderSet, Votes
 def parts_in_play(
     floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None, limit: int | None = None
 ) -> list[Part]:
-    """The parts in which somebody could start, best-ranked first; none if more than `limit` ARCs could."""
+    """The parts in which there is a choice, best-ranked first; none if more than `limit` ARCs could start.
+
+    One newcomer that needs no sharable RC is no choice: `priority` starts it, as any strategy would."""
     arcs = in_play(floor, votes, now, reserved, limit)
-    return [Part(floor, votes, now, members, reserved) for members in apart(arcs)] if arcs else []
+    return [
+        Part(floor, votes, now, members, reserved)
+        for members in apart(arcs or ())
+        if sum(arc.hold is None for arc in members) > 1 or any(arc.mask & floor.sharable for arc in members)
+    ]
 
 
 def apart(arcs: Iterable[Arc]) -> list[list[Arc]]:

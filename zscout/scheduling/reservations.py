@@ -24,7 +24,7 @@ from zscout.scheduling.model import Arc, Ns, Rc
 from zscout.scheduling.policy import owner_of
 from zscout.scheduling.votes import HolderSet, Votes
 
-MAX_OWED: Final = 256
+MAX_OWED: Final = 64
 """ARCs that are kept a place at one time; those owed after them follow as these start."""
 
 
