@@ -33,7 +33,10 @@ async def measure(rounds: int, crowds: int, programs: int) -> list[Row]:
             rows = await process.idle(lab)
             progress("zscout --help")
             rows += process.help_time(rounds=15)
-            rows = await latency.latencies(lab, rounds, progress) + rows
+            (folder / "priority").mkdir()
+            async with latency.fleet_of(folder / "priority", "priority") as paper:
+                latency.start(paper)
+                rows = await latency.latencies(lab, paper, rounds, progress) + rows
             (folder / "empty").mkdir()
             rows += await crowd.crowd(lab, folder / "empty", crowds, 3.0, progress, programs)
             rows += process.memory_after(lab)

@@ -17,6 +17,7 @@ from zscout import messages
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import Needs, OpenArc
 from zscout.messages import Ask, Notice, StateAsk
+from zscout.scheduling.strategies import StrategyName
 
 EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
 SHARABLE = ["radio/rf0", "video/ch1"]
@@ -26,9 +27,9 @@ more than anything that is measured here, and most where many processes take par
 HOLD = 60.0
 
 
-def fleet_of(folder: Path) -> Lab:
+def fleet_of(folder: Path, strategy: StrategyName = "adaptive") -> Lab:
     """The RCM's node apart from those of the RCs, as on a mesh; not started yet."""
-    return Lab(folder, candidates=["lead"])
+    return Lab(folder, candidates=["lead"], strategy=strategy)
 
 
 def start(lab: Lab) -> None:
@@ -44,10 +45,51 @@ async def running(client: Client, arc: OpenArc) -> None:
         await client.changed(arc)
 
 
-async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> list[Row]:
-    """Rows for the bare query, its asyncio face, the grants and the release."""
-    client, second = await lab.client("bench"), await lab.client("second")
-    await lab.ready(client, *EXCLUSIVE, *SHARABLE)
+class Programs:
+    """Two programs in one fleet, and what they do."""
+
+    def __init__(self, client: Client, second: Client) -> None:
+        self.client, self.second = client, second
+
+    @classmethod
+    async def of(cls, lab: Lab) -> Programs:
+        made = cls(await lab.client("bench"), await lab.client("second"))
+        await lab.ready(made.client, *EXCLUSIVE, *SHARABLE)
+        return made
+
+    def grant(self, needs: Needs, *, confirm: bool = False) -> Callable[[], Awaitable[float]]:
+        async def measured() -> float:
+            start = time.perf_counter()
+            arc = await self.client.request("bench", needs, min_runtime=HOLD)
+            await (self.client.granted(arc) if confirm else running(self.client, arc))
+            took = time.perf_counter() - start
+            await self.client.end(arc)
+            return took
+
+        return measured
+
+    def release_to_next(self, needs: Needs) -> Callable[[], Awaitable[float]]:
+        async def measured() -> float:
+            holder = await self.client.request("holder", needs, min_runtime=HOLD)
+            await running(self.client, holder)
+            waiter = await self.second.request("waiter", needs, min_runtime=HOLD)
+            assert waiter.state == "queued"
+            start = time.perf_counter()
+            released = asyncio.create_task(self.client.end(holder))
+            await running(self.second, waiter)
+            took = time.perf_counter() - start
+            await released
+            await self.second.end(waiter)
+            return took
+
+        return measured
+
+
+async def latencies(lab: Lab, paper: Lab, rounds: int, progress: Callable[[str], None]) -> list[Row]:
+    """Rows for the bare query, its asyncio face, the grants and the release; `paper` is a fleet under the
+    strategy `priority`."""
+    programs, papers = await Programs.of(lab), await Programs.of(paper)
+    client = programs.client
     one: Needs = {EXCLUSIVE[0]: {}}
     five: Needs = {name: {} for name in EXCLUSIVE[:5]}
     votes: Needs = {name: {"rate": 4} for name in SHARABLE}
@@ -65,39 +107,19 @@ async def latencies(lab: Lab, rounds: int, progress: Callable[[str], None]) -> l
         assert reply is not None, "the face did not answer"
         return took
 
-    def grant(needs: Needs, *, confirm: bool = False) -> Callable[[], Awaitable[float]]:
-        async def measured() -> float:
-            start = time.perf_counter()
-            arc = await client.request("bench", needs, min_runtime=HOLD)
-            await (client.granted(arc) if confirm else running(client, arc))
-            took = time.perf_counter() - start
-            await client.end(arc)
-            return took
-
-        return measured
-
-    async def next_waiter() -> float:
-        holder = await client.request("holder", one, min_runtime=HOLD)
-        await running(client, holder)
-        waiter = await second.request("waiter", one, min_runtime=HOLD)
-        assert waiter.state == "queued"
-        start = time.perf_counter()
-        released = asyncio.create_task(client.end(holder))
-        await running(second, waiter)
-        took = time.perf_counter() - start
-        await released
-        await second.end(waiter)
-        return took
-
     measured: dict[str, Callable[[], Awaitable[float]]] = {
         "query, asyncio face": face_query,
-        "grant, 1 RC": grant(one),
-        "grant, 5 RCs": grant(five),
-        "grant, 2 votes": grant(votes),
-        "grant and confirmation, 1 RC": grant(one, confirm=True),
-        "grant and confirmation, 5 RCs": grant(five, confirm=True),
-        "grant and confirmation, 2 votes": grant(votes, confirm=True),
-        "release to next grant": next_waiter,
+        "grant, 1 RC": programs.grant(one),
+        "1 RC under priority": papers.grant(one),
+        "grant, 5 RCs": programs.grant(five),
+        "5 RCs under priority": papers.grant(five),
+        "grant, 2 votes": programs.grant(votes),
+        "2 votes under priority": papers.grant(votes),
+        "grant and confirmation, 1 RC": programs.grant(one, confirm=True),
+        "grant and confirmation, 5 RCs": programs.grant(five, confirm=True),
+        "grant and confirmation, 2 votes": programs.grant(votes, confirm=True),
+        "release to next grant": programs.release_to_next(one),
+        "release under priority": papers.release_to_next(one),
     }
     aims = {
         "grant, 1 RC": 1.5,

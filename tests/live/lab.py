@@ -20,6 +20,7 @@ from zscout.config import Fleet, load_fleet
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.messages import RcAsk, RcmState, RcState
 from zscout.scheduling.model import Ns
+from zscout.scheduling.strategies import StrategyName
 
 START = 20.0
 """Seconds within which anything that is waited for must have come true, on a busy machine."""
@@ -32,7 +33,13 @@ class Lab:
     """
 
     def __init__(
-        self, folder: Path, *, lease: float = 1.0, candidates: Sequence[str] = (), extra: str = ""
+        self,
+        folder: Path,
+        *,
+        lease: float = 1.0,
+        candidates: Sequence[str] = (),
+        extra: str = "",
+        strategy: StrategyName = "adaptive",
     ) -> None:
         self.folder = folder
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
@@ -43,7 +50,7 @@ class Lab:
         names = ", ".join(f'"{name}"' for name in candidates)
         port = random.randint(20_000, 60_000)  # noqa: S311
         self.fleet_file.write_text(
-            f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\n'
+            f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\nstrategy = "{strategy}"\n'
             f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\n'
             f'interface = "lo"\nlease = {lease}\n{extra}'
         )
