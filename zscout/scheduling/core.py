@@ -168,8 +168,8 @@ class Core:
         elif place.term == self.term:
             self._arrivals = max(self._arrivals, place.arrival)
         band = self.policy.band(request.priority)
-        named = self.floor.mask(need for need in request.needs if not is_pattern(need))
-        slots = tuple(need for need in request.needs if is_pattern(need))
+        slots = tuple(filter(is_pattern, request.needs))
+        named = self.floor.mask([need for need in request.needs if need not in slots])
         arc = Arc(request, place, named, band=band, slots=slots, named=named)
         if slots:
             self.floor.unbind(arc)

@@ -6,7 +6,7 @@ Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from zscout.keyexpr import is_pattern, matcher
@@ -64,7 +64,7 @@ class Floor:
         wanted = arc.request.needs
         arc.bound = bound
         arc.needs = {bound.get(need, need): params for need, params in wanted.items()}
-        arc.mask = arc.named | self.mask(iter(bound.values()))
+        arc.mask = arc.named | self.mask(bound.values())
         arc.rcs = tuple(self.of(arc.mask))
 
     def params(self, arc: Arc, rc: Rc) -> Params:
@@ -95,10 +95,11 @@ class Floor:
         """Bits of all RCs that were ever named."""
         return (1 << len(self._by_bit)) - 1
 
-    def mask(self, names: Iterator[RcName]) -> int:
-        mask = 0
+    def mask(self, names: Iterable[RcName]) -> int:
+        mask, rcs = 0, self.rcs
         for name in names:
-            mask |= self.rc(name).bit
+            rc = rcs.get(name) or self.rc(name)
+            mask |= rc.bit
         return mask
 
     def of(self, mask: int) -> Iterator[Rc]:

@@ -6,7 +6,8 @@ stops nobody who has nothing to do with it, and the cost is that of the parts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from operator import attrgetter
 
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.in_play import in_play
@@ -33,7 +34,9 @@ def parts_in_play(
 
 def apart(arcs: Iterable[Arc]) -> list[list[Arc]]:
     """The ARCs in groups that have no RC in common, each in rank order; the best-ranked group first."""
-    members = sorted(arcs, key=lambda arc: arc.rank)
+    members = sorted(arcs, key=attrgetter("rank"))
+    if _hang_together(members):
+        return [members]
     leader = list(range(len(members)))
 
     def find(number: int) -> int:
@@ -68,6 +71,22 @@ def _grade(arc: Arc, first: set[ArcId], now: Ns) -> tuple[int, int]:
     else:
         later = bool(first) and arc.id not in first
     return -arc.priority, 2 if later else 1
+
+
+def _hang_together(arcs: Sequence[Arc]) -> bool:
+    """Whether a few looks are enough to see that there is one group only: the usual case."""
+    mask, rest = 0, list(arcs)
+    for _ in range(3):
+        apart = []
+        for arc in rest:
+            if mask and not arc.mask & mask:
+                apart.append(arc)
+            else:
+                mask |= arc.mask
+        if not apart:
+            return True
+        rest = apart
+    return False
 
 
 class Part:
