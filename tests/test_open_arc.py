@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from decimal import Decimal
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
 
-from zscout.behaviors.arc import Revoked
+from zscout.behaviors.arc import Held, Revoked
+from zscout.behaviors.client import Client
 from zscout.behaviors.request import OpenArc
-from zscout.messages import Notice
+from zscout.messages import Amounts, Notice
 from zscout.scheduling.model import SECOND, Grant, Place, Term
 
 OLD, TERM = Term(1, "zz"), Term(2, "aa")
 FIRST, SECOND_GRANT = Grant(TERM, 1), Grant(TERM, 9)
 NOW = 1000 * SECOND
+NOBODY = cast("Client", None)
+"""For what asks nobody on the mesh."""
 
 
-def arc() -> OpenArc:
-    return OpenArc("id", "survey", {"robot/x": {}}, priority=0, min_runtime=Decimal(5))
+def arc(*needs: str) -> OpenArc:
+    wanted: dict[str, Amounts] = {need: {} for need in needs or ("robot/x",)}
+    return OpenArc("id", "survey", wanted, priority=0, min_runtime=Decimal(5))
 
 
 def notice(step: int, state: Any = "queued", **details: Any) -> Notice:
@@ -32,6 +37,10 @@ RUNS = notice(2, "running", grant=FIRST, remaining=5.0, place=Place(TERM, 1))
 TAKEN = notice(3, outcome="preempted", reason="preempted by op", by="h/c/op", grant=FIRST)
 WAITS = notice(4, reason="needs robot/x")
 AGAIN = notice(5, "running", grant=SECOND_GRANT, remaining=5.0)
+
+
+def runs(bound: dict[str, str], step: int = 2, grant: Grant = FIRST) -> Notice:
+    return notice(step, "running", grant=grant, remaining=5.0, bound=bound)
 
 
 @pytest.mark.parametrize(
@@ -58,6 +67,47 @@ def test_words_of_the_rcm(words: list[Notice], state: str, grant: Grant | None, 
     assert (known.state, known.grant, known.ending) == (state, grant, ending)
     assert known.told(NOW).grant == grant
     assert known.place == Place(TERM, 1)
+
+
+def test_what_meets_a_pattern_is_what_the_newest_hold_says() -> None:
+    known = arc("fg/*", "fg/*#2", "robot/x")
+    assert known.take(runs({"fg/*": "fg/b", "fg/*#2": "fg/a"}), NOW)
+    first = Held(NOBODY, known, FIRST)
+    assert (first.rcs, first.rc("fg/*"), first.rc("fg/*#2")) == (["fg/a", "fg/b", "robot/x"], "fg/b", "fg/a")
+    assert (first.rc("robot/x"), first.rc("fg/a")) == ("robot/x", "fg/a")
+    known.take(TAKEN, NOW)
+    known.take(runs({"fg/*": "fg/c", "fg/*#2": "fg/a"}, step=5, grant=SECOND_GRANT), NOW)
+    again = Held(NOBODY, known, SECOND_GRANT)
+    assert (again.rcs, again.rc("fg/*")) == (["fg/a", "fg/c", "robot/x"], "fg/c")
+    assert first.rc("fg/*") == "fg/b"
+    assert known.ask(NOW).needs.keys() == {"fg/*", "fg/*#2", "robot/x"}
+    for unasked in ("fg/*#3", "video/*", "robot/y", "fg/b"):
+        with pytest.raises(KeyError, match=re.escape(f"{unasked} is no need of survey; it asked for fg/*,")):
+            again.rc(unasked)
+
+
+@pytest.mark.parametrize(
+    "bound",
+    [
+        {},
+        {"fg/*": "fg/a"},
+        {"fg/*": "fg/a", "fg/*#2": "fg/a"},
+        {"fg/*": "fg/a", "fg/*#2": "robot/x"},
+        {"fg/*": "fg/a", "fg/*#2": "fg/*"},
+        {"fg/*": "fg/a", "fg/*#2": "fg/../b"},
+        {"fg/*": "fg/a", "fg/*#3": "fg/b"},
+    ],
+)
+def test_a_hold_that_is_not_what_was_asked_for_is_not_believed(bound: dict[str, str]) -> None:
+    known = arc("fg/*", "fg/*#2", "robot/x")
+    assert not known.take(runs(bound), NOW)
+    assert (known.state, known.grant, known.rcs, known.bound) == ("asking", None, [], {})
+
+
+def test_no_binding_makes_another_rc_of_one_that_was_named() -> None:
+    known = arc("robot/x")
+    assert known.take(runs({"robot/x": "robot/y"}), NOW)
+    assert (known.rcs, known.bound) == (["robot/x"], {})
 
 
 def test_what_the_client_ends_itself() -> None:

@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 MAX_NAME = 64
 NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
-_CHUNK = rf"(?:\*|(?=[^/#]*\$\*)(?:[A-Za-z0-9_.-]|\$\*){{1,{MAX_NAME}}}|[A-Za-z0-9_.-]{{1,{MAX_NAME}}})"
+# A whole name; or parts of one and stars between them, no two stars together and not a star alone.
+_CHUNK = rf"(?:\*|(?![^/#]*\$\*\$)(?!\$\*(?:[/#]|\Z))(?:[A-Za-z0-9_.-]|\$\*){{1,{MAX_NAME}}})"
 _PATTERN = re.compile(rf"{_CHUNK}/{_CHUNK}(?:#[1-9][0-9]?)?")
 ROOT = "zscout"
 REMEMBERED = 4_096
@@ -67,10 +68,32 @@ def check_need(need: str) -> str:
 @lru_cache(REMEMBERED)
 def matcher(need: str) -> Callable[[str], bool]:
     """Tells whether an RC's name matches a pattern, as Zenoh's key expressions do."""
-    pattern = need.partition("#")[0]
-    parts = (re.escape(part).replace(r"\$\*", "[^/]*").replace(r"\*", "[^/]+") for part in pattern.split("/"))
-    expression = re.compile("/".join(parts))
-    return lambda name: expression.fullmatch(name) is not None
+    kind, _, name = need.partition("#")[0].partition("/")
+
+    def matches(rc: str) -> bool:
+        rc_kind, _, rc_name = rc.partition("/")
+        return _matches(kind, rc_kind) and _matches(name, rc_name)
+
+    return matches
+
+
+def _matches(pattern: str, name: str) -> bool:
+    """One chunk. No regular expression: with many stars one can take for ever."""
+    if "/" in name or not name:
+        return False
+    if pattern == "*" or "*" not in pattern:
+        return pattern in ("*", name)
+    first, *middle, last = pattern.split("$*")
+    if len(name) < len(first) + len(last) or not name.startswith(first) or not name.endswith(last):
+        return False
+    # The leftmost place of each part leaves most for the others.
+    at, end = len(first), len(name) - len(last)
+    for part in middle:
+        at = name.find(part, at, end)
+        if at < 0:
+            return False
+        at += len(part)
+    return True
 
 
 def valid_name(text: str) -> str:

@@ -44,7 +44,8 @@ class Message(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Ask(Message, frozen=True, tag_field="op", tag="request"):
-    """Asks for an ARC: all of `needs`, for at least `min_runtime` seconds.
+    """Asks for an ARC: all of `needs`, for at least `min_runtime` seconds. A need is the name of an RC, or a
+    pattern that any one RC meets (`keyexpr.check_need`).
 
     `id` is the client's own and stays the same however often it asks; `place` is what an earlier RCM gave,
     and `waited` the seconds since it was last queued there.
@@ -130,6 +131,9 @@ class Notice(Message, frozen=True):
     """ARCs that rank before it in the queue."""
     grant: Grant | None = None
     rcs: list[str] = []
+    """What it holds, or held; of a request that waits, the RCs that it names."""
+    bound: dict[str, str] = {}
+    """While it runs: the RC that meets each of its patterns."""
     remaining: Seconds | None = None
     """Seconds until its minimum runtime is over."""
 
@@ -140,8 +144,8 @@ class Notice(Message, frozen=True):
 class Holder(Message, frozen=True):
     """One holder of one RC, told so fully that a new RCM can carry its ARC on from the RCs' word alone.
 
-    `rcs` names the whole gang. `remaining` seconds of its minimum runtime are left, negative where it is
-    over; with `keep` the hold does not end then."""
+    `rcs` names the whole gang, `bound` the RC that meets each of its patterns. `remaining` seconds of its
+    minimum runtime are left, negative where it is over; with `keep` the hold does not end then."""
 
     id: str
     arc: str
@@ -154,6 +158,7 @@ class Holder(Message, frozen=True):
     priority: int = 0
     keep: bool = False
     params: Amounts = {}
+    bound: dict[str, str] = {}
 
 
 class Revocation(Message, frozen=True):
@@ -197,7 +202,8 @@ class StateAsk(Message, frozen=True):
 
 
 class HoldView(Message, frozen=True):
-    """A hold in force. `held` is how long it has stood, in seconds."""
+    """A hold in force. `held` is how long it has stood, in seconds; `needs` are by RC, `bound` the RC that
+    meets each of its patterns."""
 
     id: str
     arc: str
@@ -210,10 +216,11 @@ class HoldView(Message, frozen=True):
     held: Seconds
     remaining: Seconds
     keep: bool = False
+    bound: dict[str, str] = {}
 
 
 class WaitView(Message, frozen=True):
-    """An ARC in the queue, in rank order. `waited` seconds since it was last queued."""
+    """An ARC in the queue, in rank order. `waited` seconds since it was last queued; `needs` as asked."""
 
     id: str
     arc: str

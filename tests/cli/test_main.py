@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -171,10 +172,39 @@ def test_needs() -> None:
     assert gather_needs([(rc, params), ("robot/a", {})]) == {"radio/rf0": params, "robot/a": {}}
 
 
+def test_a_pattern_that_comes_again_is_numbered() -> None:
+    def needs(*texts: str) -> list[str]:
+        return list(gather_needs([parse_need(text) for text in texts]))
+
+    assert needs("fg/*", "robot/a", "fg/*", "fg/*") == ["fg/*", "robot/a", "fg/*#2", "fg/*#3"]
+    assert needs("fg/a$*", "fg/*", "fg/a$*", "*/x") == ["fg/a$*", "fg/*", "fg/a$*#2", "*/x"]
+    # What is written out stays as it is.
+    assert needs("fg/*", "fg/*", "fg/*#2", "fg/*#7") == ["fg/*", "fg/*#3", "fg/*#2", "fg/*#7"]
+    assert len(needs(*["fg/*"] * 64)) == 64
+    same = {"rate": Decimal(2)}
+    assert gather_needs([parse_need("radio/*:rate=2")] * 2) == {"radio/*": same, "radio/*#2": same}
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["robot/a", "fg/*", "robot/a"], "robot/a is named twice; name each RC once"),
+        (["fg/*#2", "fg/*#2"], "fg/*#2 is named twice; leave the numbers out, and they are given"),
+        (["radio/*:rate=2", "radio/*:rate=3"], "different parameters; give all the same"),
+        (["radio/*:rate=2", "*/x"], "name its kind"),
+        (["fg/*"] * 65, "65 RCs; at most 64 are allowed"),
+    ],
+)
+def test_needs_that_do_not_go_together(texts: list[str], message: str) -> None:
+    with pytest.raises(BadInput, match=re.escape(message)):
+        gather_needs([parse_need(text) for text in texts])
+
+
 @pytest.mark.parametrize(
     "text",
     ["", "robot", "robot/", "/a", "a/b/c", "a/b:", "a/b:rate", "a/b:rate=", "a/b:rate=-1", "a/b:rate=nan",
-     "a/b:rate=1,rate=2", "a/b:rate=1,", "a/b:=1", "a/*", "a/b:rate=1e999", "a/b:ra te=1", "a/b\n"],
+     "a/b:rate=1,rate=2", "a/b:rate=1,", "a/b:=1", "a/b:rate=1e999", "a/b:ra te=1", "a/b\n",
+     "*", "a/**", "a/b*", "a/*/*", "a/*#", "a/*#0", "a/*#2#3", "a/*#100", "a/b#2", "a/*:rate", "a/* "],
 )  # fmt: skip
 def test_what_is_no_need_is_refused(text: str) -> None:
     with pytest.raises(BadInput, match="need "):

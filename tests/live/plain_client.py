@@ -7,6 +7,8 @@ Takes orders as JSON lines on stdin and tells what happens as JSON lines on stdo
     {"do": "ask", "id": ..., "arc": ..., "needs": {...}, "priority": 1, "min_runtime": 60}
     {"do": "command", "id": ..., "rc": ..., "action": {...}}       {"do": "release" | "cancel", "id": ...}
     {"do": "quit"}
+
+`rc` is an RC, or a pattern of the request: the command goes to the RC that meets it.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import secrets
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 # Protocol, "Joining": with few receiving threads one cut-off host stalls every link.
@@ -54,6 +56,22 @@ def absurd(term: tuple[int, str], known: tuple[int, str]) -> bool:
     return term[0] > (MAX_COUNTER if known == NO_TERM else min(MAX_COUNTER, known[0] + MAX_JUMP))
 
 
+def matches(pattern: str, rc: str) -> bool:
+    """Protocol, "Names and keys": Zenoh's own rules, without the number behind the pattern."""
+    return bool(zenoh.KeyExpr(pattern.partition("#")[0]).includes(zenoh.KeyExpr(rc)))
+
+
+def meets(needs: Json, notice: Json) -> bool:
+    """Whether the RCs of a hold are one for each need, and no others."""
+    if notice["state"] != "running":
+        return True
+    bound = notice.get("bound", {})
+    rcs = [bound.get(need) if "*" in need else need for need in needs]
+    if None in rcs or sorted(set(rcs)) != sorted(notice["rcs"]) or len(set(rcs)) != len(rcs):
+        return False
+    return all(matches(need, rc) for need, rc in bound.items())
+
+
 @dataclass
 class OpenRequest:
     """A request that is not over, and the newest word about it."""
@@ -62,6 +80,8 @@ class OpenRequest:
     state: str = "asking"
     place: Any = None
     grant: Any = None
+    rcs: tuple[str, ...] = ()
+    bound: Json = field(default_factory=dict)
     last: tuple[tuple[int, str], int] = (NO_TERM, 0)
 
 
@@ -111,7 +131,7 @@ class PlainClient:
                     self.work.put(("release", notice["id"]))
                 return
             order = (term, int(notice["step"]))
-            if order <= request.last:
+            if order <= request.last or not meets(request.asked["needs"], notice):
                 return
             request.last = order
             new = notice["state"], notice.get("grant")
@@ -119,6 +139,8 @@ class PlainClient:
             request.state = notice["state"]
             request.place = notice.get("place", request.place)
             request.grant = notice.get("grant") if request.state == "running" else None
+            if request.state == "running":
+                request.rcs, request.bound = tuple(notice["rcs"]), notice.get("bound", {})
             if request.state == "ended":
                 del self.requests[notice["id"]]
             elif request.state == "running" and changed:
@@ -208,6 +230,7 @@ class PlainClient:
         with self.lock:
             request = self.requests.get(request_id)
             grant = request.grant if request is not None else None
+            rcs, bound = (request.rcs, request.bound) if request is not None else ((), {})
         if request is None or grant is None:
             return
         refusals: list[Json] = []
@@ -217,7 +240,7 @@ class PlainClient:
             if "code" in answer:
                 refusals.append(answer)
 
-        threads = [threading.Thread(target=one, args=(rc,)) for rc in request.asked["needs"]]
+        threads = [threading.Thread(target=one, args=(rc,)) for rc in rcs]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -229,7 +252,7 @@ class PlainClient:
             tell("not_confirmed", id=request_id, refusals=refusals)
             self.end("release", request_id)
         else:
-            tell("entered", id=request_id, grant=grant)
+            tell("entered", id=request_id, grant=grant, rcs=rcs, bound=bound)
 
     def command(self, rc: str, grant: Any, action: Json) -> Json:
         key = f"{self.base}/rc/{rc}/command/{self.host}/{self.name}"
@@ -293,7 +316,9 @@ class PlainClient:
             with self.lock:
                 request = self.requests.get(order["id"])
                 grant = order.get("grant") or (request.grant if request is not None else None)
-            tell("done", rc=order["rc"], answer=self.command(order["rc"], grant, order["action"]))
+                bound = request.bound if request is not None else {}
+            rc = str(bound.get(order["rc"], order["rc"]))
+            tell("done", rc=rc, answer=self.command(rc, grant, order["action"]))
         elif do in ("release", "cancel"):
             self.end(do, order["id"])
 

@@ -7,8 +7,12 @@ from fractions import Fraction
 
 import pytest
 
-from zscout.messages import ClientRequests, Holder, OpenRequest, RcState
+from zscout.drivers.holding import Holding
+from zscout.messages import ClientRequests, Holder, HoldView, OpenRequest, RcmState, RcState
+from zscout.scheduling.core import Core
+from zscout.scheduling.events import LeadTaken, RcJoined
 from zscout.scheduling.model import SECOND, Grant, Ns, Place, Term
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rebuild import Inheritance, rebuild
 
 NOW: Ns = 1000 * SECOND
@@ -27,6 +31,7 @@ def hold(
     remaining: float = 10,
     params: dict[str, Decimal] | None = None,
     runtime: str = "60",
+    bound: dict[str, str] | None = None,
 ) -> Holder:
     return Holder(
         id=f"{name}-id",
@@ -40,6 +45,7 @@ def hold(
         priority=3,
         keep=True,
         params=params or {},
+        bound=bound or {},
     )
 
 
@@ -181,6 +187,107 @@ def test_clocks_differ_a_little_and_the_earliest_end_counts() -> None:
 def test_the_parameters_at_an_absent_rc_are_what_the_client_says() -> None:
     (held,) = rebuild(BOTH[:1], [RUNS], NOW).standing
     assert held.request.needs["radio/b"] == {"rate": Fraction(5, 2)}
+
+
+# Needs by pattern
+
+RATE = {"rate": Decimal("2.5")}
+THREE = ("robot/a", "radio/b", "radio/c")
+BOUND = {"robot/*": "robot/a", "radio/*": "radio/c", "radio/*#2": "radio/b"}
+
+
+def bound_hold(bound: dict[str, str] = BOUND, params: dict[str, Decimal] | None = None) -> Holder:
+    return hold(THREE, params=params, bound=bound)
+
+
+BY_PATTERN = [
+    rc("robot/a", bound_hold()),
+    rc("radio/b", bound_hold(params=RATE)),
+    rc("radio/c", bound_hold(params=RATE)),
+]
+ASKED = client(asked(grant=Grant(TERM, 5), needs=tuple(BOUND)))
+
+
+@pytest.mark.parametrize("clients", [[], [ASKED]], ids=["its client is late", "its client answers"])
+@pytest.mark.parametrize(
+    "states",
+    [
+        pytest.param(BY_PATTERN, id="all there"),
+        pytest.param(BY_PATTERN[1:], id="without the robot"),
+        pytest.param(BY_PATTERN[:2], id="without one radio: the other tells what is asked of it"),
+        pytest.param([rc("robot/a", hold(THREE)), *BY_PATTERN[1:]], id="one RC knows nothing of patterns"),
+    ],
+)
+def test_patterns_and_what_meets_them_are_restored(
+    states: list[RcState], clients: list[ClientRequests]
+) -> None:
+    found = rebuild(states, clients, NOW)
+    (held,) = found.standing
+    rate = {"rate": Fraction(5, 2)}
+    assert held.request.needs == {"robot/*": {}, "radio/*": rate, "radio/*#2": rate}
+    assert held.bound == BOUND
+    core = Core(STRATEGIES["priority"]())
+    joined = [RcJoined(state.rc, state.sharable) for state in states]
+    core.handle(NOW, *joined, LeadTaken(Term(4, "cc"), tuple(found.standing)))
+    arc = core.floor.arc("h/one/gang-id")
+    assert arc is not None
+    if len(states) == len(THREE):
+        assert (arc.hold is not None, set(arc.needs), arc.bound) == (True, set(THREE), BOUND)
+    else:
+        assert (arc.hold, arc.place) == (None, PLACE)
+
+
+def test_an_rc_that_read_of_its_hold_in_a_snapshot_passes_on_its_binding() -> None:
+    view = HoldView(
+        id="gang-id", arc="gang", client="h/one", priority=3, grant=Grant(TERM, 5), place=PLACE,
+        needs={"robot/a": {}}, min_runtime=Decimal(60), held=50.0, remaining=10.0,
+        bound={"robot/*": "robot/a"},
+    )  # fmt: skip
+    holding = Holding("robot/a", hold_lease=3 * SECOND)
+    holding.read(RcmState(TERM, 5, "h", [view]), NOW, sharable=False)
+    (held,) = rebuild([rc("robot/a", *holding.holders(NOW))], [], NOW).standing
+    assert (held.request.needs, held.bound) == ({"robot/*": {}}, {"robot/*": "robot/a"})
+
+
+def test_half_a_gang_waits_for_its_patterns() -> None:
+    found = rebuild([*BY_PATTERN[:2], rc("radio/c")], [], NOW)
+    assert summary(found) == ([], ["gang"])
+    assert found.waiting[0].request.needs.keys() == BOUND.keys()
+
+
+def test_what_waits_by_pattern_waits_on_and_nonsense_does_not() -> None:
+    good = asked("good", needs=("radio/*", "radio/*#2"), place=Place(OLD, 8))
+    bad = [asked(f"bad-{at}", needs=(need,)) for at, need in enumerate(("radio/**", "radio/*#0", "*/*/*"))]
+    cross = asked("cross", needs=("radio/*", "*/rf0"))
+    found = rebuild([], [client(good, *bad, cross)], NOW)
+    assert summary(found) == ([], ["good"])
+    assert found.waiting[0].request.needs.keys() == {"radio/*", "radio/*#2"}
+
+
+@pytest.mark.parametrize("missing", [None, "radio/c"], ids=["all there", "half a gang"])
+@pytest.mark.parametrize(
+    "bound",
+    [
+        pytest.param({"robot/*": "robot/b"}, id="an RC that it does not hold"),
+        pytest.param({"robot/*": "radio/b"}, id="an RC that does not match"),
+        pytest.param({"radio/*": "radio/b", "radio/*#2": "radio/b"}, id="one RC for two patterns"),
+        pytest.param({"robot/b": "robot/a"}, id="a name for a pattern"),
+        pytest.param({"robot/a": "robot/a"}, id="an RC for itself"),
+        pytest.param({"robot/**": "robot/a"}, id="no pattern"),
+        pytest.param({"robot/* ": "robot/a"}, id="nearly a pattern"),
+        pytest.param({"*/a": "robot/a", "radio/*": "radio/b"}, id="patterns that may not stand together"),
+    ],
+)
+def test_a_hold_with_a_wrong_binding_is_left_out(
+    bound: dict[str, str], missing: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    wrong = [
+        rc(name, *([] if name == missing else [bound_hold(bound, RATE if name.startswith("radio") else {})]))
+        for name in THREE
+    ]
+    other = rc("robot/x", hold(("robot/x",), name="good"))
+    assert summary(rebuild([*wrong, other], [], NOW)) == (["good"], [])
+    assert "the hold of h/one/gang-id is not carried on: " in caplog.text
 
 
 def test_what_waits_keeps_place_and_parameters() -> None:

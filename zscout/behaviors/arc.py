@@ -10,6 +10,9 @@ minimum runtime is over (nothing comes out: it had its time). `holds` goes again
     async for attempt in holds(client, "survey", {"robot/scout33": {}}, min_runtime=5):
         async with attempt as held:
             ...
+
+A need may be a pattern, which any one RC meets: with `{"framegrabber/*": {}}` as needs,
+`held.rc("framegrabber/*")` is the one that was given, and `held.command("framegrabber/*", ...)` goes to it.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from typing import Any
 from zscout import clock
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import Ending, Needs, OpenArc
+from zscout.keyexpr import is_pattern
 from zscout.messages import Done
 from zscout.scheduling.model import SECOND, Grant
 
@@ -44,10 +48,20 @@ class Held:
         self._client = client
         self.arc = arc
         self.grant = grant
+        self.rcs: list[str] = list(arc.rcs)
+        """All that it holds, sorted."""
+        self.bound: dict[str, str] = dict(arc.bound)
+        """By each pattern of the needs: the RC that meets it."""
 
-    @property
-    def rcs(self) -> list[str]:
-        return sorted(self.arc.needs)
+    def rc(self, need: str) -> str:
+        """The RC that meets a need: `held.rc("framegrabber/*")`; an RC that is held meets its own name.
+
+        Raises KeyError for what was not asked for."""
+        rc = self.bound.get(need, need)
+        if rc not in self.rcs:
+            asked = ", ".join(sorted(self.arc.needs))
+            raise KeyError(f"{need} is no need of {self.arc.name}; it asked for {asked}")
+        return rc
 
     @property
     def active(self) -> bool:
@@ -66,8 +80,11 @@ class Held:
             return not self.arc.keep and self.remaining <= 0
         return self.arc.outcome == "completed"
 
-    async def command(self, rc: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
-        """Has one of the held RCs do something. Raises CommandRefused."""
+    async def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
+        """Has one of the held RCs do something: the one of this name, or that meets this pattern.
+
+        Raises CommandRefused, and KeyError for a pattern that was not asked for."""
+        rc = self.rc(need) if is_pattern(need) else need
         return await self._client.command(rc, self.grant, do, ttl=ttl)
 
     async def over(self) -> None:

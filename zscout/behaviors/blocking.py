@@ -58,9 +58,19 @@ class BlockingHeld:
 
         return self._lab.run(over())
 
-    def command(self, rc: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Any:
-        """Has one of the held RCs do something and returns its result. Raises CommandRefused."""
-        return self._lab.run(self._held.command(rc, do, ttl=ttl)).result
+    @property
+    def rcs(self) -> list[str]:
+        """All that it holds, sorted."""
+        return list(self._held.rcs)
+
+    def rc(self, need: str) -> str:
+        """The RC that meets a need, as `arc.Held.rc` tells. Raises KeyError."""
+        return self._held.rc(need)
+
+    def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Any:
+        """Has one of the held RCs do something and returns its result: the one of this name, or that meets
+        this pattern. Raises CommandRefused, and KeyError for a pattern that was not asked for."""
+        return self._lab.run(self._held.command(need, do, ttl=ttl)).result
 
 
 class Lab:

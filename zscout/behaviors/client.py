@@ -153,7 +153,8 @@ class Client:
     ) -> OpenArc:
         """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
 
-        Raises RequestRefused where the request can't be taken as it is."""
+        A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
+        more. Raises RequestRefused where the request can't be taken as it is."""
         arc = OpenArc(
             id=new_instance(),
             name=check_name(name, "arc"),
@@ -205,7 +206,7 @@ class Client:
                 return refused
             return None
 
-        refusals = await asyncio.gather(*(one(rc) for rc in arc.needs))
+        refusals = await asyncio.gather(*(one(rc) for rc in arc.rcs))
         return next((refused for refused in refusals if refused is not None), None)
 
     async def end(self, arc: OpenArc) -> None:

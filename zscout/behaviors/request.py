@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Any, NamedTuple
 
+from zscout.keyexpr import BadName, check_rc, is_pattern, matcher
 from zscout.messages import Amounts, Ask, Notice, OpenRequest
 from zscout.scheduling.model import NO_TERM, SECOND, Grant, Ns, Place, Term
 
@@ -41,6 +42,10 @@ class OpenArc:
     place: Place | None = None
     ahead: int | None = None
     grant: Grant | None = None
+    rcs: list[str] = field(default_factory=list)
+    """What it holds, or held last."""
+    bound: dict[str, str] = field(default_factory=dict)
+    """By each of its patterns: the RC among them that meets it."""
     end: Ns = 0
     """When the minimum runtime of the present hold is over, on this host's clock."""
     since: Ns = 0
@@ -56,8 +61,12 @@ class OpenArc:
         return self.state in ("asking", "queued", "running")
 
     def take(self, notice: Notice, now: Ns) -> bool:
-        """Takes a newer word about this request. False if it is an old one, or a replaced RCM's."""
+        """Takes a newer word about this request. False if it is an old one, a replaced RCM's, or tells of a
+        hold that is not what was asked for."""
         if (notice.term, notice.step) <= self.last or not self.open:
+            return False
+        bound = self._binding(notice)
+        if bound is None:
             return False
         self.last = (notice.term, notice.step)
         if notice.state != self.state or notice.grant != self.grant:
@@ -74,8 +83,18 @@ class OpenArc:
             self.place = notice.place
         if notice.state == "running":
             self.grant = notice.grant
+            self.bound, self.rcs = bound, sorted(bound.get(need, need) for need in self.needs)
             self.end = now + round((notice.remaining or 0.0) * SECOND)
         return True
+
+    def _binding(self, notice: Notice) -> dict[str, str] | None:
+        """The RC that meets each pattern, each another one; None: this is no binding of what was asked."""
+        bound = {need: notice.bound.get(need, "") for need in self.needs if is_pattern(need)}
+        if notice.state != "running" or not bound:
+            return {}
+        rcs = {bound.get(need, need) for need in self.needs}
+        fits = all(_is_rc(rc) and matcher(need)(rc) for need, rc in bound.items())
+        return bound if fits and len(rcs) == len(self.needs) else None
 
     def _close(self, ending: Ending, now: Ns) -> None:
         if self.grant is not None:
@@ -122,6 +141,14 @@ class OpenArc:
             waited=self._waited(now),
             grant=self.grant,
         )
+
+
+def _is_rc(name: str) -> bool:
+    try:
+        check_rc(name)
+    except BadName:
+        return False
+    return True
 
 
 def amounts(needs: Needs) -> dict[str, Amounts]:

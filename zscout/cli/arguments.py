@@ -10,8 +10,9 @@ from typing import Any, Final
 import click
 
 from zscout import amounts
-from zscout.keyexpr import BadName, check_name, check_rc
+from zscout.keyexpr import BadName, check_name, check_need, is_pattern
 from zscout.messages import MAX_NEEDS, MAX_PARAMS
+from zscout.scheduling.patterns import check_patterns
 from zscout.strict import BadInput, quoted
 
 Needs = dict[str, dict[str, Decimal]]
@@ -42,7 +43,7 @@ class Duration(click.ParamType[Decimal]):
 
 
 class Need(click.ParamType[tuple[str, dict[str, Decimal]]]):
-    """An RC and how it will be used."""
+    """An RC or a pattern, and how it will be used."""
 
     name = "need"
 
@@ -77,10 +78,11 @@ def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
 
 
 def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
-    """`robot/scout33`, or with bandwidth parameters `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
+    """`robot/scout33`, a pattern such as `framegrabber/*`, or with bandwidth parameters
+    `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
     rc, colon, rest = text.partition(":")
     try:
-        check_rc(rc)
+        check_need(rc)
     except BadName as error:
         raise BadInput(f"need {quoted(text)}: {error}") from None
     params: dict[str, Decimal] = {}
@@ -107,12 +109,28 @@ def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
 
 
 def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
-    """The needs of one ARC. Raises BadInput where there are too many, or one RC is named twice."""
+    """The needs of one ARC; a pattern that comes again is numbered: `framegrabber/*#2` is the second.
+
+    Raises BadInput where there are too many, one RC is named twice, or patterns contradict each other."""
+    if len(pairs) > MAX_NEEDS:
+        raise BadInput(f"{len(pairs)} RCs; at most {MAX_NEEDS} are allowed in one request")
     needs: Needs = {}
-    for rc, params in pairs:
-        if rc in needs:
-            raise BadInput(f"{rc} is named twice; name each RC once, all its parameters after one colon")
-        needs[rc] = params
-    if len(needs) > MAX_NEEDS:
-        raise BadInput(f"{len(needs)} RCs; at most {MAX_NEEDS} are allowed in one request")
+    # Numbers that are written out are not given to others.
+    written = {need for need, _ in pairs}
+    for need, params in pairs:
+        name = need
+        if need in needs:
+            if not is_pattern(need):
+                raise BadInput(
+                    f"{need} is named twice; name each RC once, all its parameters after one colon"
+                )
+            if "#" in need:
+                raise BadInput(f"{need} is named twice; leave the numbers out, and they are given")
+            numbered = (f"{need}#{number}" for number in range(2, MAX_NEEDS + 2))
+            name = next(one for one in numbered if one not in needs and one not in written)
+        needs[name] = params
+    try:
+        check_patterns({need: amounts.exact_amounts(params) for need, params in needs.items()})
+    except ValueError as error:
+        raise BadInput(str(error)) from None
     return needs

@@ -20,6 +20,7 @@ from zscout.cli.arguments import Duration, Need, Needs, gather_needs
 from zscout.cli.common import Failed, clean, connected, fleet_file, json_option, run, span
 from zscout.cli.dry_run import foresee
 from zscout.cli.run_command import RunningCommand, check_command, environment
+from zscout.cli.seen import held_text
 from zscout.cli.waiting import Report
 from zscout.keyexpr import check_name, valid_name
 from zscout.strict import BadInput
@@ -121,7 +122,11 @@ def request(
     """Wait until all of the devices are granted at once, then hold them.
 
     A NEED is kind/name, and for a sharable device how it will be used:
-    radio/rf0:command_rate=5,other=1. With a COMMAND, they are held while it
+    radio/rf0:command_rate=5,other=1. With a * it is met by any one device whose
+    name matches: 'framegrabber/*' is any framegrabber, 'robot/scout$*' any robot
+    whose name begins so; twice the same is two of them. Quote it for the shell.
+
+    With a COMMAND, they are held while it
     runs, for the minimum runtime at most (--keep: for longer), and given back
     as soon as it ends. When its time is over or the grant is taken away, the
     command's process group gets SIGTERM, and SIGKILL after the grace. Without
@@ -131,6 +136,8 @@ def request(
     The command finds in its environment:
       ZSCOUT_ARC, ZSCOUT_ARC_ID  the ARC's name and id
       ZSCOUT_RCS                 the devices, with spaces between
+      ZSCOUT_BOUND               which of them meets which pattern, as JSON:
+                                 {"framegrabber/*": "framegrabber/fgrab1"}
       ZSCOUT_GRANT               the grant as JSON, to be sent with each command
       ZSCOUT_CLIENT              who holds it: <host>/<client>
       ZSCOUT_REMAINING           seconds until the minimum runtime is over
@@ -149,6 +156,7 @@ def request(
       zscout request robot/scout33 --min-runtime 2m
       zscout request robot/scout33 radio/rf0:command_rate=5 --keep -- ./survey.py --fast
       zscout request framegrabber/fgrab1 --timeout 30 --again -- ./record.sh
+      zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- ./stereo.py
       zscout request robot/scout33 --json | jq .event
       zscout request robot/scout33 --priority 5 --dry-run
     """
@@ -245,10 +253,17 @@ async def _use(client: Client, wanted: Wanted, report: Report, arc: OpenArc) -> 
     if grant is None:  # taken away since the RCs confirmed it
         return await _taken(client, wanted, report, arc)
     held = Held(client, arc, grant)
-    rcs = ", ".join(held.rcs)
+    rcs = held_text(held.rcs, held.bound)
     length = "until it is needed elsewhere" if arc.keep else f"for {span(held.remaining)}"
     left = round(held.remaining, 3)
-    details = {"id": arc.id, "grant": grant, "rcs": held.rcs, "remaining": left, "keep": arc.keep}
+    details = {
+        "id": arc.id,
+        "grant": grant,
+        "rcs": held.rcs,
+        "bound": held.bound,
+        "remaining": left,
+        "keep": arc.keep,
+    }
     report.event("granted", f"{arc.name} holds {rcs} {length}", details)
     try:
         code = await (_run(wanted, report, held, client) if wanted.command else _hold(report, held))
@@ -287,6 +302,7 @@ async def _run(wanted: Wanted, report: Report, held: Held, client: Client) -> in
         arc=held.arc.name,
         arc_id=held.arc.id,
         rcs=held.rcs,
+        bound=held.bound,
         grant=held.grant,
         client=client.mesh.me,
         remaining=held.remaining,

@@ -23,14 +23,14 @@ from zscout.cli.common import (
     the_fleet,
 )
 from zscout.cli.request import CommandAfterDashes, Wanted, carry_out, gather, hold_options
-from zscout.cli.waiting import hold_json, hold_text, needs_seen
+from zscout.cli.seen import hold_json, hold_text, needs_seen
 from zscout.messages import HoldView, RcmState
 
 MAX_ANSWER = 4_096
 
 
 @click.command(cls=CommandAfterDashes)
-@click.argument("needs", nargs=-1, required=True, type=Need(), metavar="RC...")
+@click.argument("needs", nargs=-1, required=True, type=Need(), metavar="NEED...")
 @click.option("-y", "--yes", is_flag=True, help="Don't ask.")
 @click.option("--no-keep", is_flag=True, help="Give back when the minimum runtime is over.")
 @hold_options
@@ -40,13 +40,14 @@ def take(ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name: str 
 
     Says who will be preempted and asks, on stderr; without a terminal it needs
     --yes. Then it waits, holds and runs a COMMAND as `zscout request` does, with the
-    same exit codes; 1 also where the question was not answered with y.
+    same exit codes; 1 also where the question was not answered with y. A NEED is
+    written as there.
 
     \b
     Examples:
       zscout take robot/scout33
       zscout take robot/scout33 radio/rf0:command_rate=5 --yes -- ./drive.py
-      zscout take robot/scout33 --no-keep --min-runtime 2m
+      zscout take 'robot/*' 'framegrabber/*' --no-keep --min-runtime 2m
     """
     priority = the_fleet().operator_priority
     wanted = gather(ctx, needs, name, "operator", priority=priority, keep=not no_keep, **rest)
@@ -61,11 +62,13 @@ async def _take(wanted: Wanted, *, yes: bool) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Toll:
-    """What taking costs others: holds that end for certain, that may end, and that do not yield."""
+    """What taking costs others: holds that end for certain, that may end, and that do not yield. Of `either`,
+    by pattern, one must end before it is met."""
 
     ends: list[HoldView]
     may_end: list[HoldView]
     stays: list[HoldView]
+    either: dict[str, list[HoldView]]
     absent: list[str]
 
     def lines(self) -> list[str]:
@@ -73,6 +76,10 @@ class Toll:
         said = [f"preempts {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends]
         said += [f"may preempt {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end]
         said += [f"waits for {hold_text(hold)}" for hold in self.stays]
+        said += [
+            f"waits for {need}: {' or '.join(hold_text(hold) for hold in holds)}"
+            for need, holds in self.either.items()
+        ]
         said += [f"waits for {rc}, which is not on the mesh" for rc in self.absent]
         return said
 
@@ -82,6 +89,9 @@ class Toll:
             "preempts": [hold_json(hold) for hold in self.ends],
             "may_preempt": [hold_json(hold) for hold in self.may_end],
             "waits_for": [hold_json(hold) for hold in self.stays],
+            "waits_for_one_of": {
+                need: [hold_json(hold) for hold in holds] for need, holds in self.either.items()
+            },
             "absent": self.absent,
         }
 
@@ -91,18 +101,31 @@ def toll(state: RcmState, wanted: Wanted) -> Toll:
     ends: dict[str, HoldView] = {}
     may_end: dict[str, HoldView] = {}
     stays: dict[str, HoldView] = {}
+    either: dict[str, list[HoldView]] = {}
     needs = needs_seen(state, wanted.needs)
     for need in needs:
-        for hold in need.holds:
-            key = f"{hold.client}/{hold.id}"
-            overstays = hold.keep and hold.remaining <= 0 and hold.priority == wanted.priority
-            if hold.priority < wanted.priority or overstays:
-                (may_end if need.sharable else ends)[key] = hold
-            elif not need.sharable:
-                stays[key] = hold
+        if need.rc is None and need.met:
+            continue
+        choice = len(need.rcs) > 1
+        keeps: dict[str, HoldView] = {}
+        yields = False
+        for rc in need.rcs:
+            for hold in rc.holds:
+                key = f"{hold.client}/{hold.id}"
+                overstays = hold.keep and hold.remaining <= 0 and hold.priority == wanted.priority
+                if hold.priority < wanted.priority or overstays:
+                    (may_end if rc.sharable or choice else ends)[key] = hold
+                    yields = True
+                elif not rc.sharable:
+                    keeps[key] = hold
+        # With a choice, the RCM takes from the lowest priority that yields.
+        if not choice:
+            stays |= keeps
+        elif keeps and not yields:
+            either[need.need] = list(keeps.values())
     may_end = {key: hold for key, hold in may_end.items() if key not in ends}
-    absent = [need.rc for need in needs if not need.present]
-    return Toll(list(ends.values()), list(may_end.values()), list(stays.values()), absent)
+    absent = [need.need for need in needs if not need.present]
+    return Toll(list(ends.values()), list(may_end.values()), list(stays.values()), either, absent)
 
 
 async def _agree(client: Client, wanted: Wanted, *, yes: bool) -> None:

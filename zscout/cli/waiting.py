@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Self
@@ -13,7 +13,8 @@ from zscout import clock
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import OpenArc
 from zscout.cli.common import at_terminal, clean, console, print_json, print_line, span
-from zscout.messages import HoldView, RcmState
+from zscout.cli.seen import held_text, needs_seen
+from zscout.messages import RcmState
 from zscout.scheduling.model import SECOND, Ns
 
 if TYPE_CHECKING:
@@ -24,58 +25,12 @@ REFRESH = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Need:
-    """One RC that is asked for, as the RCM sees it."""
-
-    rc: str
-    present: bool
-    sharable: bool
-    holds: list[HoldView]
-
-    def text(self) -> str:
-        """Who has it and since when, in words."""
-        return f"{self.rc}: " + "; ".join(hold_text(hold) for hold in self.holds)
-
-    def as_json(self) -> dict[str, Any]:
-        holders = [hold_json(hold) for hold in self.holds]
-        return {"rc": self.rc, "present": self.present, "sharable": self.sharable, "holders": holders}
-
-
-@dataclass(frozen=True, slots=True)
 class Ending:
     """How the last hold came to its end, in the protocol's word and in words."""
 
     outcome: str = "lost"
     reason: str = ""
     by: str | None = None
-
-
-def needs_seen(state: RcmState, rcs: Iterable[str], own: str = "") -> list[Need]:
-    """How each RC stands, holds of the ARC with id `own` left out."""
-    views = {view.rc: view for view in state.rcs}
-    seen = []
-    for rc in sorted(rcs):
-        view = views.get(rc)
-        holds = [hold for hold in state.holds if rc in hold.needs and hold.id != own]
-        seen.append(Need(rc, view is not None and view.present, view is not None and view.sharable, holds))
-    return seen
-
-
-def hold_text(hold: HoldView) -> str:
-    left = "kept" if hold.keep else f"{span(hold.remaining)} left"
-    return clean(f"{hold.arc} (priority {hold.priority}, {hold.client}) for {span(hold.held)}, {left}")
-
-
-def hold_json(hold: HoldView) -> dict[str, Any]:
-    return {
-        "arc": hold.arc,
-        "id": hold.id,
-        "client": hold.client,
-        "priority": hold.priority,
-        "held": round(hold.held, 3),
-        "remaining": round(hold.remaining, 3),
-        "keep": hold.keep,
-    }
 
 
 class Report:
@@ -173,24 +128,27 @@ class Report:
             await asyncio.sleep(left)
 
     def _tell_wait(self, arc: OpenArc, state: RcmState | None) -> None:
-        needs = needs_seen(state, arc.needs, arc.id) if state is not None else []
+        own = f"{self._client}/{arc.id}"
+        needs = needs_seen(state, arc.needs, own) if state is not None else []
         told, starts_in = self._estimate(arc, state)
         start = ""
         if told:
             start = "no start can be foretold" if starts_in is None else f"starts in {span(starts_in)}"
-        # A sharable RC has holders who are in nobody's way, unless the reason names it.
-        in_way = [need for need in needs if need.holds and (not need.sharable or need.rc in arc.reason)]
+        # A sharable RC has holders who are in nobody's way, unless the reason names it. Two patterns may be
+        # met by one RC: it is told of once.
+        met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
+        in_way = [rc for rc in met.values() if not rc.sharable or rc.rc in arc.reason]
         ahead = f", {arc.ahead} ahead" if arc.ahead else ""
         self.show(
             f"{arc.name} waits {span(_since(arc))}{ahead}{start and f', {start}'}: {arc.reason}",
-            *(f"  {need.text()}" for need in in_way),
+            *(f"  {rc.text()}" for rc in in_way),
         )
         # Without the estimate: it changes all the time.
         now = (arc.state, arc.reason, arc.ahead)
         if self._watched or self._said == now:
             return
         self._said = now
-        more = "".join(f"; {text}" for text in (start, *(need.text() for need in in_way)) if text)
+        more = "".join(f"; {text}" for text in (start, *(rc.text() for rc in in_way)) if text)
         details = {
             "id": arc.id,
             "reason": arc.reason,
@@ -213,7 +171,7 @@ class Report:
             self._changed.clear()
             left = (arc.end - clock.now()) / SECOND
             rest = f"held for {span(_since(arc))}, kept" if arc.keep else f"{span(left)} left"
-            self.show(f"{arc.name} holds {', '.join(sorted(arc.needs))}: {rest}; Ctrl-C gives back")
+            self.show(f"{arc.name} holds {held_text(arc.rcs, arc.bound)}: {rest}; Ctrl-C gives back")
             await self._news_or_a_second()
 
     async def within(self, seconds: float, true: Callable[[], bool]) -> None:

@@ -10,7 +10,8 @@ import click
 from msgspec import structs
 
 from zscout.cli import common
-from zscout.messages import HoldView, RcmState, RcView, StoryLine, WaitView
+from zscout.cli.seen import SeenNeed, hold_json, needs_seen
+from zscout.messages import HoldView, RcmState, StoryLine, WaitView
 from zscout.strict import quoted
 
 if TYPE_CHECKING:
@@ -71,10 +72,9 @@ async def _look(asked: str) -> dict[str, Any]:
 async def _told(client: Client, view: View, state: RcmState) -> dict[str, Any]:
     """One open ARC, with its own story and not that of others of its name."""
     story = (await common.state_of(client, _full(view))).story
-    rcs = {rc.rc: rc for rc in state.rcs}
     told = structs.asdict(view) | {
         "state": "running" if isinstance(view, HoldView) else "queued",
-        "needs": [_need(rc, view, rcs.get(rc), state) for rc in sorted(view.needs)],
+        "needs": [_need(need, view) for need in needs_seen(state, view.needs, _full(view))],
         "story": _story(story),
     }
     if isinstance(view, WaitView):
@@ -83,26 +83,16 @@ async def _told(client: Client, view: View, state: RcmState) -> dict[str, Any]:
     return told
 
 
-def _need(name: str, view: View, rc: RcView | None, state: RcmState) -> dict[str, Any]:
-    return {
-        "rc": name,
-        "params": view.needs[name],
-        "present": rc is not None and rc.present,
-        "sharable": rc is not None and rc.sharable,
-        "holders": [
-            {
-                "arc": hold.arc,
-                "id": hold.id,
-                "client": hold.client,
-                "priority": hold.priority,
-                "held": hold.held,
-                "remaining": hold.remaining,
-                "keep": hold.keep,
-                "params": hold.needs[name],
-            }
-            for hold in state.holds
-            if name in hold.needs and _full(hold) != _full(view)
-        ],
+def _need(seen: SeenNeed, view: View) -> dict[str, Any]:
+    """One need; of a hold `need` is what was asked for, and `rc` what it has."""
+    met = {rc: need for need, rc in view.bound.items()} if isinstance(view, HoldView) else {}
+    holders = [
+        hold_json(hold) | {"rc": rc.rc, "params": hold.needs[rc.rc]} for rc in seen.rcs for hold in rc.holds
+    ]
+    return seen.as_json() | {
+        "need": met.get(seen.need, seen.need),
+        "params": view.needs[seen.need],
+        "holders": holders,
     }
 
 
@@ -174,15 +164,20 @@ def _standing(arc: dict[str, Any]) -> Iterator[Line]:
 
 def _need_words(need: dict[str, Any]) -> Iterator[Line]:
     amounts = common.amount_text(need["params"])
-    name = f"  {need['rc']}" + (f" ({amounts})" if amounts else "")
+    rc = need["rc"]
+    what = need["need"] if rc in (None, need["need"]) else f"{rc} for {need['need']}"
+    name = f"  {what}" + (f" ({amounts})" if amounts else "")
     if not need["present"]:
         yield f"{name}: not on the mesh", {"fg": "red"}
+    elif rc is None and need["free"]:
+        yield f"{name}: no ARC holds {', '.join(need['free'])}", {"fg": "green"}
     elif not need["holders"]:
         yield f"{name}: no other ARC holds it", {"fg": "green"}
     for holder in need["holders"] if need["present"] else ():
         share = common.amount_text(holder["params"])
+        which = "" if rc is not None else f"{holder['rc']} "
         yield (
-            f"{name}: {'shared with' if need['sharable'] else 'held by'} {holder['arc']}"
+            f"{name}: {which}{'shared with' if need['sharable'] else 'held by'} {holder['arc']}"
             + (f" ({share})" if share else "")
             + f" of {holder['client']}, priority {holder['priority']}, for {common.span(holder['held'])}; "
             + _left(holder),

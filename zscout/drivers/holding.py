@@ -126,6 +126,7 @@ class Holding:
                 priority=view.priority,
                 keep=view.keep,
                 params=view.needs[self.rc],
+                bound=view.bound,
             )
             self._begin(holder, change, now)
         return change

@@ -22,6 +22,7 @@ from zscout.keyexpr import check_need, is_pattern
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, Need, Ns, Params, Rc
 from zscout.scheduling.reservations import Reservations
+from zscout.scheduling.visit import listed
 from zscout.scheduling.votes import Votes
 
 
@@ -102,6 +103,14 @@ def bind_all(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None 
             claimed |= arc.mask & ~arc.named
         else:
             floor.unbind(arc)
+
+
+def nothing_left(floor: Floor, arc: Arc) -> str:
+    """Which patterns keep an ARC from being bound at all, in words."""
+    there = {need: sum(rc.present for rc in floor.matching(need)) for need in arc.slots}
+    # Those without any; else there are some for each, but not enough for all.
+    short = sorted(need for need, count in there.items() if not count) or sorted(there)
+    return f"no RC on the mesh is left for {listed(short)}"
 
 
 def check_patterns(needs: Mapping[Need, Params]) -> None:

@@ -42,7 +42,7 @@ from typing import Literal, Protocol, TypeAlias
 
 from zscout.scheduling.floor import Floor
 from zscout.scheduling.model import Arc, Need, Ns, Rank, Rc, RcName
-from zscout.scheduling.patterns import Binder
+from zscout.scheduling.patterns import Binder, nothing_left
 from zscout.scheduling.reservations import Bar, Reservations
 from zscout.scheduling.visit import Admitted, Open, Refused, Visit, absence, listed, over_quota
 from zscout.scheduling.votes import HolderSet, Votes
@@ -180,7 +180,7 @@ class Pass:
         if best is None:
             self.floor.unbind(arc)
             self.waits.reopen(arc)
-            self.actions.wait(arc, f"no RC on the mesh is left for {listed(sorted(arc.slots))}")
+            self.actions.wait(arc, nothing_left(self.floor, arc))
             return
         self.floor.bind(arc, best[0])
         self._carry_out(arc, Visit(self.floor, self.votes, self.now, arc), best[1])

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from zscout.amounts import duration, exact_amounts
 from zscout.config import Limits
-from zscout.keyexpr import BadName, Sender, check_name, check_rc
+from zscout.keyexpr import BadName, Sender, check_name, check_need
 from zscout.mesh import Refused
 from zscout.messages import MAX_PARAMS, Ask, Foresee
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcId, Request
+from zscout.scheduling.patterns import check_patterns
 
 MAX_PRIORITY = 1_000_000
 
@@ -29,15 +30,17 @@ def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: Li
     try:
         check_name(ask.arc, "arc")
         for name, params in ask.needs.items():
-            check_rc(name)
+            check_need(name)
             if len(params) > MAX_PARAMS:
                 raise ValueError(f"{name} has more than {MAX_PARAMS} parameters")
             for parameter in params:
                 check_name(parameter, f"parameter of {name}")
+        needs = {name: exact_amounts(params) for name, params in ask.needs.items()}
+        check_patterns(needs)
         return Request(
             arc=arc,
             client=str(sender),
-            needs={name: exact_amounts(params) for name, params in ask.needs.items()},
+            needs=needs,
             priority=ask.priority,
             min_runtime=duration(ask.min_runtime, "min_runtime"),
             keep=ask.keep,

@@ -8,7 +8,7 @@ from collections import OrderedDict
 from typing import Any
 
 from zscout import clock
-from zscout.keyexpr import BadName, client_of
+from zscout.keyexpr import BadName, client_of, is_pattern
 from zscout.mesh import Mesh
 from zscout.messages import Notice, State
 from zscout.scheduling.core import Core
@@ -133,6 +133,8 @@ class Notices:
     def of_arc(self, arc: Arc) -> Notice:
         state: State = "queued" if arc.hold is None else "running"
         hold = arc.hold
+        # While it waits, what it is bound to is only what it was last looked at with.
+        rcs = arc.needs if hold is not None else [need for need in arc.request.needs if not is_pattern(need)]
         return self._notice(
             arc.id,
             arc.request.client,
@@ -143,7 +145,8 @@ class Notices:
             place=arc.place,
             ahead=self._ahead(arc) if hold is None else None,
             grant=hold.grant if hold is not None else None,
-            rcs=sorted(arc.request.needs),
+            rcs=sorted(rcs),
+            bound=dict(arc.bound) if hold is not None else {},
             remaining=(hold.end - clock.now()) / SECOND if hold is not None else None,
         )
 

@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 
 from zscout.amounts import duration, exact_amounts
-from zscout.keyexpr import BadName, check_name, check_rc, client_of
+from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState
 from zscout.scheduling.events import Standing, Waiting
-from zscout.scheduling.model import SECOND, Grant, Ns, RcName, Request
+from zscout.scheduling.model import SECOND, Grant, Need, Ns, RcName, Request
+from zscout.scheduling.patterns import check_patterns
 from zscout.services import views
 
 log = logging.getLogger(__name__)
@@ -81,34 +82,60 @@ def _inherit_hold(
     asked: tuple[str, OpenRequest] | None,
     now: Ns,
 ) -> None:
-    some = next(iter(held.values()))
-    # An absent RC's parameters are known to the client only.
-    needs: dict[str, Amounts] = {name: {} for name in some.rcs}
+    # An RC from before there were patterns passes on nothing about them.
+    some = max(held.values(), key=lambda holder: len(holder.bound))
+    patterns = _patterns(some)
+    needs: dict[str, Amounts] = {patterns.get(name, name): {} for name in some.rcs}
+    # An absent RC's parameters are known to the client only, unless another RC meets a like pattern: those
+    # of one kind have all the same.
+    kinds = {_kind(patterns[name]): holder.params for name, holder in held.items() if name in patterns}
+    needs |= {need: kinds[_kind(need)] for need in patterns.values() if _kind(need) in kinds}
     if asked is not None:
-        needs |= {name: params for name, params in asked[1].needs.items() if name in needs}
-    needs |= {name: holder.params for name, holder in held.items()}
+        needs |= {need: params for need, params in asked[1].needs.items() if need in needs}
+    needs |= {patterns.get(name, name): holder.params for name, holder in held.items()}
     request = _request(arc, some.client, needs, some)
     # Of a gang with an absent RC the core says by name what was lost; half a gang that is all there is none.
     if all(name in held or name not in result.rcs for name in some.rcs):
         remaining = min(holder.remaining for holder in held.values())
         end = now + round(remaining * SECOND)
-        result.standing.append(Standing(request, some.place, grant, end - request.min_runtime, end))
+        result.standing.append(
+            Standing(request, some.place, grant, end - request.min_runtime, end, some.bound)
+        )
     else:
         result.waiting.append(Waiting(request, some.place))
+
+
+def _patterns(said: Holder) -> dict[RcName, Need]:
+    """By RC: the pattern that it meets. Raises BadName, ValueError."""
+    for rc in said.rcs:
+        check_rc(rc)
+    for need, rc in said.bound.items():
+        if not is_pattern(check_need(need)) or rc not in said.rcs or not matcher(need)(rc):
+            raise ValueError(f"it does not hold {rc[:130]!r} for {need[:130]!r}")
+    patterns = {rc: need for need, rc in said.bound.items()}
+    if len(patterns) < len(said.bound):
+        raise ValueError("one RC is said to meet two of its patterns")
+    return patterns
 
 
 def _request(arc: str, client: str, needs: dict[str, Amounts], said: OpenRequest | Holder) -> Request:
     client_of(client)
     check_name(said.id, "id")
     check_name(said.arc, "arc")
-    for name in needs:
-        check_rc(name)
+    for need in needs:
+        check_need(need)
+    wanted = {need: exact_amounts(params) for need, params in needs.items()}
+    check_patterns(wanted)
     return Request(
         arc=arc,
         client=client,
-        needs={name: exact_amounts(params) for name, params in needs.items()},
+        needs=wanted,
         priority=said.priority,
         min_runtime=duration(Decimal(said.min_runtime), "min_runtime"),
         keep=said.keep,
         label=said.arc,
     )
+
+
+def _kind(need: str) -> str:
+    return need.partition("/")[0]

@@ -29,8 +29,14 @@ def amounts(params: Params) -> Amounts:
     return {name: _decimal(value) for name, value in params.items()}
 
 
-def needs(arc: Arc) -> dict[str, Amounts]:
-    return {name: amounts(params) for name, params in sorted(arc.request.needs.items())}
+def asked(arc: Arc) -> dict[str, Amounts]:
+    """Its needs as they were asked for, patterns among them."""
+    return {need: amounts(params) for need, params in sorted(arc.request.needs.items())}
+
+
+def held(arc: Arc) -> dict[str, Amounts]:
+    """Its needs by the RCs that it holds."""
+    return {rc: amounts(params) for rc, params in sorted(arc.needs.items())}
 
 
 def holder(arc: Arc, hold: Hold, rc: str, now: Ns) -> Holder:
@@ -40,12 +46,13 @@ def holder(arc: Arc, hold: Hold, rc: str, now: Ns) -> Holder:
         client=arc.request.client,
         grant=hold.grant,
         place=arc.place,
-        rcs=sorted(arc.request.needs),
+        rcs=sorted(arc.needs),
         min_runtime=seconds(arc.request.min_runtime),
         remaining=(hold.end - now) / SECOND,
         priority=arc.request.priority,
         keep=arc.request.keep,
-        params=amounts(arc.request.needs[rc]),
+        params=amounts(arc.needs[rc]),
+        bound=dict(arc.bound),
     )
 
 
@@ -81,11 +88,12 @@ def hold_view(arc: Arc, hold: Hold, now: Ns) -> HoldView:
         priority=arc.request.priority,
         grant=hold.grant,
         place=arc.place,
-        needs=needs(arc),
+        needs=held(arc),
         min_runtime=seconds(arc.request.min_runtime),
         held=(now - hold.start) / SECOND,
         remaining=(hold.end - now) / SECOND,
         keep=arc.request.keep,
+        bound=dict(arc.bound),
     )
 
 
@@ -96,7 +104,7 @@ def wait_view(arc: Arc, reason: str, now: Ns, start: Ns | None = None) -> WaitVi
         client=arc.request.client,
         priority=arc.request.priority,
         place=arc.place,
-        needs=needs(arc),
+        needs=asked(arc),
         min_runtime=seconds(arc.request.min_runtime),
         waited=(now - arc.since) / SECOND,
         reason=reason,
