@@ -62,7 +62,7 @@ BAD_FLEETS = {
     ),
     '[fleet]\npreempt = "never"': 'fleet.preempt: is the text "never"; write "after_min_runtime" or "always"',
     "[fleet]\npatience = -1": "fleet.patience: is -1 s; write 0 to 31622400 seconds",
-    "[fleet]\npatience = nan": "fleet.patience: is NaN s; write 0 to 31622400 seconds",
+    "[fleet]\npatience = nan": "fleet.patience: is not a finite number; write a number",
     '[fleet]\npromise = "all"\npatience = 0': (
         'fleet.promise: is "all", but only "adaptive" with some patience promises anything; '
         'write strategy = "adaptive" and a patience above 0, or promise = "equals"'

@@ -166,7 +166,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     assert high.poll() is None
     # Now one of them is free: nobody has to be asked.
     fleet.state(lambda state: len(state.holds) == 1)
-    done = fleet.zscout("take", ANY, "robot/$*", "--", "sh", "-c", "echo $ZSCOUT_RCS")
+    done = fleet.zscout("take", ANY, "robot/$*a", "--", "sh", "-c", "echo $ZSCOUT_RCS")
     assert (done.returncode, done.stdout) == (0, f"{F1} robot/a\n"), done.stderr
     end(high)
     assert fleet.idle(F1, F2, "robot/a")
