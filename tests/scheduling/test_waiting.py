@@ -15,6 +15,7 @@ from zscout.scheduling.events import Asked, LeadTaken, RcJoined, Tick, Waiting
 from zscout.scheduling.model import NO_TERM, SECOND, Ns, Params, Place, RcName, Request, Term
 from zscout.scheduling.policy import Policy
 from zscout.scheduling.replay import Replay, replay
+from zscout.scheduling.reservations import MAX_OWED
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 
 RUNS = 10_000
@@ -66,6 +67,7 @@ def check_bound(workload: Workload, played: Replay, patience: Ns) -> int:
         ]:
             linked |= {one.arc: one for one in found}
         ahead = sum(one.min_runtime for one in linked.values() if one is not arc)
+        ahead += longest * ((len(linked) - 1) // MAX_OWED)
         bound = max(patience, patience // 2 + longest) + ahead
         assert waited <= bound, f"{arc.arc} waited {waited / SECOND} s, promised are {bound / SECOND}"
     return tried

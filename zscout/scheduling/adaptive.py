@@ -27,7 +27,7 @@ from zscout.scheduling.model import ArcId, Ns, RcName
 from zscout.scheduling.packing import Item, Problem, numbers, pack
 from zscout.scheduling.parts import Part, parts_in_play
 from zscout.scheduling.priority import Actions
-from zscout.scheduling.reservations import Reservations
+from zscout.scheduling.reservations import Reservations, reservations
 from zscout.scheduling.votes import HolderSet, Votes
 
 WORK: Final = 20_000
@@ -53,8 +53,8 @@ SEARCHING: Final = "a better schedule is sought"
 
 
 def steps_for(size: int) -> int:
-    """Steps that a part of so many ARCs is worth: 306 for 100, 5,840 for 600."""
-    return min(MAX_STEPS, size * (130 + size) // 75)
+    """Steps that a part of so many ARCs is worth: 246 for 100, 5,480 for 600."""
+    return min(MAX_STEPS, size * (85 + size) // 75)
 
 
 @dataclass(slots=True)
@@ -163,8 +163,8 @@ class Adaptive:
         if patience is None:
             return None
         before = self._reserved
-        reserved = self._reserved = Reservations(floor, votes, now, patience)
-        if before is not None:
+        reserved = self._reserved = reservations(floor, votes, now, patience, before)
+        if before is not None and before is not reserved:
             floor.waits.freed |= reserved.changed(before)
         return reserved
 

@@ -39,6 +39,8 @@ class Floor:
         self._clients: dict[ClientId, dict[ArcId, Arc]] = {}
         self.turns = 0
         """Counts who was queued or started."""
+        self.changes = 0
+        """Grows with all that changes who holds what, which RCs are there, and who yields."""
 
     def rc(self, name: RcName) -> Rc:
         """The RC of this name, made known (absent, exclusive) if it was not."""
@@ -118,12 +120,14 @@ class Floor:
         self.present |= rc.bit
         self.sharable = self.sharable | rc.bit if sharable else self.sharable & ~rc.bit
         self.waits.freed |= rc.bit
+        self.changes += 1
 
     def leave(self, name: RcName) -> None:
         rc = self.rc(name)
         rc.present = False
         self.present &= ~rc.bit
         self.waits.freed |= rc.bit
+        self.changes += 1
 
     def enqueue(self, arc: Arc, since: Ns) -> None:
         arc.since, arc.turn = since, self._turn()
@@ -158,6 +162,7 @@ class Floor:
         """A running ARC goes on under another client."""
         self.forget(arc)
         self._count_out(arc)
+        self.changes += 1
         arc.request = replace(arc.request, client=to)
         self.owners[owner_of(to)] += 1
         self._clients.setdefault(to, {})[arc.id] = arc
@@ -166,6 +171,7 @@ class Floor:
         self.drop(arc)
         arc.hold, arc.reason, arc.since, arc.turn = hold, "", now, self._turn()
         self.running[arc.id] = arc
+        self.changes += 1
         self.waits.stirred |= arc.mask
         self.owners[owner_of(arc.request.client)] += 1
         for rc in arc.rcs:
@@ -177,6 +183,7 @@ class Floor:
         hold = arc.hold
         assert hold is not None, arc.id  # noqa: S101
         del self.running[arc.id]
+        self.changes += 1
         self._count_out(arc)
         arc.hold = None
         for rc in arc.rcs:
@@ -188,6 +195,7 @@ class Floor:
     def overstayed(self, arc: Arc) -> None:
         """A kept hold has had its minimum runtime: from now on it yields to its equals."""
         self.waits.freed |= arc.mask
+        self.changes += 1
 
     def room(self, arc: Arc) -> int | None:
         """How many more ARCs of its owner may run, if `arc` is bound by a quota."""

@@ -23,12 +23,16 @@ def parts_in_play(
 ) -> list[Part]:
     """The parts in which there is a choice, best-ranked first; none if more than `limit` ARCs could start.
 
-    One newcomer that needs no sharable RC is no choice: `priority` starts it, as any strategy would."""
+    One newcomer is no choice where nobody has to end for it, or those have to whose exclusive RCs it needs:
+    `priority` starts it, as any strategy would."""
     arcs = in_play(floor, votes, now, reserved, limit)
     return [
         Part(floor, votes, now, members, reserved)
         for members in apart(arcs or ())
-        if sum(arc.hold is None for arc in members) > 1 or any(arc.mask & floor.sharable for arc in members)
+        if len(members) > 1
+        and (
+            sum(arc.hold is None for arc in members) > 1 or any(arc.mask & floor.sharable for arc in members)
+        )
     ]
 
 

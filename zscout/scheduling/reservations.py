@@ -24,7 +24,7 @@ from zscout.scheduling.model import Arc, Ns, Rc
 from zscout.scheduling.policy import owner_of
 from zscout.scheduling.votes import HolderSet, Votes
 
-MAX_OWED: Final = 64
+MAX_OWED: Final = 16
 """ARCs that are kept a place at one time; those owed after them follow as these start."""
 
 
@@ -47,6 +47,20 @@ class Bar(NamedTuple):
         return f"{self.rc.name} is kept for {self.creditor.name}, whose time to wait is over before this ends"
 
 
+def reservations(
+    floor: Floor, votes: Votes, now: Ns, patience: Ns, last: Reservations | None
+) -> Reservations:
+    """What is kept at `now`: the `last` that was found, if nothing has changed that it depends on."""
+    floor.waits.ripen(now - patience // 2, floor.queued)
+    if last is not None and last.still(now):
+        return last
+    return Reservations(floor, votes, now, patience)
+
+
+def _inputs(floor: Floor, votes: Votes) -> tuple[int, int, int]:
+    return floor.changes, votes.changes, floor.waits.owed_changes
+
+
 class Reservations:
     """What is kept for whom at one instant: for those of `floor.waits.owed`."""
 
@@ -60,9 +74,17 @@ class Reservations:
         """RCs with claims."""
         self._free: dict[int, Ns] = {}
         """By bit: when those owed before are done with the RC."""
-        floor.waits.ripen(now - patience // 2, floor.queued)
+        self._made_of = _inputs(floor, votes)
         for _, _, arc in floor.waits.owed[:MAX_OWED]:
             self._reserve(floor.queued[arc])
+
+    def still(self, now: Ns) -> bool:
+        """Goes on to `now`. False: something has changed since this was found.
+
+        Time alone changes nothing: who is to start later is kept the same place, and nobody could be over
+        before one that is due already."""
+        self._now = now
+        return self._made_of == _inputs(self._floor, self._votes)
 
     def _reserve(self, arc: Arc) -> None:
         rcs = self._rcs(arc)

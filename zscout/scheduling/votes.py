@@ -114,6 +114,8 @@ class Votes:
         self._out: dict[int, tuple[RcName, HolderSet]] = {}
         self._next = 1
         self._silent: set[RcName] = set()
+        self.changes = 0
+        """Grows with all that changes what is known."""
         self.heard: set[RcName] = set()
         """RCs that answered, or fell silent, since somebody last took note and emptied this."""
         self.forgotten: set[RcName] = set()
@@ -165,6 +167,7 @@ class Votes:
         ballot.silent = False
         self._silent.discard(rc)
         self.heard.add(rc)
+        self.changes += 1
         if accept:
             ballot.accept(holders)
         else:
@@ -181,6 +184,7 @@ class Votes:
             return False
         ballot.overdue.add(holders)
         self.heard.add(rc)
+        self.changes += 1
         self._silent.add(rc)
         if not ballot.silent:
             ballot.silent = True
@@ -190,6 +194,7 @@ class Votes:
     def forget_rc(self, rc: RcName) -> None:
         """The RC left, came anew or changed its rules: nothing it said stands, nothing asked is awaited."""
         self.forgotten.add(rc)
+        self.changes += 1
         self._silent.discard(rc)
         ballot = self._ballots.pop(rc, None)
         if ballot is not None:
@@ -202,6 +207,7 @@ class Votes:
         if ballot is None:
             return
         ballot.forget(arc)
+        self.changes += 1
         for holders in [holders for holders in ballot.out if arc in holders]:
             self._close(ballot, holders)
 

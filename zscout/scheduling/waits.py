@@ -34,6 +34,8 @@ class Waits:
         """Of all that are queued, best first."""
         self._patient: list[tuple[Ns, ArcId]] = []
         """Those who wait and are not owed yet, by the time since when they do."""
+        self.owed_changes = 0
+        """Grows when somebody is owed, or is so no more."""
         self.owed: list[tuple[int, Ns, ArcId]] = []
         """The others: by band of priorities (negated), then by the same."""
 
@@ -48,6 +50,7 @@ class Waits:
         del self.ranks[bisect_left(self.ranks, arc.rank)]
         if arc.owed:
             arc.owed = False
+            self.owed_changes += 1
             del self.owed[bisect_left(self.owed, _claim(arc))]
         else:
             del self._patient[bisect_left(self._patient, (arc.since, arc.id))]
@@ -56,6 +59,7 @@ class Waits:
     def ripen(self, since: Ns, queued: Mapping[ArcId, Arc]) -> None:
         """Who has waited since then or longer is owed from now on."""
         ripe = bisect_right(self._patient, since, key=itemgetter(0))
+        self.owed_changes += ripe
         for _, arc_id in self._patient[:ripe]:
             arc = queued[arc_id]
             arc.owed = True
