@@ -16,7 +16,7 @@ from tests.live.lab import Lab
 from zscout import messages
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import Needs, OpenArc
-from zscout.messages import Ask, Notice, StateAsk
+from zscout.messages import Ask, HostRanking, Notice, RankAsk, StateAsk
 from zscout.scheduling.strategies import StrategyName
 
 EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
@@ -107,8 +107,16 @@ async def latencies(lab: Lab, paper: Lab, rounds: int, progress: Callable[[str],
         assert reply is not None, "the face did not answer"
         return took
 
+    async def ranking() -> float:
+        start = time.perf_counter()
+        reply = await client.mesh.ask_one(client.mesh.keys.rank, RankAsk(), HostRanking, timeout=5)
+        took = time.perf_counter() - start
+        assert reply is not None, "the balancer did not answer"
+        return took
+
     measured: dict[str, Callable[[], Awaitable[float]]] = {
         "query, asyncio face": face_query,
+        "balancer's answer": ranking,
         "grant, 1 RC": programs.grant(one),
         "1 RC under priority": papers.grant(one),
         "grant, 5 RCs": programs.grant(five),
@@ -122,6 +130,7 @@ async def latencies(lab: Lab, paper: Lab, rounds: int, progress: Callable[[str],
         "release under priority": papers.release_to_next(one),
     }
     aims = {
+        "balancer's answer": 1.2,
         "grant, 1 RC": 1.5,
         "grant, 5 RCs": 1.5,
         "grant, 2 votes": 2.6,

@@ -152,6 +152,12 @@ BAD_NODES = {
     '[node]\nhost = ""': f'node.host: "" is not a name; {NAME_RULE}',
     '[node]\nload = "yes"': 'node.load: is the text "yes"; write true or false',
     "[node]\nfleet = 1": "node.fleet: is 1; write a text in quotes",
+    '[node]\nlabels = "gpu"': 'node.labels: is the text "gpu"; write a list',
+    '[node]\nlabels = ["gpu", "a b"]': f'node.labels[1]: "a b" is not a name; {NAME_RULE}',
+    '[node]\nlabels = ["gpu", "gpu"]': (
+        'node.labels[1]: "gpu" stands at node.labels[0] already; rename or remove one of the two'
+    ),
+    f"[node]\nlabels = {['a'] * 33}": "node.labels: has 33 entries; at most 32 are allowed",
     "[mesh]\nlease = 1": "mesh.lease: unknown key; known here: connect, interface, listen",
     '[mesh]\nconnect = ["anvil"]': f'mesh.connect[0]: "anvil" is not an endpoint; {ENDPOINT_RULE}',
     '[mesh]\ninterface = "a b"': 'mesh.interface: "a b" names no interface; write "auto", or as in "eth0"',
@@ -324,6 +330,7 @@ def test_every_key_of_a_node_file() -> None:
         fleet = "../lab.toml"
         candidate = false
         load = false
+        labels = ["gpu", "arm64"]
         [mesh]
         connect = ["tcp/b:3"]
         interface = "eth1"
@@ -348,6 +355,7 @@ def test_every_key_of_a_node_file() -> None:
         listen=("tcp/a:1",), connect=("tcp/b:3",), interface="eth1", lease=0.5
     )
     assert (made.host, made.candidate, made.load) == ("anvil", False, False)
+    assert made.labels == ("gpu", "arm64")
     assert made.rcs == (
         config.RcSpec("robot/scout33", "exclusive", {}, 2_500_000_000),
         config.RcSpec("radio/rf0", "capacity", {"command_rate": Fraction(10), "share": Fraction(1, 10)}, 0),
@@ -359,7 +367,7 @@ def test_an_empty_node_file_means_the_defaults() -> None:
     made = node("")
     assert made == config.default_node()
     assert (made.fleet, made.candidate, made.load, made.rcs) == (config.default_fleet(), True, True, ())
-    assert made.recorder is None
+    assert (made.recorder, made.labels) == (None, ())
     assert strict.check_name(made.host, Where("host")) == made.host
 
 

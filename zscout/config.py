@@ -19,6 +19,7 @@ from msgspec import Meta, Struct, structs
 
 from zscout.endpoints import check_links, check_multicast, ip_of
 from zscout.keyexpr import valid_name
+from zscout.messages import MAX_LABELS
 from zscout.scheduling.model import SECOND, Ns
 from zscout.scheduling.policy import OPERATOR_PRIORITY, PATIENCE, Policy, Preempt, Promise
 from zscout.scheduling.strategies import StrategyName
@@ -145,6 +146,8 @@ class Node(Struct, frozen=True):
     rcs: tuple[RcSpec, ...]
     recorder: Recorder | None
     """None: this node does not record."""
+    labels: tuple[str, ...] = ()
+    """What the host is or has, for components that need it."""
 
 
 # The files as they are written
@@ -179,6 +182,7 @@ class _NodeTable(Struct, frozen=True, forbid_unknown_fields=True):
     fleet: str | None = None
     candidate: bool = True
     load: bool = True
+    labels: Annotated[tuple[str, ...], Meta(max_length=MAX_LABELS)] = ()
 
 
 class _RcTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -312,6 +316,9 @@ def _node(file: _NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     own = {key: value for key, value in structs.asdict(file.mesh).items() if value is not None}
     mesh = structs.replace(fleet.mesh, **own)
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
+    for number, label in enumerate(file.node.labels):
+        check_name(label, (top / "node" / "labels").item(number))
+    check_unique(file.node.labels, top / "node" / "labels")
     check_unique((rc.name for rc in file.rc), top / "rc", "name")
     return Node(
         host=host,
@@ -320,6 +327,7 @@ def _node(file: _NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         load=file.node.load,
         rcs=tuple(_rc(rc, (top / "rc").item(number, rc.name)) for number, rc in enumerate(file.rc)),
         recorder=None if file.recorder is None else _recorder(file.recorder, folder, top / "recorder"),
+        labels=file.node.labels,
     )
 
 

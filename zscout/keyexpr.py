@@ -201,6 +201,10 @@ class Keys:
     def load_any(self) -> str:
         return f"{self.base}/host/*/load"
 
+    @property
+    def rank(self) -> str:
+        return f"{self.base}/balancer/rank"
+
     # Clients
 
     def notice(self, client: Sender) -> str:

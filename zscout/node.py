@@ -58,7 +58,7 @@ async def run_node(node: Node, stop: asyncio.Event) -> None:
             stack.push_async_callback(rc.stop)
             log.info("runs %s (%s)", spec.name, spec.driver)
         if node.load:
-            reporter = LoadReporter(mesh)
+            reporter = LoadReporter(mesh, node.labels)
             reporter.start()
             stack.push_async_callback(reporter.stop)
         if node.recorder is not None:

@@ -64,7 +64,7 @@ def test_in_a_pipe_it_prints_plain_tables(capsys: pytest.CaptureFixture[str]) ->
 
 def test_the_group_s_help_leads_to_the_options(capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here("study", "--help") == 0
-    assert "schedule  Compares scheduling strategies" in capsys.readouterr().out
+    assert "Compares scheduling strategies" in capsys.readouterr().out
     assert zscout_here("study", "schedule", "--help") == 0
     assert "--family" in capsys.readouterr().out
 

@@ -20,6 +20,7 @@ pytestmark = pytest.mark.live
 
 DEEP = b'{"op":"request","x":' + b"[" * 20_000 + b"]" * 20_000 + b"}"
 SCHEDULE = "rcm/schedule/t/bad"
+RANK = "balancer/rank"
 VOTE = "rc/radio/a/vote"
 COMMAND = "rc/robot/a/command/t/bad"
 
@@ -106,6 +107,12 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("an empty id", SCHEDULE, bad(id=""), "bad_name", "id '' is not valid"),
     ("a long id", SCHEDULE, bad(id="x" * 65), "bad_name", "use 1 to 64 of"),
     ("an id with a line feed", SCHEDULE, bad(id="x\ny"), "bad_name", "'x\\ny' is not valid"),
+    ("no metric of ours", RANK, b'{"metric": "luck"}', "malformed", "Invalid enum value 'luck'"),
+    ("no policy of ours", RANK, b'{"policy": 7}', "malformed", "at `$.policy`"),
+    ("no host to be named", RANK, b'{"at_most": 0}', "malformed", "at `$.at_most`"),
+    ("hosts by pattern", RANK, b'{"hosts": ["*"]}', "bad_name", "host '*' is not valid"),
+    ("a thousand hosts", RANK, json.dumps({"hosts": ["h"] * 1000}).encode(), "malformed", "at `$.hosts`"),
+    ("less than no memory", RANK, b'{"memory": -1}', "malformed", "at `$.memory`"),
     ("a place of a future term", SCHEDULE, bad(place=[[HIGH, "f"], 1]), "bad_request", "place is of a term"),
     ("a place of one part", SCHEDULE, bad(place=[[1, "x"]]), "malformed", "at `$.place`"),
     ("a place before the first", SCHEDULE, bad(place=[[0, ""], 0]), "bad_request", "place was never given"),

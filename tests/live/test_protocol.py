@@ -58,6 +58,7 @@ def test_the_document_names_every_key_and_role() -> None:
         keys.schedule(sender),
         keys.grants,
         keys.rcm_state,
+        keys.rank,
         keys.vote("K/N"),
         keys.command("K/N", sender),
     ]

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.live.lab import Lab
+from tests.live.lab import START, Lab
 from zscout.behaviors.arc import Revoked, hold
+from zscout.messages import LoadReport
 
 pytestmark = pytest.mark.live
 
@@ -76,5 +77,31 @@ def test_what_would_come_is_foretold_and_nothing_is_changed_by_asking(tmp_path: 
             assert [view.arc for view in after.holds] == ["mine"]
             assert [view.arc for view in after.queue] == ["next"]
             assert (running.state, waiting.state) == ("running", "queued")
+
+    asyncio.run(story())
+
+
+def test_a_node_tells_its_load_once_a_second_with_its_labels(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            client = await lab.client()
+            heard: asyncio.Queue[tuple[float, LoadReport]] = asyncio.Queue()
+            loop = asyncio.get_running_loop()
+            keys = client.mesh.keys
+
+            def on_load(key: str, report: LoadReport) -> None:
+                assert keys.host_of(key) == report.host
+                heard.put_nowait((loop.time(), report))
+
+            client.mesh.subscribe(keys.load_any, LoadReport, on_load)
+            lab.node("a", extra='labels = ["gpu", "lab-3"]')
+            async with asyncio.timeout(START):
+                told = [await heard.get() for _ in range(4)]
+            reports = [report for _, report in told]
+            first = reports[0].number
+            assert [report.number for report in reports] == list(range(first, first + 4))
+            assert {report.labels for report in reports} == {("gpu", "lab-3")}
+            assert all(report.speed > 0.01 and report.components == () for report in reports)
+            assert told[-1][0] - told[0][0] > 2.5
 
     asyncio.run(story())

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import click
 
 from zscout.cli import common
+from zscout.cli.study_placement import placement
 from zscout.scheduling.study.families import FAMILIES
 from zscout.scheduling.study.trial import STRATEGIES, Job
 from zscout.strict import BadInput, quoted
@@ -49,8 +50,12 @@ def study() -> None:
     Examples:
       zscout study
       zscout study schedule --family paper --seeds 100
+      zscout study placement --seeds 20
       zscout study schedule --help
     """
+
+
+study.add_command(placement)
 
 
 @study.command()
@@ -117,7 +122,7 @@ def schedule(
             f"--seeds: {trials} trials are more than {MAX_TRIALS}; ask for fewer seeds or families"
         )
     if rrd is not None:
-        _check_recording(rrd)
+        check_recording(rrd)
     # numpy is wanted from here on.
     from zscout.scheduling.study.summary import Study
 
@@ -163,7 +168,7 @@ def parse_seeds(text: str) -> range:
 async def _carry_out(jobs: Sequence[Job], processes: int, result: Study) -> None:
     from zscout.cli.study_pool import spread
 
-    with _progress(len(jobs)) as advance:
+    with progress(len(jobs)) as advance:
         async with aclosing(spread(jobs, min(processes, len(jobs)))) as trials:
             async for trial in trials:
                 result.add(trial)
@@ -175,8 +180,8 @@ def _processors() -> int:
     return min(MAX_PROCESSES, len(os.sched_getaffinity(0)))
 
 
-def _check_recording(rrd: Path) -> None:
-    """Before the work, not after it."""
+def check_recording(rrd: Path) -> None:
+    """Before the work, not after it. Raises BadInput."""
     if rrd.suffix != ".rrd":
         raise BadInput(f"--rrd {rrd}: the viewer knows a recording by its name; end it in .rrd")
     try:
@@ -189,7 +194,8 @@ def _check_recording(rrd: Path) -> None:
 
 
 @contextmanager
-def _progress(total: int) -> Iterator[_Advance]:
+def progress(total: int) -> Iterator[_Advance]:
+    """A bar at a terminal, on stderr; call what it yields once for each of `total` trials."""
     if not common.at_terminal(sys.stderr):
         yield lambda: None
         return

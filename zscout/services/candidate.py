@@ -18,6 +18,7 @@ from zscout.mesh import Declared, Mesh, Reply
 from zscout.messages import ClientRequests, Grants, RcAsk, RcState, absurd
 from zscout.scheduling.model import NO_TERM, SECOND, Term
 from zscout.services.election import Election
+from zscout.services.load_balancer import LoadBalancer
 from zscout.services.rcm import Rcm
 from zscout.services.rebuild import rebuild
 
@@ -39,6 +40,8 @@ class Candidate:
         self.known: Term = NO_TERM
         """The highest term seen anywhere."""
         self.rcm: Rcm | None = None
+        self.balancer: LoadBalancer | None = None
+        """Beside the RCM, while this node leads."""
         self._changed = asyncio.Event()
         self._declared: list[Declared] = []
         self._task: asyncio.Task[None] | None = None
@@ -58,10 +61,16 @@ class Candidate:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
         if self.rcm is not None:
-            self.rcm.stop()
-            self.rcm = None
+            self._stop_leading(self.rcm)
         for declared in self._declared:
             declared.close()
+
+    def _stop_leading(self, rcm: Rcm) -> None:
+        rcm.stop()
+        self.rcm = None
+        if self.balancer is not None:
+            self.balancer.stop()
+            self.balancer = None
 
     # What is seen
 
@@ -90,8 +99,7 @@ class Candidate:
             log.warning(
                 "stepping down: term %d of another RCM is above %d", term.counter, self.rcm.term.counter
             )
-            self.rcm.stop()
-            self.rcm = None
+            self._stop_leading(self.rcm)
             self._changed.set()
 
     # Leading
@@ -173,3 +181,5 @@ class Candidate:
         )
         self.rcm = Rcm(self.mesh, self.fleet, term, self._see)
         self.rcm.start(inheritance)
+        self.balancer = LoadBalancer(self.mesh)
+        self.balancer.start()
