@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from zscout.balancing.model import POLICIES, SECOND, Ns, Policy
 from zscout.balancing.simulation import Outcome
 from zscout.balancing.study import SCENARIOS, Report
+from zscout.services.study_plots import page
 from zscout.strict import BadInput
 
 if TYPE_CHECKING:
@@ -94,18 +95,7 @@ def _blueprint() -> rrb.Blueprint:
         ]
         return rrb.Grid(*views, grid_columns=2, name=scenario)
 
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Tabs(*(tab(scenario) for scenario in SCENARIOS), active_tab=0),
-            rrb.TextDocumentView(origin="/summary", name="What was found"),
-            column_shares=[68, 32],
-        ),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIME),
-        auto_layout=False,
-        auto_views=False,
-    )
+    return page([tab(scenario) for scenario in SCENARIOS], TIME)
 
 
 def _words(report: Report) -> str:

@@ -110,7 +110,13 @@ def _blueprint(report: Report) -> rrb.Blueprint:
         ]
         return rrb.Vertical(*curves, rrb.Horizontal(*bars), row_shares=[3, 3, 2], name=family.family)
 
-    tabs = [tab(family) for family in report.families]
+    return page([tab(family) for family in report.families], TIME)
+
+
+def page(tabs: Sequence[rrb.Container], time: str) -> rrb.Blueprint:
+    """Plots in tabs, and beside them what was found, in words, from `/summary`."""
+    import rerun.blueprint as rrb
+
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Tabs(*tabs, active_tab=0),
@@ -119,7 +125,7 @@ def _blueprint(report: Report) -> rrb.Blueprint:
         ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIME),
+        rrb.TimePanel(state="collapsed", timeline=time),
         auto_layout=False,
         auto_views=False,
     )
