@@ -143,6 +143,9 @@ class Adaptive:
     def __call__(self, floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
         """One pass at `now`."""
         self.statistics.passes += 1
+        if self._reserved is None and not self._searches and _one_without_choice(floor, now):
+            priority.run_pass(floor, votes, now, actions)
+            return
         self._work, self._steps = WORK, SLICE
         if self._unfinished and self._nothing_new(floor, votes, now) and self._go_on():
             actions.again()
@@ -163,7 +166,8 @@ class Adaptive:
         if patience is None:
             return None
         before = self._reserved
-        reserved = self._reserved = reservations(floor, votes, now, patience, before)
+        reserved = reservations(floor, votes, now, patience, before)
+        self._reserved = reserved if reserved.bits else None
         if before is not None and before is not reserved:
             floor.waits.freed |= reserved.changed(before)
         return reserved
@@ -287,6 +291,17 @@ class Adaptive:
         self.statistics.last = Gain(
             part.now, _pairs(part, search.best), _pairs(part, search.heuristic), search.steps
         )
+
+
+def _one_without_choice(floor: Floor, now: Ns) -> bool:
+    """Whether one ARC waits alone, and who would have to end for it is plain: the usual case where nothing is
+    scarce, at the cost of `priority`."""
+    if len(floor.queued) != 1 or floor.policy.promise != "equals":
+        return False
+    (arc,) = floor.queued.values()
+    return not arc.slots and not any(
+        holder.yields_to(arc, now) for rc in arc.rcs if rc.sharable for holder in rc.holders.values()
+    )
 
 
 def _situation(floor: Floor) -> tuple[int, ...]:
