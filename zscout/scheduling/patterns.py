@@ -4,7 +4,7 @@ While an ARC waits, each visit *binds* it: gives each of its patterns an RC of i
 instant. So a bound ARC is like any other, and every strategy knows patterns. Where a bound RC keeps the ARC
 out, the visit goes on with the next best. A hold keeps its binding to its end.
 
-How good a choice is (`Standing`): an RC that is free, before one that somebody yields, before one that is
+How good a choice is (`Fitness`): an RC that is free, before one that somebody yields, before one that is
 kept for another or does not answer, before one that is held. The worst of an ARC's choices counts: of two
 bindings, the one that gets by without the worse kind is taken, by augmenting paths (Kuhn's algorithm), so
 that an ARC never waits where some choice of free RCs would let it run. Between equals, the RC that fewest
@@ -26,7 +26,7 @@ from zscout.scheduling.visit import listed
 from zscout.scheduling.votes import Votes
 
 
-class Standing(IntEnum):
+class Fitness(IntEnum):
     """How well an RC would do, the best first."""
 
     FREE = 0
@@ -63,36 +63,36 @@ class Binder:
         options: dict[str, list[tuple[tuple[int, float], Rc]]] = {}
         for need in arc.slots:
             matching = (rc for rc in self._floor.matching(need) if rc.present and not rc.bit & taken)
-            options[need] = sorted(((self._standing(arc, rc), rc) for rc in matching), key=_by_standing)
+            options[need] = sorted(((self._fitness(arc, rc), rc) for rc in matching), key=_by_fitness)
             if not options[need]:
                 return None
-        for worst in Standing:
+        for worst in Fitness:
             allowed = {
-                need: [rc for (standing, _), rc in found if standing <= worst]
+                need: [rc for (fitness, _), rc in found if fitness <= worst]
                 for need, found in options.items()
             }
             if all(allowed.values()) and (chosen := _distinct(allowed)) is not None:
                 return chosen
         return None
 
-    def _standing(self, arc: Arc, rc: Rc) -> tuple[int, float]:
+    def _fitness(self, arc: Arc, rc: Rc) -> tuple[int, float]:
         """How well `rc` would do, and what decides between equals."""
         wanted = float(rc.wanted)
         firm = [holder for holder in rc.holders.values() if not holder.yields_to(arc, self._now)]
         if rc.sharable:
             answer = self._votes.known(rc.name, frozenset((*(holder.id for holder in firm), arc.id)))
             if answer is None and self._votes.silent(rc.name):
-                return Standing.KEPT, wanted
+                return Fitness.KEPT, wanted
             if answer is not None and not answer.accept:
-                return Standing.HELD, wanted
-            return Standing.FREE, len(rc.holders) + (answer is None)
+                return Fitness.HELD, wanted
+            return Fitness.FREE, len(rc.holders) + (answer is None)
         if firm:
-            return Standing.HELD, max(0 if one.hold is None else one.hold.end for one in firm)
+            return Fitness.HELD, max(0 if one.hold is None else one.hold.end for one in firm)
         if self._reserved is not None and self._reserved.keeps(rc, arc):
-            return Standing.KEPT, wanted
+            return Fitness.KEPT, wanted
         if rc.holders:
-            return Standing.YIELDED, max(one.priority for one in rc.holders.values())
-        return (Standing.SPOKEN_FOR if rc.bit & self._claimed else Standing.FREE), wanted
+            return Fitness.YIELDED, max(one.priority for one in rc.holders.values())
+        return (Fitness.SPOKEN_FOR if rc.bit & self._claimed else Fitness.FREE), wanted
 
 
 def bind_all(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None) -> None:
@@ -127,7 +127,7 @@ def check_patterns(needs: Mapping[Need, Params]) -> None:
         raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
 
 
-def _by_standing(option: tuple[tuple[int, float], Rc]) -> tuple[tuple[int, float], int]:
+def _by_fitness(option: tuple[tuple[int, float], Rc]) -> tuple[tuple[int, float], int]:
     return option[0], option[1].bit
 
 

@@ -171,7 +171,7 @@ class Pass:
             tries += 1
             visit = Visit(self.floor, self.votes, self.now, arc)
             verdict = self._judge(arc, visit)
-            blame = self._blame(arc, visit, verdict)
+            blame = self._blame(arc, verdict)
             best = best or (arc.bound, verdict)
             if not blame:
                 best = arc.bound, verdict
@@ -185,7 +185,7 @@ class Pass:
         self.floor.bind(arc, best[0])
         self._carry_out(arc, Visit(self.floor, self.votes, self.now, arc), best[1])
 
-    def _blame(self, arc: Arc, visit: Visit, verdict: _Verdict) -> int:
+    def _blame(self, arc: Arc, verdict: _Verdict) -> int:
         """Bits of those RCs of a binding that keep the ARC out, where others might not."""
         match verdict:
             case Refused(rc) | Bar(rc, _, None):

@@ -52,7 +52,7 @@ def reservations(
 ) -> Reservations:
     """What is kept at `now`: the `last` that was found, if nothing has changed that it depends on."""
     floor.waits.ripen(now - patience // 2, floor.queued)
-    if last is not None and last.still(now):
+    if last is not None and last.go_on(now):
         return last
     return Reservations(floor, votes, now, patience)
 
@@ -78,7 +78,7 @@ class Reservations:
         for _, _, arc in floor.waits.owed[:MAX_OWED]:
             self._reserve(floor.queued[arc])
 
-    def still(self, now: Ns) -> bool:
+    def go_on(self, now: Ns) -> bool:
         """Goes on to `now`. False: something has changed since this was found.
 
         Time alone changes nothing: who is to start later is kept the same place, and nobody could be over
@@ -148,7 +148,6 @@ class Reservations:
         """What `arc` would be in the way of if it started now."""
         if not arc.mask & self.bits:
             return None
-        done = self._now + arc.request.min_runtime
         for rc in self._floor.of(arc.mask & self.bits):
             before: list[Arc] = []
             bars: Claim | None = None
@@ -156,7 +155,7 @@ class Reservations:
                 if claim.creditor is arc:
                     break
                 before.append(claim.creditor)
-                if bars is None and arc.band <= claim.creditor.band and done > claim.start:
+                if bars is None and self._delays(arc, claim):
                     bars = claim
             if bars is None:
                 continue
@@ -172,11 +171,11 @@ class Reservations:
     def keeps(self, rc: Rc, arc: Arc) -> bool:
         """Whether `rc`, exclusive, is kept for another who goes before `arc`."""
         claims = self.claims.get(rc.bit, ())
-        done = self._now + arc.request.min_runtime
-        return any(
-            claim.creditor is not arc and arc.band <= claim.creditor.band and done > claim.start
-            for claim in claims[:1]
-        )
+        return any(claim.creditor is not arc and self._delays(arc, claim) for claim in claims)
+
+    def _delays(self, arc: Arc, claim: Claim) -> bool:
+        """Whether `arc`, started now, would hold what the claim is for when it begins, and must not."""
+        return arc.band <= claim.creditor.band and self._now + arc.request.min_runtime > claim.start
 
     def changed(self, earlier: Reservations) -> int:
         """Bits of the RCs at which other claims stand now than then."""
