@@ -17,6 +17,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta, Struct, structs
 
+from zscout.balancing.rules import DEFAULT_RULES, Rules
 from zscout.endpoints import check_links, check_multicast, ip_of
 from zscout.keyexpr import valid_name
 from zscout.messages import MAX_LABELS
@@ -45,7 +46,12 @@ MAX_ENDPOINTS: Final = 256
 MAX_PARAMETERS: Final = 64
 """Capacities of one RC."""
 
+MAX_KINDS: Final = 256
+MAX_STARTED: Final = 256
+"""Components of one node that run at one time; a load report holds no more."""
+
 Driver = Literal["exclusive", "capacity"]
+LoadKind = bool | Literal["tree"]
 _Endpoints = Annotated[tuple[str, ...], Meta(max_length=MAX_ENDPOINTS)]
 
 
@@ -93,6 +99,17 @@ class Timing(Struct, frozen=True):
     """How long in ns a new RCM waits for what stands."""
 
 
+class Components(Struct, frozen=True, forbid_unknown_fields=True):
+    """What of other hosts' asking a node starts."""
+
+    allow: bool = True
+    """Whether it starts components at all."""
+    kinds: Annotated[tuple[str, ...], Meta(max_length=MAX_KINDS)] | None = None
+    """Only these entry points; None: all that are installed."""
+    max: Annotated[int, Meta(ge=1, le=MAX_STARTED)] = 64
+    """That run at one time."""
+
+
 class Fleet(Struct, frozen=True):
     """One mesh with one RCM at a time; the same on every host, but for the node's own part of `mesh`."""
 
@@ -104,6 +121,8 @@ class Fleet(Struct, frozen=True):
     mesh: Mesh
     limits: Limits
     timing: Timing
+    rules: Rules = DEFAULT_RULES
+    """Of the component placer."""
 
     @property
     def operator_priority(self) -> int:
@@ -141,13 +160,15 @@ class Node(Struct, frozen=True):
     """With this host's own `listen`, `connect` and `interface` in its `mesh`."""
     candidate: bool
     """Whether this host may lead, if the fleet's `candidates` let it."""
-    load: bool
-    """Whether the host reports its load."""
+    load: LoadKind
+    """Whether the host reports its load; "tree": only that of this node and what it started, as if the host
+    had no other programs (several nodes on one machine)."""
     rcs: tuple[RcSpec, ...]
     recorder: Recorder | None
     """None: this node does not record."""
     labels: tuple[str, ...] = ()
     """What the host is or has, for components that need it."""
+    components: Components = Components()
 
 
 # The files as they are written
@@ -170,18 +191,31 @@ class _TimingTable(Struct, frozen=True, forbid_unknown_fields=True):
     rebuild: Decimal = Decimal("0.2")
 
 
+class _PlacementTable(Struct, frozen=True, forbid_unknown_fields=True):
+    start_timeout: Decimal = Decimal(DEFAULT_RULES.start_timeout) / SECOND
+    restarts: Annotated[int, Meta(ge=0, le=1_000)] = DEFAULT_RULES.restarts
+    back_off: Decimal = Decimal(DEFAULT_RULES.back_off) / SECOND
+    longest_back_off: Decimal = Decimal(DEFAULT_RULES.longest_back_off) / SECOND
+    settled: Decimal = Decimal(DEFAULT_RULES.settled) / SECOND
+    rebalance: bool = False
+    gain: Annotated[float, Meta(ge=0.05, le=100)] = DEFAULT_RULES.gain
+    steady: Decimal = Decimal(DEFAULT_RULES.steady) / SECOND
+    rest: Decimal = Decimal(DEFAULT_RULES.rest) / SECOND
+
+
 class _FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
     fleet: _FleetTable = _FleetTable()
     mesh: Mesh = Mesh()
     limits: Limits = Limits()
     timing: _TimingTable = _TimingTable()
+    placement: _PlacementTable = _PlacementTable()
 
 
 class _NodeTable(Struct, frozen=True, forbid_unknown_fields=True):
     host: str | None = None
     fleet: str | None = None
     candidate: bool = True
-    load: bool = True
+    load: LoadKind = True
     labels: Annotated[tuple[str, ...], Meta(max_length=MAX_LABELS)] = ()
 
 
@@ -210,6 +244,7 @@ class _NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
     mesh: _NodeMeshTable = _NodeMeshTable()
     rc: Annotated[tuple[_RcTable, ...], Meta(max_length=MAX_RCS)] = ()
     recorder: _RecorderTable | None = None
+    components: Components = Components()
 
 
 def load_fleet(path: Path) -> Fleet:
@@ -266,6 +301,7 @@ def _fleet(file: _FleetFile, top: Where) -> Fleet:
         mesh=mesh,
         limits=file.limits,
         timing=_timing(file.timing, mesh.lease, top / "timing"),
+        rules=_rules(file.placement, top / "placement"),
     )
 
 
@@ -304,6 +340,23 @@ def _timing(table: _TimingTable, lease: float, at: Where) -> Timing:
     return timing
 
 
+def _rules(table: _PlacementTable, at: Where) -> Rules:
+    def ns(key: str, high: int) -> Ns:
+        return seconds_to_ns(getattr(table, key), at / key, low=Decimal("0.05"), high=Decimal(high))
+
+    return Rules(
+        start_timeout=ns("start_timeout", 600),
+        restarts=table.restarts,
+        back_off=ns("back_off", 3600),
+        longest_back_off=ns("longest_back_off", 86_400),
+        settled=ns("settled", 86_400),
+        rebalance=table.rebalance,
+        gain=table.gain,
+        steady=ns("steady", 3600),
+        rest=ns("rest", 86_400),
+    )
+
+
 def _check_above(value: Ns, bound: Ns, meaning: str, where: Where) -> None:
     if value <= bound:
         limit = f"{bound / SECOND:g}"
@@ -319,6 +372,8 @@ def _node(file: _NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     for number, label in enumerate(file.node.labels):
         check_name(label, (top / "node" / "labels").item(number))
     check_unique(file.node.labels, top / "node" / "labels")
+    for number, kind in enumerate(file.components.kinds or ()):
+        check_name(kind, (top / "components" / "kinds").item(number))
     check_unique((rc.name for rc in file.rc), top / "rc", "name")
     return Node(
         host=host,
@@ -328,6 +383,7 @@ def _node(file: _NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         rcs=tuple(_rc(rc, (top / "rc").item(number, rc.name)) for number, rc in enumerate(file.rc)),
         recorder=None if file.recorder is None else _recorder(file.recorder, folder, top / "recorder"),
         labels=file.node.labels,
+        components=file.components,
     )
 
 

@@ -19,6 +19,8 @@ NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
 _CHUNK = rf"(?:\*|(?![^/#]*\$\*\$)(?!\$\*(?:[/#]|\Z))(?:[A-Za-z0-9_.-]|\$\*){{1,{MAX_NAME}}})"
 _PATTERN = re.compile(rf"{_CHUNK}/{_CHUNK}(?:#[1-9][0-9]?)?")
 ROOT = "zscout"
+MAX_DIGITS = 15
+"""Of an incarnation."""
 REMEMBERED = 4_096
 """Valid names that are not looked at again."""
 
@@ -106,6 +108,14 @@ def new_instance() -> str:
     return secrets.token_hex(6)
 
 
+def incarnation_of(instance: str) -> int:
+    """Which start of a component its token stands for: `<incarnation>-<any>`. Raises BadName."""
+    number = instance.partition("-")[0]
+    if not (number.isascii() and number.isdigit() and len(number) <= MAX_DIGITS and int(number) > 0):
+        raise BadName(f"{instance[:80]!r} does not begin with an incarnation")
+    return int(number)
+
+
 class Sender(NamedTuple):
     """Who speaks: `<host>/<client>`."""
 
@@ -135,6 +145,7 @@ class Role:
     CLIENT = "client"
     LOAD = "load"
     RECORDER = "recorder"
+    COMPONENT = "component"
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,9 +212,24 @@ class Keys:
     def load_any(self) -> str:
         return f"{self.base}/host/*/load"
 
+    def component(self, host: str) -> str:
+        return f"{self.base}/host/{check_name(host, 'host')}/component"
+
+    @property
+    def component_any(self) -> str:
+        return f"{self.base}/host/*/component"
+
     @property
     def rank(self) -> str:
         return f"{self.base}/balancer/rank"
+
+    @property
+    def placer(self) -> str:
+        return f"{self.base}/placer/component"
+
+    @property
+    def placements(self) -> str:
+        return f"{self.base}/placer/placements"
 
     # Clients
 

@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 import pytest
 
+import zscout
 from tests.live.lab import START, Lab
 from zscout import messages
 from zscout.behaviors.arc import hold
@@ -44,7 +45,7 @@ def test_the_document_names_every_message_and_field(name: str) -> None:
 
 
 def test_the_document_names_every_error_code_and_outcome() -> None:
-    sources = [path.read_text() for path in (Path(messages.__file__).parent).rglob("*.py")]
+    sources = [path.read_text() for path in Path(zscout.__file__).parent.rglob("*.py")]
     raised = r"(?:Refused|Refusal|Problem)\(\s*\"(\w+)\""
     codes = {code for source in sources for code in re.findall(raised, source)} - {"unknown"}
     assert len(codes) > 15

@@ -1,0 +1,111 @@
+"""What all messages have in common: their base, bounds, and the way to JSON and back."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from decimal import Decimal
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
+
+import msgspec
+
+from zscout.scheduling.model import NO_TERM, Term
+
+MAX_PAYLOAD = 65_536
+"""Bytes of one message that is not a state answer."""
+MAX_STATE = 16_000_000
+"""Bytes of one answer about a whole fleet."""
+MAX_NEEDS = 64
+MAX_PARAMS = 16
+MAX_COUNTER = 10**12
+"""A term whose counter is above this is believed by nobody."""
+MAX_JUMP = 1_000_000
+"""A term whose counter is this far above all that was heard is an error, not an election."""
+MAX_ERROR = 400
+"""Characters in the text of an error: it may quote what was sent."""
+
+Amounts: TypeAlias = dict[str, Decimal]
+State: TypeAlias = Literal["queued", "running", "ended"]
+Seconds: TypeAlias = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+"""A duration that is computed with: bounded, so that it is still finite in nanoseconds."""
+Elapsed: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+"""Likewise; of something that lies behind."""
+ShortText: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=130)]
+"""A name, or `kind/name`."""
+Figure: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+Bytes: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=1 << 60)]
+
+
+class Message(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Base of all messages."""
+
+
+class Problem(Message, frozen=True):
+    """Why something was refused. `term` is the term that the answerer has promised, where that is why."""
+
+    code: str
+    message: str
+    term: Term | None = None
+
+
+T = TypeVar("T")
+_ENCODER = msgspec.json.Encoder(decimal_format="number")
+_DECODERS: dict[Any, msgspec.json.Decoder[Any]] = {}
+_ONCE_ONLY: set[Any] = set()
+
+
+class Malformed(ValueError):
+    """A payload that is not the message it should be; says what and where."""
+
+
+def absurd(term: Term, known: Term) -> bool:
+    """Whether `term` is too far above `known`, the newest heard, to be believed. Who has heard of none yet
+    (`NO_TERM`) believes any up to MAX_COUNTER: a fleet may be old."""
+    bound = MAX_COUNTER if known == NO_TERM else min(MAX_COUNTER, known.counter + MAX_JUMP)
+    return term.counter > bound
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    return _ENCODER.encode(message)
+
+
+def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
+    """`payload` as a message of `kind` (a struct, or a union of tagged ones). Raises Malformed."""
+    if len(payload) > limit:
+        raise Malformed(f"{len(payload)} bytes are too many; at most {limit} are taken")
+    decoder = _DECODERS.get(kind)
+    if decoder is None:
+        decoder = _DECODERS[kind] = msgspec.json.Decoder(kind)
+    try:
+        message: T = decoder.decode(payload)
+        if kind in _ONCE_ONLY:
+            _ONCE.decode(payload.decode())
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise Malformed(f"not a valid {_name(kind)}: {str(error)[:MAX_ERROR]}") from None
+    return message
+
+
+def names_once(kind: Any) -> None:
+    """From now on a name that stands twice in one object of a `kind` is refused. The decoder alone takes the
+    last, which in a request would drop a need without a word; elsewhere the 6 us are not worth it."""
+    _ONCE_ONLY.add(kind)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        twice, _ = Counter(name for name, _ in pairs).most_common(1)[0]
+        raise ValueError(f"{twice[:80]!r} stands more than once in one object; write it once")
+    return found
+
+
+_ONCE = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=str)
+
+
+def schema(kind: type) -> str:
+    """The name under which a message travels in the encoding."""
+    return f"zscout.{kind.__name__}.v1"
+
+
+def _name(kind: Any) -> str:
+    return getattr(kind, "__name__", "operation")

@@ -1,0 +1,82 @@
+"""What RCs say and are told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from zscout.messages.base import Amounts, Message, Seconds
+from zscout.messages.scheduling import Holder
+from zscout.scheduling.model import NO_TERM, Grant, Term
+
+
+class ProposedHolder(Message, frozen=True):
+    id: str
+    arc: str
+    client: str
+    params: Amounts = {}
+
+
+class Proposal(Message, frozen=True):
+    """Would the RC carry exactly these holders?"""
+
+    proposal: int
+    term: Term
+    holders: list[ProposedHolder]
+
+
+class Ballot(Message, frozen=True):
+    proposal: int
+    accept: bool
+    reason: str = ""
+
+
+class Command(Message, frozen=True):
+    """Do `do` under `grant`, unless it has waited longer than `ttl` seconds by then.
+
+    `do` names what to do in `name`; the rest is the driver's. Every RC knows `confirm`.
+    """
+
+    grant: Grant
+    do: dict[str, Any]
+    ttl: float = 1.0
+
+
+class Done(Message, frozen=True):
+    """A command was carried out. `warming` seconds are left until the device has its full use."""
+
+    result: Any = None
+    warming: Seconds = 0.0
+
+
+class RcAsk(Message, frozen=True):
+    """Asks an RC for its state. With `promise`, an RC that answers obeys no lower term again."""
+
+    promise: Term | None = None
+
+
+class EndedHold(Message, frozen=True):
+    """A hold that ended at the RC by itself: `why` is `time`, `lease` or `failed`."""
+
+    id: str
+    grant: Grant
+    why: str
+
+
+class RcState(Message, frozen=True):
+    """An RC as it is. `term`, `seq`: the newest publication heard, or term promised."""
+
+    rc: str
+    host: str
+    instance: str
+    sharable: bool
+    term: Term = NO_TERM
+    seq: int = 0
+    holders: list[Holder] = []
+    ended: list[EndedHold] = []
+    health: str = "ok"
+    """`ok`, or in words what is wrong; an RC that is not ok counts as lost."""
+    rules: int = 0
+    """Grows when what it votes by changes: earlier votes are void."""
+    leader: bool = False
+    """Whether it sees a leading RCM."""
+    capacity: Amounts = {}

@@ -1,0 +1,253 @@
+"""What RCM and clients tell each other."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import TypeAlias
+
+from zscout.messages.base import Amounts, Elapsed, Message, Seconds, State, names_once
+from zscout.scheduling.model import Grant, Place, Term
+
+
+class Ask(Message, frozen=True, tag_field="op", tag="request"):
+    """Asks for an ARC: all of `needs`, for at least `min_runtime` seconds. A need is the name of an RC, or a
+    pattern that any one RC meets (`keyexpr.check_need`).
+
+    `id` is the client's own and stays the same however often it asks; `place` is what an earlier RCM gave,
+    and `waited` the seconds since it was last queued there.
+    """
+
+    id: str
+    arc: str
+    needs: dict[str, Amounts]
+    priority: int
+    min_runtime: Decimal
+    keep: bool = False
+    place: Place | None = None
+    waited: Elapsed = 0.0
+
+
+class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
+    """The ARC is not wanted any more. `client` names its owner where that is not the sender."""
+
+    id: str
+    client: str | None = None
+
+
+class Release(Message, frozen=True, tag_field="op", tag="release"):
+    """Gives back what a running ARC holds. `client` names its owner where that is not the sender."""
+
+    id: str
+    client: str | None = None
+
+
+class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
+    """The sender's running ARC goes on in client `to`, under a new grant."""
+
+    id: str
+    to: str
+
+
+class Foresee(Message, frozen=True, tag_field="op", tag="foresee"):
+    """Asks what would come of a request, without making it. Answered with a Foresight."""
+
+    id: str
+    arc: str
+    needs: dict[str, Amounts]
+    priority: int
+    min_runtime: Decimal
+    keep: bool = False
+
+
+class Foresight(Message, frozen=True):
+    """What would come of a request, if nothing else came. `starts_in` is absent where it would not start as
+    things stand, or not within what can be foretold; `reason` then says what it would wait for."""
+
+    id: str
+    arc: str
+    starts_in: Seconds | None = None
+    preempts: list[str] = []
+    """Names of the ARCs that it would preempt at once."""
+    reason: str = ""
+
+
+Operation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
+names_once(Operation)
+
+
+class Notice(Message, frozen=True):
+    """How one request stands: the answer to an operation, and what the client is told at each change.
+
+    Of two notices about one request the one with the greater `(term, step)` is the newer.
+    """
+
+    id: str
+    arc: str
+    client: str
+    state: State
+    term: Term
+    step: int
+    priority: int = 0
+    reason: str = ""
+    outcome: str | None = None
+    """How the last hold, or the wait, came to its end."""
+    by: str | None = None
+    """The ARC that it was taken for."""
+    place: Place | None = None
+    ahead: int | None = None
+    """ARCs that rank before it in the queue."""
+    grant: Grant | None = None
+    rcs: list[str] = []
+    """What it holds, or held; of a request that waits, the RCs that it names."""
+    bound: dict[str, str] = {}
+    """While it runs: the RC that meets each of its patterns."""
+    remaining: Seconds | None = None
+    """Seconds until its minimum runtime is over."""
+
+
+# From the RCM to all
+
+
+class Holder(Message, frozen=True):
+    """One holder of one RC, told so fully that a new RCM can carry its ARC on from the RCs' word alone.
+
+    `rcs` names the whole gang, `bound` the RC that meets each of its patterns. `remaining` seconds of its
+    minimum runtime are left, negative where it is over; with `keep` the hold does not end then."""
+
+    id: str
+    arc: str
+    client: str
+    grant: Grant
+    place: Place
+    rcs: list[str]
+    min_runtime: Decimal
+    remaining: Seconds
+    priority: int = 0
+    keep: bool = False
+    params: Amounts = {}
+    bound: dict[str, str] = {}
+
+
+class Revocation(Message, frozen=True):
+    """A hold that is over, by name."""
+
+    id: str
+    arc: str
+    client: str
+    grant: Grant
+    rcs: list[str]
+    outcome: str
+    reason: str
+    by: str | None = None
+
+
+class Grants(Message, frozen=True):
+    """A publication of the leading RCM. For each RC touched, all its holders from now on.
+
+    `prev` is the seq of the publication before: a receiver that heard another one has missed something.
+    Without `rcs` and `revoked` it is a heartbeat; one comes at least every `every` seconds.
+    """
+
+    term: Term
+    seq: int
+    prev: int
+    every: Seconds
+    rcs: dict[str, list[Holder]] = {}
+    revoked: list[Revocation] = []
+
+
+# The state of the RCM
+
+
+class StateAsk(Message, frozen=True):
+    """Asks how things stand. `arc` (a name or an id) asks for the story of one ARC besides."""
+
+    arc: str | None = None
+    holds_only: bool = False
+    forecast: bool = False
+    """Whether to foretell when who waits will start."""
+
+
+class HoldView(Message, frozen=True):
+    """A hold in force. `held` is how long it has stood, in seconds; `needs` are by RC, `bound` the RC that
+    meets each of its patterns."""
+
+    id: str
+    arc: str
+    client: str
+    priority: int
+    grant: Grant
+    place: Place
+    needs: dict[str, Amounts]
+    min_runtime: Decimal
+    held: Seconds
+    remaining: Seconds
+    keep: bool = False
+    bound: dict[str, str] = {}
+
+
+class WaitView(Message, frozen=True):
+    """An ARC in the queue, in rank order. `waited` seconds since it was last queued; `needs` as asked."""
+
+    id: str
+    arc: str
+    client: str
+    priority: int
+    place: Place
+    needs: dict[str, Amounts]
+    min_runtime: Decimal
+    waited: Seconds
+    reason: str
+    preemptions: int = 0
+    starts_in: Seconds | None = None
+    """An estimate, where one was asked for: as if nothing else were to come."""
+
+
+class RcView(Message, frozen=True):
+    rc: str
+    present: bool
+    sharable: bool
+    holders: list[str] = []
+    """Ids of the ARCs that hold it."""
+
+
+class StoryLine(Message, frozen=True):
+    """Something that happened to an ARC, `ago` seconds before the answer."""
+
+    ago: Seconds
+    text: str
+
+
+class RcmState(Message, frozen=True):
+    """What the RCM knows. `seq` is the last that it published; `more` counts queued ARCs left out."""
+
+    term: Term
+    seq: int
+    host: str
+    holds: list[HoldView] = []
+    queue: list[WaitView] = []
+    rcs: list[RcView] = []
+    story: list[StoryLine] = []
+    more: int = 0
+
+
+# Clients
+
+
+class OpenRequest(Message, frozen=True):
+    """A request as its client knows it, for an RCM that takes the lead. `waited` as in Ask."""
+
+    id: str
+    arc: str
+    needs: dict[str, Amounts]
+    priority: int
+    min_runtime: Decimal
+    keep: bool = False
+    place: Place | None = None
+    waited: Elapsed = 0.0
+    grant: Grant | None = None
+
+
+class ClientRequests(Message, frozen=True):
+    client: str
+    requests: list[OpenRequest]
