@@ -28,7 +28,7 @@ class Spec:
     restart: Restart = "on_failure"
     metric: Metric = "composite"
     policy: Policy = "pending"
-    requirements: Requirements = Requirements()
+    requirements: Requirements = field(default_factory=Requirements)
     hosts: frozenset[HostName] | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
