@@ -60,6 +60,9 @@ def test_the_document_names_every_key_and_role() -> None:
         keys.grants,
         keys.rcm_state,
         keys.rank,
+        keys.component("H"),
+        keys.placer,
+        keys.placements,
         keys.vote("K/N"),
         keys.command("K/N", sender),
     ]
