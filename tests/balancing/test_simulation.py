@@ -31,8 +31,9 @@ def test_all_at_once_pending_is_within_one_in_all_seeds() -> None:
 
 def test_all_at_once_two_choices_uses_all_hosts_in_all_seeds() -> None:
     found = splits("two_choices")
-    assert all(least > 0 for least, _, _ in found)
-    assert max(most for _, _, most in found) < 12
+    assert all(least >= 2 for least, _, _ in found)
+    # Chance has its share: not all runs are within one.
+    assert sum(most - least <= 1 for least, _, most in found) > 50
 
 
 @pytest.mark.parametrize("policy", POLICIES)

@@ -1,15 +1,15 @@
 """The pure core of the load balancer: reports and placements in, rankings out.
 
 A host is named only if it has reported lately, is not cordoned, and meets the requirements. What was placed
-and is not in the reports yet is *pending*: policy `pending` adds it to the host's load, so that components
-that start at the same moment spread; the other policies see the reports only.
+and is not in the reports yet is *pending*: policies `pending` and `two_choices` add it to the host's load, so
+that components that start at the same moment spread; the other policies see the reports only.
 
 - `least_loaded`: the best score (the paper; all on one host when all start at once: its Figure 3a).
 - `randomized`: the best after a little noise on each load (the cure that the paper proposes).
   It moves the metrics that look at the load: `load_average` and `composite`.
 - `two_choices`: the better of two hosts drawn at random (Mitzenmacher, IEEE TPDS 12(10), 2001), first. Of two
-  that the reports can't tell apart, the one that was chosen longer ago.
-- `pending`: the best score, with what is pending counted.
+  that can't be told apart, the one that was chosen longer ago.
+- `pending`: the best score.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ LOAD_TIME: Final = 60 * SECOND
 """Time constant of the one-minute load average, in ns."""
 NOISE: Final = 0.25
 """Greatest noise of policy `randomized`, in load a core."""
+COUNTING: Final = frozenset({"two_choices", "pending"})
+"""Policies that count what was placed and is not in the reports yet."""
 CLOSE: Final = 0.05
 """Scores that differ by less, or by less of the greater, are equal to policy `two_choices`."""
 SETTLED: Final = 3 * SECOND
@@ -193,7 +195,7 @@ class Balancer:
         profile, score = self.profile(question.kind), SCORES[metric]
         found: list[Ranked] = []
         for host in fit:
-            outlook = self.outlook(now, host, pending=question.policy == "pending")
+            outlook = self.outlook(now, host, pending=question.policy in COUNTING)
             if question.policy == "randomized":
                 noise = self._rng.random() * NOISE * outlook.report.cores
                 outlook = replace(outlook, load=outlook.load + noise)
@@ -242,7 +244,7 @@ class Balancer:
             return f"it has no label {', '.join(missing)}"
         required = question.requirements.memory
         if required:
-            available = max(0, self.outlook(now, host, pending=question.policy == "pending").memory)
+            available = max(0, self.outlook(now, host, pending=question.policy in COUNTING).memory)
             if available < required:
                 return f"{available:,} bytes available, {required:,} required"
         return ""
