@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import click
 
 from zscout.cli import common
+from zscout.cli.groups import DefaultGroup
 from zscout.cli.study_placement import placement
 from zscout.scheduling.study.families import FAMILIES
 from zscout.scheduling.study.trial import STRATEGIES, Job
@@ -34,15 +35,7 @@ class _Advance(Protocol):
     def __call__(self) -> None: ...
 
 
-class Studies(click.Group):
-    """A group that takes options without a subcommand to be meant for `DEFAULT`."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        named = args and (not args[0].startswith("-") or args[0] in self.get_help_option_names(ctx))
-        return super().parse_args(ctx, args if named else [DEFAULT, *args])
-
-
-@click.group(cls=Studies)
+@click.group(cls=DefaultGroup, default=DEFAULT)
 def study() -> None:
     """Runs experiments with random workloads in virtual time; `schedule` unless another one is named.
 

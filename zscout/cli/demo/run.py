@@ -6,11 +6,7 @@ The watching place only listens once the first ARC has asked: asking the RCM wou
 from __future__ import annotations
 
 import asyncio
-import os
-import socket
-import sys
-from collections.abc import Awaitable, Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
@@ -18,33 +14,22 @@ from typing import Final, Self
 import msgspec
 
 from zscout import clock
-from zscout.cli import launch
-from zscout.cli.common import Failed
 from zscout.cli.demo.arc import Part, Word
+from zscout.cli.demo.processes import HOSTS, Processes
 from zscout.cli.demo.tables import Observed
 from zscout.config import load_fleet
-from zscout.keyexpr import Role, Sender, Token, new_instance
+from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import Declared, Mesh
 from zscout.messages import Grants, LoadReport, RcmState, StateAsk
 from zscout.scheduling.model import NO_TERM, SECOND, Grant, Ns, Term
 from zscout.scheduling.workload import Arrival, Workload
 from zscout.services import views
 
-HOSTS: Final = ("anvil", "bellows", "crucible")
-RECORDS: Final = "crucible"
-"""The host whose node records."""
-RECORDINGS: Final = "recordings"
-"""The folder of its recording, below the demo's."""
 START: Final = 30.0
 """Seconds within which everything must be there."""
 ANSWER: Final = 5.0
 LATE: Final = 5.0
 """Seconds that an ARC's end may be late before the demo gives up."""
-GRACE: Final = 12.0
-"""Seconds for the processes to end in order."""
-MAX_LINE: Final = 65_536
-SHOWN: Final = 600
-"""Characters of a log that explain a failure."""
 
 
 class Demo:
@@ -54,39 +39,36 @@ class Demo:
     """
 
     def __init__(self, folder: Path, workload: Workload, tell: Callable[[float, str], None]) -> None:
-        self.folder, self.workload, self._tell = folder, workload, tell
+        self.workload, self._tell = workload, tell
         self.seen = Observed()
-        self._processes: dict[str, asyncio.subprocess.Process] = {}
+        self._processes = Processes(folder)
+        self._behaviors: dict[str, asyncio.subprocess.Process] = {}
         self._tasks: list[asyncio.Task[None]] = []
         self._words: dict[tuple[str, str], asyncio.Event] = {}
-        self._failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._mesh: Mesh | None = None
         self._newest: tuple[Term, int] = (NO_TERM, 0)
         self._told: set[Grant] = set()
         self._published = asyncio.Event()
         self._declared: list[Declared] = []
-        self._ending = False
 
     async def run(self) -> None:
         """Plays the whole workload. Raises Failed, MeshError, BadInput."""
-        play = asyncio.ensure_future(self._play())
-        try:
-            await asyncio.wait({play, self._failed}, return_when=asyncio.FIRST_COMPLETED)
-            if self._failed.done():
-                self._failed.result()
-            await play
-        finally:
-            play.cancel()
-            await asyncio.gather(play, return_exceptions=True)
+        await self._processes.watched(self._play())
 
     async def _play(self) -> None:
-        await self._start_nodes()
+        devices = {host: self.workload.rcs[at :: len(HOSTS)] for at, host in enumerate(HOSTS)}
+        await self._processes.start_nodes(
+            {
+                host: "".join(f'[[rc]]\nname = "{rc.name}"\ndriver = "exclusive"\n' for rc in rcs)
+                for host, rcs in devices.items()
+            }
+        )
         await self._start_arcs()
-        fleet = load_fleet(self.folder / "fleet.toml")
+        fleet = load_fleet(self._processes.fleet_file)
         self._mesh = await Mesh.open(fleet.name, Sender("demo", "watch"), fleet.mesh)
-        await self._within(START, self._all_there(self._mesh), "the nodes did not find each other")
+        await self._processes.within(START, self._all_there(self._mesh), "the nodes did not find each other")
         ready = (self._word(arrival.request.arc, "ready").wait() for arrival in self.workload.arrivals)
-        await self._within(START, asyncio.gather(*ready), "the behaviors did not find the nodes")
+        await self._processes.within(START, asyncio.gather(*ready), "the behaviors did not find the nodes")
         self._tell(0.0, "all nodes, devices and behaviors are there")
         # In the order of the file; who asks in one instant asks one after the other's answer.
         for arrival in sorted(self.workload.arrivals, key=lambda arrival: arrival.at):
@@ -96,36 +78,10 @@ class Demo:
         done = [self._word(arrival.request.arc, "done").wait() for arrival in self.workload.arrivals]
         assert self.seen.zero is not None  # noqa: S101
         left = (self.seen.zero + _latest_end(self.workload.arrivals) - clock.now()) / SECOND
-        await self._within(left + LATE, asyncio.gather(*done), "not all ARCs had their time")
-        await self._within(ANSWER, self._all_free(), "the RCM did not publish the last end")
+        await self._processes.within(left + LATE, asyncio.gather(*done), "not all ARCs had their time")
+        await self._processes.within(ANSWER, self._all_free(), "the RCM did not publish the last end")
 
     # Processes
-
-    async def _start_nodes(self) -> None:
-        ports = _free_ports(len(HOSTS) + 1)
-        ends = {host: f"tcp/127.0.0.1:{port}" for host, port in zip(HOSTS, ports, strict=False)}
-        fleet = self.folder / "fleet.toml"
-        fleet.write_text(
-            f'[fleet]\nname = "demo-{new_instance()}"\ncandidates = {_list(HOSTS)}\n'
-            '[mesh]\nmulticast = false\nlisten = ["tcp/127.0.0.1:0"]\n'
-            f"connect = {_list(list(ends.values()))}\n"
-        )
-        devices = {
-            host: [rc.name for rc in self.workload.rcs[at :: len(HOSTS)]] for at, host in enumerate(HOSTS)
-        }
-        for host, end in ends.items():
-            others = [other for other in ends.values() if other != end]
-            text = f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n'
-            text += f'[mesh]\nlisten = ["{end}"]\nconnect = {_list(others)}\n'
-            if host == RECORDS:
-                text += f'[recorder]\npath = "{RECORDINGS}"\nport = {ports[-1]}\n'
-            for rc in devices[host]:
-                text += f'[[rc]]\nname = "{rc}"\ndriver = "exclusive"\n'
-            file = self.folder / f"{host}.toml"
-            file.write_text(text)
-            # The launcher has the kernel end the node with this process, however that may end.
-            start = ["-I", "-S", launch.__file__, str(os.getpid()), "-1", sys.executable, "-m", "zscout.node"]
-            await self._start(f"node {host}", [*start, str(file)])
 
     async def _all_there(self, mesh: Mesh) -> None:
         missing, complete = {Role.RCM, Role.RECORDER}, asyncio.Event()
@@ -160,86 +116,34 @@ class Demo:
                 priority=request.priority,
                 min_runtime=views.seconds(request.min_runtime),
             )
-            process = await self._start(request.arc, ["-m", "zscout.cli.demo.arc"], speaks=True)
+            process = await self._processes.start(request.arc, ["-m", "zscout.cli.demo.arc"], speaks=True)
+            self._behaviors[request.arc] = process
             assert process.stdin is not None  # noqa: S101
             process.stdin.write(msgspec.json.encode(part) + b"\n")
             self._tasks.append(asyncio.create_task(self._hear(process, part)))
 
-    async def _start(
-        self, name: str, arguments: Sequence[str], *, speaks: bool = False
-    ) -> asyncio.subprocess.Process:
-        with self._log(name).open("wb") as log:
-            process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                *arguments,
-                stdin=asyncio.subprocess.PIPE if speaks else asyncio.subprocess.DEVNULL,
-                stdout=asyncio.subprocess.PIPE if speaks else log,
-                stderr=log,
-                env=os.environ | {"ZSCOUT_FLEET": str(self.folder / "fleet.toml")},
-                # Ctrl-C is for this process alone, which then ends the others in their order.
-                start_new_session=True,
-                limit=MAX_LINE,
-            )
-        self._processes[name] = process
-        self._tasks.append(asyncio.create_task(self._mourn(name, process)))
-        return process
-
-    async def _mourn(self, name: str, process: asyncio.subprocess.Process) -> None:
-        code = await process.wait()
-        early = bool(code) or name.startswith("node ")
-        if early and not self._ending and not self._failed.done():
-            words = self._log(name).read_text(errors="replace").strip()[-SHOWN:]
-            self._failed.set_exception(Failed(f"{name} ended with code {code}: {words or 'it said nothing'}"))
-
-    def _log(self, name: str) -> Path:
-        return self.folder / f"{name.replace(' ', '-')}.log"
-
     async def __aenter__(self) -> Self:
+        await self._processes.__aenter__()
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._ending = True
-        try:
-            async with asyncio.timeout(GRACE):
-                await self._end()
-        except TimeoutError:
-            pass
-        finally:
-            for process in self._processes.values():
-                if process.returncode is None:
-                    process.kill()
-        await asyncio.gather(*(process.wait() for process in self._processes.values()))
+        if self._mesh is not None:
+            await self._mesh.close()
+        await self._processes.__aexit__(kind, error, trace)
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._failed.cancel()
-
-    async def _end(self) -> None:
-        """The node that records goes first: that the others go is no part of the story."""
-        if self._mesh is not None:
-            await self._mesh.close()
-        for process in self._processes.values():
-            if process.stdin is not None:
-                process.stdin.close()
-        nodes = [process for name, process in self._processes.items() if name.startswith("node ")]
-        recording = self._processes.get(f"node {RECORDS}")
-        for process in sorted(nodes, key=lambda process: process is not recording):
-            if process.returncode is None:
-                process.terminate()
-            if process is recording:
-                await process.wait()
-        await asyncio.gather(*(process.wait() for process in self._processes.values()))
 
     # What happens
 
     async def _signal(self, arc: str) -> None:
         """Has an ARC ask, and waits for its answer."""
-        stdin = self._processes[arc].stdin
+        stdin = self._behaviors[arc].stdin
         assert stdin is not None  # noqa: S101
         stdin.write(b"\n")
-        await self._within(ANSWER, self._word(arc, "answered").wait(), f"{arc} got no answer")
+        await self._processes.within(ANSWER, self._word(arc, "answered").wait(), f"{arc} got no answer")
 
     def _word(self, arc: str, what: str) -> asyncio.Event:
         return self._words.setdefault((arc, what), asyncio.Event())
@@ -297,27 +201,7 @@ class Demo:
         zero = self.seen.zero
         self._tell((at - zero) / SECOND if zero is not None else 0.0, text)
 
-    async def _within(self, seconds: float, what: Awaitable[object], otherwise: str) -> None:
-        try:
-            async with asyncio.timeout(seconds):
-                await what
-        except TimeoutError:
-            logs = (self._log(name).read_text(errors="replace").strip() for name in self._processes)
-            words = next((log for log in logs if "ERROR" in log or "WARN" in log), "")[-SHOWN:]
-            raise Failed(f"{otherwise} in time; {words or 'is this machine very busy? try again'}") from None
-
 
 def _latest_end(arrivals: Sequence[Arrival]) -> Ns:
     """When everything is over even if it runs one after the other, each once more after a preemption."""
     return max(arrival.at for arrival in arrivals) + sum(arrival.request.min_runtime for arrival in arrivals)
-
-
-def _list(texts: Sequence[str]) -> str:
-    return "[" + ", ".join(f'"{text}"' for text in texts) + "]"
-
-
-def _free_ports(count: int) -> list[int]:
-    """Ports that nobody has at this moment, all different."""
-    with ExitStack() as stack:
-        servers = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [int(server.getsockname()[1]) for server in servers]
