@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks import crowd, latency, process
+from benchmarks import crowd, hosts, latency, process, reporter
 from benchmarks.loop import run
 from benchmarks.stats import Row, table
 
@@ -40,6 +40,10 @@ async def measure(rounds: int, crowds: int, programs: int) -> list[Row]:
             (folder / "empty").mkdir()
             rows += await crowd.crowd(lab, folder / "empty", crowds, 3.0, progress, programs)
             rows += process.memory_after(lab)
+            rows += reporter.costs(lab.nodes["lead"].pid)
+        progress("1,000 hosts")
+        (folder / "hosts").mkdir()
+        rows += await hosts.rows_of_thousand(folder / "hosts")
     return rows
 
 

@@ -1,7 +1,7 @@
 """`zscout-node`: what one host does in its fleet, as its node file says.
 
-It stands as a candidate for the RCM, reports the host's load, runs the host's RCs, and runs the recorder as
-a process of its own.
+It stands as a candidate for the RCM, reports the host's load, runs the host's RCs, starts components, and
+runs the recorder as a process of its own.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError
 from zscout.scheduling.model import SECOND
 from zscout.services.candidate import Candidate
+from zscout.services.component_host import ComponentHost
 from zscout.services.load_reporter import LoadReporter
 from zscout.services.recorder_process import RecorderProcess
 from zscout.stall import StallWatch
@@ -57,8 +58,9 @@ async def run_node(node: Node, stop: asyncio.Event) -> None:
             await rc.start()
             stack.push_async_callback(rc.stop)
             log.info("runs %s (%s)", spec.name, spec.driver)
+        components = ComponentHost(mesh, node.fleet, node.components)
         if node.load:
-            reporter = LoadReporter(mesh, node.labels)
+            reporter = LoadReporter(mesh, node.labels, components, tree=node.load == "tree")
             reporter.start()
             stack.push_async_callback(reporter.stop)
         if node.recorder is not None:
@@ -69,6 +71,9 @@ async def run_node(node: Node, stop: asyncio.Event) -> None:
             candidate = Candidate(mesh, node.fleet)
             candidate.start()
             stack.push_async_callback(candidate.stop)
+        await components.start()
+        # Before all else: they give back their ARCs while there is an RCM and while there are RCs.
+        stack.push_async_callback(components.stop)
         log.info("%s is on the mesh of fleet %s", node.host, node.fleet.name)
         alone = asyncio.get_running_loop().call_later(ALONE_AFTER, _say_if_alone, mesh)
         stack.callback(alone.cancel)

@@ -238,6 +238,39 @@ def test_a_report_that_no_host_can_send_is_refused(field: str, value: object) ->
         report("a", **{field: value})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("metric", [metric for metric in METRICS if metric != "auto"])
+def test_the_few_that_are_named_are_the_first_of_all(metric: Metric, policy: Policy) -> None:
+    few, all_ = (Balancer(Random(7)) for _ in range(2))  # noqa: S311
+    for balancer in (few, all_):
+        for number in range(40):
+            balancer.reported(0, report(f"h{number}", 1, number % 5, memory_available=number % 3 * GIGABYTE))
+        balancer.placed(0, "one", "job", "h5")
+    question = Question("job", metric, policy, Requirements(memory=1))
+    first, every = few.rank(0, question, 3), all_.rank(0, question)
+    assert (first.hosts, first.more, first.left_out) == (every.hosts[:3], 23, every.left_out)
+    assert (len(every.hosts), every.more) == (26, 0)
+
+
+@given(
+    cores=st.floats(0.1, 64),
+    load=st.floats(0, 100),
+    speed=st.floats(0.1, 8),
+    memory=st.integers(0, 2_000),
+    profile=st.builds(Profile, st.floats(0, 16), st.integers(0, 2_000), st.just(1), st.integers(1, 8)),
+)
+def test_composite_is_speed_shared_by_all_who_want_it(
+    cores: float, load: float, speed: float, memory: int, profile: Profile
+) -> None:
+    balancer = Balancer(Random(0))  # noqa: S311
+    balancer.profiles["job"] = profile
+    balancer.reported(0, report("a", 1, load, cores=cores, speed=speed, memory_available=memory))
+    (found,) = balancer.rank(0, Question("job")).hosts
+    wanting = load + max(profile.wants(speed), 0.01)
+    share = 1.0 if memory >= profile.memory else max(0.05, (memory / profile.memory) ** 2)
+    assert found.score == pytest.approx(speed * min(1.0, cores / wanting) * share)
+
+
 LABELS = st.frozensets(st.sampled_from(["camera", "gpu"]))
 REPORTS = st.builds(
     Report,

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import copy
+from dataclasses import replace
 from fractions import Fraction
 
 from tests.scheduling.oracle import Contender, Oracle
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Queued, Revoked
-from zscout.scheduling.model import NO_TERM, ArcId, Grant, Ns, Params, RcName, Request
+from zscout.scheduling.model import NO_TERM, Arc, ArcId, ClientId, Grant, Ns, Params, RcName, Request
 from zscout.scheduling.workload import WorkloadRc, excess
 
 
@@ -23,7 +25,17 @@ class Ledger:
         self.requests: dict[ArcId, Request] = {request.arc: request for request in requests}
         self.open: dict[ArcId, Granted] = {}
         self.newest = Grant(NO_TERM, 0)
-        self.handed_over: set[ArcId] = set()
+        self.handed_over: dict[ArcId, Granted] = {}
+        """By the new names of ARCs that run: what they held under the old ones, until it is granted anew."""
+        self._moves: dict[ArcId, Arc] = {}
+        """What the next batch hands over: by the new name, the ARC as it was."""
+        self._renamed: dict[ArcId, ArcId] = {}
+
+    def will_move(self, core: Core, arc: ArcId, to: ClientId, renamed: ArcId) -> None:
+        """The next batch will hand over `arc`."""
+        self.requests[renamed] = replace(self.requests[arc], arc=renamed, client=to)
+        self._moves[renamed] = copy(core.floor.running.get(arc) or core.floor.queued[arc])
+        self._renamed[arc] = renamed
 
     def take(self, now: Ns, core: Core, effects: list[Effect]) -> None:
         """Takes the effects of one batch, and compares the outcome with what the core believes."""
@@ -45,7 +57,23 @@ class Ledger:
             if arc.hold is not None
         }
         assert not self.handed_over, "handed over to nobody"
+        self._check_moves(core, effects)
         assert held == believed, "the effects told do not add up to what the core holds"
+
+    def _check_moves(self, core: Core, effects: list[Effect]) -> None:
+        """Who was handed over is there under the new name, at the old place; its wait goes on."""
+        granted = {effect.arc for effect in effects if isinstance(effect, Granted)}
+        for renamed, before in self._moves.items():
+            assert core.floor.arc(before.id) is None, f"{before.id} is there under its old name"
+            after = core.floor.arc(renamed)
+            if after is None:
+                assert before.hold is not None, f"{before.id} got lost while it was handed over"
+                continue
+            assert (after.id, after.place) == (renamed, before.place)
+            if before.hold is None and renamed not in granted:
+                assert after.since == before.since
+        self._moves.clear()
+        self._renamed.clear()
 
     def holders(self, rc: RcName) -> list[ArcId]:
         return [arc for arc, hold in self.open.items() if rc in hold.rcs]
@@ -62,9 +90,11 @@ class Ledger:
         assert effect.end is None or effect.end == effect.start + request.min_runtime
         self.newest = effect.grant
         self.open[effect.arc] = effect
+        assert not self.handed_over or effect.arc in self.handed_over, "granted amid a hand-over"
         if effect.arc in self.handed_over:
             # The same hold goes on; rules that changed meanwhile do not touch it.
-            self.handed_over.remove(effect.arc)
+            before = self.handed_over.pop(effect.arc)
+            assert (effect.rcs, effect.start, effect.end) == (before.rcs, before.start, before.end)
             return
         for rc in effect.rcs:
             holders = self.holders(rc)
@@ -79,7 +109,7 @@ class Ledger:
         assert hold.grant == effect.grant, "a hold is revoked under another grant than it was given"
         assert hold.rcs == effect.rcs, "a part of a gang is revoked"
         if effect.outcome is Outcome.HANDED_OVER:
-            self.handed_over.add(effect.arc)
+            self.handed_over[self._renamed[effect.arc]] = hold
         request = self.requests[effect.arc]
         over = now >= hold.start + request.min_runtime
         if effect.outcome is Outcome.COMPLETED:

@@ -30,7 +30,7 @@ from zscout.scheduling.events import (
     VoteOverdue,
     Waiting,
 )
-from zscout.scheduling.model import NO_TERM, SECOND, Arc, Ns, RcName, Term
+from zscout.scheduling.model import NO_TERM, SECOND, Arc, ArcId, ClientId, Ns, RcName, Term
 from zscout.scheduling.strategies import STRATEGIES, StrategyName
 from zscout.scheduling.workload import WorkloadRc, excess
 
@@ -45,6 +45,7 @@ OPS = (
     "rc ends",
     "client lost",
     "hand over",
+    "hand over all",
     "takeover",
 )
 MAX_SETTLING_STEPS = 400
@@ -72,6 +73,7 @@ class Chaos:
         self.late: list[Propose] = []
         """Overdue ones; their answers may still come, or never."""
         self.wake: Ns | None = None
+        self.moves = 0
         self.send(*[self.join(rc) for rc in self.fleet])
 
     def new_core(self) -> Core:
@@ -139,10 +141,19 @@ class Chaos:
             self.send(RcReported(min(self.ledger.requests[arc].needs), ended=(arc,)))
         elif op == "client lost":
             self.send(ClientLost(f"host/{pick % 3}"))
-        elif op == "hand over" and running:
-            self.send(HandedOver(running[pick % len(running)], f"host/{(pick + 1) % 3}"))
+        elif op == "hand over" and arcs:
+            self.send(self.hand_over(arcs[pick % len(arcs)], f"host/{(pick + 1) % 3}"))
+        elif op == "hand over all":
+            theirs = self.core.arcs_of(f"host/{pick % 3}")
+            self.send(*[self.hand_over(arc.id, f"host/{(pick + 1) % 3}") for arc in theirs])
         elif op == "takeover":
             self.take_over()
+
+    def hand_over(self, arc: ArcId, to: ClientId) -> Event:
+        self.moves += 1
+        renamed = f"{arc.partition('.')[0]}.{self.moves}"
+        self.ledger.will_move(self.core, arc, to, renamed)
+        return HandedOver(arc, to, renamed)
 
     def take_over(self) -> None:
         """The RCM dies with all it knew of votes; the next one hears of every hold and request."""

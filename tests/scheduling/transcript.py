@@ -6,7 +6,7 @@ One line is one batch of events; several commands of one instant are joined by `
     at TIME                                    sets the clock for what follows; `at TIME COMMAND` too
     join RC [sharable]                         leave RC [REASON]            lost CLIENT
     ask ARC NEED,... [priority=N] [runtime=S] [client=NAME] [keep] [place=TERM.N]
-    cancel ARC          release ARC            handover ARC CLIENT          tick
+    cancel ARC          release ARC            handover ARC CLIENT NEW_NAME    tick
     vote N yes|no [REASON]                     overdue N
     rules RC            ended RC ARC,...
     standing ARC ... grant=TERM.N start=S      waiting ARC ...              for the `lead` that follows
@@ -116,7 +116,8 @@ class _Player:
             case "release":
                 return Released(first)
             case "handover":
-                return HandedOver(first, second)
+                client, renamed = second.split()
+                return HandedOver(first, client, renamed)
             case "vote":
                 answer, _, reason = second.partition(" ")
                 return Vote(int(first), accept=_choice(answer, yes="yes", no="no"), reason=reason)

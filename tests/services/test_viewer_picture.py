@@ -61,11 +61,13 @@ def record(path: Path) -> None:
 
 
 @contextmanager
-def viewer(recording: Path, home: Path) -> Iterator[ViewerClient]:
-    """A viewer without a window that has the recording open; skips where it finds no graphics driver."""
+def viewer(recording: Path, home: Path, *, panes: int = 4, height: int = HEIGHT) -> Iterator[ViewerClient]:
+    """A viewer without a window that has the recording open; skips where it finds no graphics driver.
+
+    `panes` are those that the recording's layout has, hidden ones among them."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
-    size = f"{WIDTH}x{HEIGHT}"
+    size = f"{WIDTH}x{height}"
     command: list[str | Path] = [RERUN, "--headless", "--window-size", size, "--bind", "127.0.0.1"]
     log = home / "viewer.log"
     with (
@@ -78,14 +80,14 @@ def viewer(recording: Path, home: Path) -> Iterator[ViewerClient]:
         ) as process,
     ):
         try:
-            client = until(lambda: opened(process, log, f"rerun+http://127.0.0.1:{port}/proxy"))
+            client = until(lambda: opened(process, log, f"rerun+http://127.0.0.1:{port}/proxy", panes))
             yield client
         finally:
             process.kill()
 
 
-def opened(process: subprocess.Popen[bytes], log: Path, url: str) -> ViewerClient | None:
-    """The viewer, once it shows all four panes."""
+def opened(process: subprocess.Popen[bytes], log: Path, url: str, panes: int) -> ViewerClient | None:
+    """The viewer, once it has all panes."""
     if process.poll() is not None:
         words = log.read_text(errors="replace")
         if "render context" in words or "graphics adapter" in words:
@@ -93,7 +95,7 @@ def opened(process: subprocess.Popen[bytes], log: Path, url: str) -> ViewerClien
         pytest.fail(f"the viewer ended with {process.returncode}: {words}")
     try:
         client = ViewerClient.connect(url)
-        return client if len(client.get_state().views) == 4 else None
+        return client if len(client.get_state().views) == panes else None
     except (RuntimeError, ConnectionError):
         return None
 

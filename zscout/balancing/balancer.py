@@ -14,14 +14,15 @@ that components that start at the same moment spread; the other policies see the
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from random import Random
-from typing import Final
+from typing import Final, TypeAlias
 
 from zscout.balancing.learning import Learner, Observation
-from zscout.balancing.metrics import SCORES, Outlook
+from zscout.balancing.metrics import SCORES, WORDS, Outlook
 from zscout.balancing.model import (
     DEFAULT_PROFILE,
     SECOND,
@@ -58,6 +59,11 @@ SHOWN: Final = 8 * LOAD_TIME
 MAX_HOSTS: Final = 10_000
 MAX_KINDS: Final = 10_000
 MAX_PLACED: Final = 100_000
+NEVER: Final[tuple[Ns, Report | None]] = 0, None
+"""In the place of a report where there is none."""
+
+_Found: TypeAlias = tuple[float, HostName]
+"""A host with its score, negated: so the best comes first, and of equals the first by name."""
 
 
 @dataclass(slots=True)
@@ -79,10 +85,14 @@ class Balancer:
     def __init__(self, rng: Random) -> None:
         self._rng = rng
         self.reports: dict[HostName, tuple[Ns, Report]] = {}
+        self._outlooks: dict[HostName, Outlook] = {}
+        """What the reports alone tell."""
         self.profiles: dict[Kind, Profile] = {}
         self.cordoned: set[HostName] = set()
         self.learner = Learner()
         self._placed: dict[ComponentId, _Placed] = {}
+        self._there: dict[HostName, set[ComponentId]] = {}
+        """The same by host: many hosts may be lost at once."""
         self._pending: dict[HostName, dict[ComponentId, _Placed]] = {}
         self._chosen: dict[HostName, int] = {}
         self._choices = 0
@@ -97,15 +107,17 @@ class Balancer:
         if last is None and not self._room(now):
             return
         self.reports[report.host] = (now, report)
+        self._outlooks[report.host] = Outlook(report, report.load_average[0], report.memory_available)
         for use in report.uses:
             self._saw(now, report, use)
 
     def lost(self, host: HostName) -> None:
         """A host is gone, and what ran there."""
         self.reports.pop(host, None)
+        self._outlooks.pop(host, None)
         self._pending.pop(host, None)
         self._chosen.pop(host, None)
-        for component in [name for name, one in self._placed.items() if one.host == host]:
+        for component in self._there.pop(host, ()):
             del self._placed[component]
 
     def placed(self, now: Ns, component: ComponentId, kind: Kind, host: HostName) -> None:
@@ -116,16 +128,21 @@ class Balancer:
         scores: dict[Metric, float] = {}
         if host in self.reports:
             outlook = self.outlook(now, host, pending=True)
-            scores = {metric: score(outlook, self.profile(kind))[0] for metric, score in SCORES.items()}
+            scores = {metric: score([outlook], self.profile(kind))[0] for metric, score in SCORES.items()}
             self._choices += 1
             self._chosen[host] = self._choices
         self._placed[component] = one = _Placed(kind, host, now, scores)
+        self._there.setdefault(host, set()).add(component)
         self._pending.setdefault(host, {})[component] = one
 
     def gone(self, component: ComponentId) -> None:
         """A component ended, or did not start."""
         one = self._placed.pop(component, None)
         if one is not None:
+            there = self._there[one.host]
+            there.discard(component)
+            if not there:
+                del self._there[one.host]
             self._let_go(component, one.host)
 
     def _let_go(self, component: ComponentId, host: HostName) -> None:
@@ -147,6 +164,7 @@ class Balancer:
             # Of a balancer before this one: its profile is learnt, and the load average shows it already.
             one = _Placed(use.kind, report.host, now, {}, adopted=True)
             self._placed[use.component] = one
+            self._there.setdefault(report.host, set()).add(use.component)
         if one is None or one.host != report.host:
             return
         one.seen = True
@@ -176,59 +194,84 @@ class Balancer:
 
     def outlook(self, now: Ns, host: HostName, *, pending: bool) -> Outlook:
         """A host as its report tells, with what is pending there if that counts. Raises KeyError."""
-        _, report = self.reports[host]
-        load, memory = report.load_average[0], report.memory_available
-        if pending:
-            for one in self._pending.get(host, {}).values():
+        outlook = self._outlooks[host]
+        if pending and host in self._pending:
+            report, load, memory = outlook.report, outlook.load, outlook.memory
+            for one in self._pending[host].values():
                 profile = self.profile(one.kind)
                 # The load average shows a component the better the longer it runs.
                 load += profile.wants(report.speed) * math.exp(-(now - one.at) / LOAD_TIME)
                 memory -= 0 if one.seen else profile.memory
-        return Outlook(report, load, memory)
+            return Outlook(report, load, memory)
+        return outlook
 
-    def rank(self, now: Ns, question: Question) -> Ranking:
-        """Hosts best first, by the metric and under the policy that were asked for."""
-        fit, left_out = self._fit(now, question)
+    def rank(self, now: Ns, question: Question, at_most: int | None = None) -> Ranking:
+        """Hosts best first, by the metric and under the policy that were asked for; `at_most` are named."""
         metric, why = question.metric, "as asked"
         if metric == "auto":
             metric, why = self.learner.choose(self._rng)
-        profile, score = self.profile(question.kind), SCORES[metric]
-        found: list[Ranked] = []
-        for host in fit:
-            outlook = self.outlook(now, host, pending=question.policy in COUNTING)
-            if question.policy == "randomized":
-                noise = self._rng.random() * NOISE * outlook.report.cores
-                outlook = replace(outlook, load=outlook.load + noise)
-            value, words = score(outlook, profile)
-            found.append(Ranked(host, value, words))
-        best_first = sorted(found, key=lambda one: (-one.score, one.host))
-        if question.policy == "two_choices" and len(best_first) > 1:
+        fit, left_out = self._fit(now, question)
+        if question.policy == "randomized":
+            fit = {host: self._noisy(outlook) for host, outlook in sorted(fit.items())}
+        profile = self.profile(question.kind)
+        scores = SCORES[metric](list(fit.values()), profile)
+        found = [(-score, host) for score, host in zip(scores, fit, strict=True)]
+        named = len(found) if at_most is None else at_most
+        if question.policy == "two_choices":
+            best_first = self._two_choices(found)[:named]
+        else:
+            best_first = heapq.nsmallest(named, found)
+        words = WORDS[metric]
+        return Ranking(
+            tuple(Ranked(host, -value, words(fit[host], profile)) for value, host in best_first),
+            metric,
+            why,
+            left_out,
+            more=len(found) - len(best_first),
+        )
+
+    def _noisy(self, outlook: Outlook) -> Outlook:
+        noise = self._rng.random() * NOISE * outlook.report.cores
+        return replace(outlook, load=outlook.load + noise)
+
+    def _two_choices(self, found: list[_Found]) -> list[_Found]:
+        """The better of two that are drawn, then the other, then the rest."""
+        best_first = sorted(found)
+        if len(best_first) > 1:
             drawn = self._rng.sample(best_first, 2)
             first = self._better(*drawn)
             best_first.sort(key=lambda one: (one is not first, one not in drawn))
-        return Ranking(tuple(best_first), metric, why, left_out)
+        return best_first
 
-    def _better(self, one: Ranked, other: Ranked) -> Ranked:
-        if math.isclose(one.score, other.score, rel_tol=CLOSE, abs_tol=CLOSE):
-            return min(one, other, key=lambda host: self._chosen.get(host.host, 0))
-        return max(one, other, key=lambda host: host.score)
+    def _better(self, one: _Found, other: _Found) -> _Found:
+        if math.isclose(one[0], other[0], rel_tol=CLOSE, abs_tol=CLOSE):
+            return min(one, other, key=lambda found: self._chosen.get(found[1], 0))
+        return min(one, other)
 
-    def _fit(self, now: Ns, question: Question) -> tuple[list[HostName], dict[HostName, str]]:
-        asked = question.hosts if question.hosts is not None else self.reports.keys()
-        checks: list[Callable[[HostName], str]] = [
-            lambda host: self._silent(now, host),
-            lambda host: "it is cordoned" if host in self.cordoned else "",
-            lambda host: self._lacks(now, host, question),
-        ]
+    def _fit(self, now: Ns, question: Question) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
+        """Hosts that can be named, and why the others can't."""
+        needs, pending = question.requirements, question.policy in COUNTING
+        # With thousands of hosts, what is asked of each one counts.
+        look_closely = bool(self.cordoned or needs.labels or needs.memory)
+        fit: dict[HostName, Outlook] = {}
         left_out: dict[HostName, str] = {}
-        fit = []
-        for host in sorted(asked):
-            reason = next(filter(None, (check(host) for check in checks)), "")
-            if reason:
-                left_out[host] = reason
+        for host in self.reports if question.hosts is None else question.hosts:
+            at, report = self.reports.get(host, NEVER)
+            if report is None or now - at > STALE or look_closely:
+                reason = self._unfit(now, host, question)
+                if reason:
+                    left_out[host] = reason
+                    continue
+            if report is None or (pending and host in self._pending):
+                fit[host] = self.outlook(now, host, pending=pending)
             else:
-                fit.append(host)
-        return fit, left_out
+                fit[host] = self._outlooks[host]
+        return fit, dict(sorted(left_out.items()))
+
+    def _unfit(self, now: Ns, host: HostName, question: Question) -> str:
+        """Why a host can't be named; nothing if it can."""
+        cordoned = "it is cordoned" if host in self.cordoned else ""
+        return self._silent(now, host) or cordoned or self._lacks(now, host, question)
 
     def _silent(self, now: Ns, host: HostName) -> str:
         last = self.reports.get(host)

@@ -6,7 +6,7 @@ how fast the component would run there: a processor shared by all who want it, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,6 +15,8 @@ from zscout.balancing.model import Metric, Profile, Report
 THRASHING: Final = 0.05
 """What a component keeps of its speed where memory is far too small for it."""
 MEGABYTE: Final = 1_000_000
+LEAST: Final = 0.01
+"""Cores that any component wants."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +36,25 @@ class Outlook:
 
 def rate(outlook: Outlook, profile: Profile) -> float:
     """How fast a component of this profile would run: 1.0 is a core of speed 1.0 whenever it wants one."""
-    report = outlook.report
-    wanting = outlook.load + max(profile.wants(report.speed), 0.01)
-    return report.speed * min(1.0, report.cores / wanting) * fits(outlook, profile)
+    return rates([outlook], profile)[0]
+
+
+def rates(outlooks: Sequence[Outlook], profile: Profile) -> list[float]:
+    """Of thousands of hosts in one go: `profile.wants` stands in the loop, as a call would cost more."""
+    cpu, threads, needed = profile.cpu, float(profile.threads), profile.memory
+    found = []
+    for outlook in outlooks:
+        report = outlook.report
+        speed, cores = report.speed, report.cores
+        wants = cpu / speed
+        if wants > threads:
+            wants = threads
+        elif wants < LEAST:
+            wants = LEAST
+        wanting = outlook.load + wants
+        got = speed if wanting <= cores else speed * cores / wanting
+        found.append(got if outlook.memory >= needed else got * fits(outlook, profile))
+    return found
 
 
 def fits(outlook: Outlook, profile: Profile) -> float:
@@ -46,31 +64,25 @@ def fits(outlook: Outlook, profile: Profile) -> float:
     return max(THRASHING, (max(0, outlook.memory) / profile.memory) ** 2)
 
 
-def _load_average(outlook: Outlook, _: Profile) -> tuple[float, str]:
-    return -outlook.load_per_core, f"load {outlook.load_per_core:.2f} a core"
-
-
-def _processor_speed(outlook: Outlook, _: Profile) -> tuple[float, str]:
-    return outlook.report.speed, f"speed {outlook.report.speed:.2f}"
-
-
-def _available_memory(outlook: Outlook, _: Profile) -> tuple[float, str]:
-    return float(outlook.memory), f"{outlook.memory / MEGABYTE:,.0f} MB available"
-
-
-def _composite(outlook: Outlook, profile: Profile) -> tuple[float, str]:
-    got = rate(outlook, profile)
-    words = (
-        f"would run at {got:.2f}: speed {outlook.report.speed:.2f}, load {outlook.load_per_core:.2f} a core, "
-        f"{outlook.memory / MEGABYTE:,.0f} MB available"
+def _composite_words(outlook: Outlook, profile: Profile) -> str:
+    return (
+        f"would run at {rate(outlook, profile):.2f}: speed {outlook.report.speed:.2f}, "
+        f"load {outlook.load_per_core:.2f} a core, {outlook.memory / MEGABYTE:,.0f} MB available"
     )
-    return got, words
 
 
-SCORES: Final[Mapping[Metric, Callable[[Outlook, Profile], tuple[float, str]]]] = {
-    "load_average": _load_average,
-    "processor_speed": _processor_speed,
-    "available_memory": _available_memory,
-    "composite": _composite,
+SCORES: Final[Mapping[Metric, Callable[[Sequence[Outlook], Profile], list[float]]]] = {
+    "load_average": lambda outlooks, _: [-one.load_per_core for one in outlooks],
+    "processor_speed": lambda outlooks, _: [one.report.speed for one in outlooks],
+    "available_memory": lambda outlooks, _: [float(one.memory) for one in outlooks],
+    "composite": rates,
 }
-"""All but `auto`, which chooses among them: the score, and it in words."""
+"""All but `auto`, which chooses among them: the scores of these hosts."""
+
+WORDS: Final[Mapping[Metric, Callable[[Outlook, Profile], str]]] = {
+    "load_average": lambda outlook, _: f"load {outlook.load_per_core:.2f} a core",
+    "processor_speed": lambda outlook, _: f"speed {outlook.report.speed:.2f}",
+    "available_memory": lambda outlook, _: f"{outlook.memory / MEGABYTE:,.0f} MB available",
+    "composite": _composite_words,
+}
+"""The same in words: for those hosts only that are named, as they take longer than the scores."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 HostName: TypeAlias = str
 ComponentId: TypeAlias = str
@@ -39,8 +39,7 @@ MAX_USES: Final = 1_000
 """Components in one load report."""
 
 
-@dataclass(frozen=True, slots=True)
-class Use:
+class Use(NamedTuple):
     """What one component uses, with all its child processes: `cpu` in cores, `memory` in bytes.
 
     `served` is the share of the time in which it wanted a processor that it had one, from 0 to 1; None where
@@ -78,6 +77,22 @@ class Report:
     uses: tuple[Use, ...] = ()
 
     def __post_init__(self) -> None:
+        # Thousands come each second: what is wrong is looked for only where something is.
+        one, five, fifteen = self.load_average
+        if not (
+            SMALLEST <= self.cores <= LARGEST
+            and SMALLEST <= self.speed <= LARGEST
+            and 0 <= self.cpu <= 1
+            and 0 <= one <= LARGEST
+            and 0 <= five <= LARGEST
+            and 0 <= fifteen <= LARGEST
+            and 0 <= self.memory_available <= LARGEST
+            and 0 <= self.memory_total <= LARGEST
+            and len(self.uses) <= MAX_USES
+        ):
+            self._refuse()
+
+    def _refuse(self) -> None:
         _bounded("cores", self.cores, SMALLEST)
         _bounded("speed", self.speed, SMALLEST)
         _bounded("cpu", self.cpu, 0, 1)
@@ -99,8 +114,7 @@ def _bounded(name: str, value: float, least: float, most: float = LARGEST) -> No
         raise ValueError(f"{name}: {value} is not from {least:g} to {most:g}")
 
 
-@dataclass(frozen=True, slots=True)
-class Profile:
+class Profile(NamedTuple):
     """What a kind of component is known to use: `cpu` in cores of speed 1.0, `memory` in bytes.
 
     `threads`: it never wants more cores than that, however slow they are. A component that computes all the
@@ -153,9 +167,10 @@ class Ranked:
 @dataclass(frozen=True, slots=True)
 class Ranking:
     """Hosts best first; `metric` is the one that was used, `why` says how that came; `left_out` tells of each
-    host that was asked about and can't be named, why."""
+    host that was asked about and can't be named, why; `more` hosts are ranked behind those named."""
 
     hosts: tuple[Ranked, ...]
     metric: Metric
     why: str
     left_out: Mapping[HostName, str] = field(default_factory=dict)
+    more: int = 0

@@ -87,6 +87,10 @@ class Held:
         rc = self.rc(need) if is_pattern(need) else need
         return await self._client.command(rc, self.grant, do, ttl=ttl)
 
+    async def resumed(self) -> None:
+        """Waits while the client is paused: whatever becomes of the hold meanwhile is told then."""
+        await self._client.resumed()
+
     async def over(self) -> None:
         """Waits until the hold is over; for bodies that work elsewhere."""
         while self.active:
@@ -157,6 +161,7 @@ class _Entered:
 
     async def interrupt_when_over(self) -> None:
         await self.held.over()
+        await self.held.resumed()
         self._interrupted = True
         self.body.cancel()
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
-from zscout.keyexpr import BadName, check_rc, is_pattern, matcher
+from zscout.keyexpr import BadName, check_name, check_need, check_rc, is_pattern, matcher
 from zscout.messages import Amounts, Ask, Notice, OpenRequest
 from zscout.scheduling.model import NO_TERM, SECOND, Grant, Ns, Place, Term
 
@@ -26,7 +26,8 @@ class Ending(NamedTuple):
 class OpenArc:
     """A request from its first asking to its end.
 
-    `state` is `asking` until the first word, then `queued`, `running`, `ended` or `refused`.
+    `state` is `asking` until the first word, then `queued`, `running`, `ended` or `refused`. One that another
+    client is to hand over is `expected` until the first word; one that was handed over is `moved`.
     """
 
     id: str
@@ -55,6 +56,25 @@ class OpenArc:
     ending: Ending | None = None
     """How the last hold ended; `outcome` and `reason` are of the newest word, whatever it is about."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
+
+    @classmethod
+    def expected(cls, request: OpenRequest, now: Ns) -> Self:
+        """What another client will hand over, as it told of it. Raises BadName."""
+        for need in request.needs:
+            check_need(need)
+        return cls(
+            id=check_name(request.id, "id"),
+            name=check_name(request.arc, "arc"),
+            needs=request.needs,
+            priority=request.priority,
+            min_runtime=request.min_runtime,
+            keep=request.keep,
+            state="expected",
+            reason="another client is to hand it over",
+            place=request.place,
+            since=now,
+            waits_since=now - round(request.waited * SECOND),
+        )
 
     @property
     def open(self) -> bool:
@@ -111,6 +131,26 @@ class OpenArc:
         """The request is over by the client's own judgement."""
         self._close(Ending(outcome, reason), now)
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
+
+    def come(self, notice: Notice, now: Ns) -> bool:
+        """Takes the first word about an expected one. False if it is none: an old one, or not credible."""
+        self.state = "asking"
+        if notice.state != "ended" and self.take(notice, now):
+            return True
+        self.state = "expected"
+        return False
+
+    def move(self, now: Ns) -> None:
+        """It goes on in another client."""
+        self._close(Ending("handed_over", "handed over"), now)
+        self.state, self.since = "moved", now
+
+    def take_back(self, new_id: str, reason: str, now: Ns) -> None:
+        """The client to which it was handed over is gone: it is asked for anew, at its old place."""
+        if self.ending is not None and self.ending.outcome == "handed_over":
+            self.ending = Ending("lost", reason)
+        self.id, self.last = new_id, (NO_TERM, 0)
+        self.state, self.reason, self.outcome, self.since = "asking", reason, None, now
 
     def _waited(self, now: Ns) -> float:
         since = self.waits_since

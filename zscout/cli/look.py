@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Final
 from zscout import clock
 from zscout.cli import common
 from zscout.keyexpr import Role, Sender, Token
-from zscout.messages import LoadReport, RcmState
-from zscout.scheduling.model import SECOND, Ns
+from zscout.messages import ListPlacements, LoadReport, Placements, RcmState, absurd
+from zscout.scheduling.model import NO_TERM, SECOND, Ns, Term
 
 if TYPE_CHECKING:
     from zscout.behaviors.client import Client
     from zscout.mesh import Declared
 
+ASK_PLACER: Final = 1.0
 FIND_LOADS: Final = 1.2
 """Seconds to wait for load reports: they come once a second."""
 STALE: Final = 3 * SECOND
@@ -39,6 +40,11 @@ class Host:
     def has(self, role: str) -> bool:
         return any(token.role == role for token in self.tokens)
 
+    @property
+    def components(self) -> list[str]:
+        """Names of those that run there."""
+        return sorted({token.name for token in self.tokens if token.role == Role.COMPONENT})
+
 
 class Look:
     """What a client sees of its fleet from now on: who is alive, loads, and the RCM's state when asked."""
@@ -46,12 +52,16 @@ class Look:
     def __init__(self, client: Client) -> None:
         self.client = client
         self.hosts: dict[str, Host] = {}
+        self.cordoned: frozenset[str] = frozenset()
+        """Hosts on which nothing is placed, as of the last `look_at_cordons` or what was published since."""
         self.changed = asyncio.Event()
         self._settled = False
+        self._placer: Term = NO_TERM
         keys, mesh = client.mesh.keys, client.mesh
         self._declared: list[Declared] = [
             mesh.watch(keys.alive_any(), self._on_token),
             mesh.subscribe(keys.load_any, LoadReport, self._on_load),
+            mesh.subscribe(keys.placements, Placements, self._on_placements),
         ]
 
     def close(self) -> None:
@@ -71,6 +81,20 @@ class Look:
         if host is not None:
             host.load, host.reported = load, clock.now()
             self.changed.set()
+
+    def _on_placements(self, _key: str, told: Placements) -> None:
+        if told.term >= self._placer and not absurd(told.term, self._placer):
+            self._placer, self.cordoned = told.term, frozenset(told.cordoned)
+
+    async def look_at_cordons(self) -> None:
+        """Asks the placer; without an answer all stays as it was."""
+        # No component has this name: the answer is short.
+        asked = ListPlacements(component="*")
+        reply = await self.client.mesh.ask_one(
+            self.client.mesh.keys.placer, asked, Placements, timeout=ASK_PLACER
+        )
+        if reply is not None and reply.message is not None:
+            self._on_placements("", reply.message)
 
     def forget_the_gone(self) -> None:
         now = clock.now()
@@ -119,4 +143,6 @@ class Look:
 
         await self.until(complete, FIND_LOADS)
         self._settled = loads
+        if loads:
+            await self.look_at_cordons()
         return (await self.client.state(forecast=True) if loads else None) or state

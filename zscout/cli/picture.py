@@ -1,4 +1,5 @@
-"""The fleet as `zscout status` shows it to people: coloured tables at a terminal, plain lines in a pipe."""
+"""What people see: coloured tables at a terminal, plain lines in a pipe. And the fleet as `zscout status`
+shows it."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from zscout import clock
 from zscout.cli import common
 from zscout.cli.look import Host, Look
-from zscout.keyexpr import Role
+from zscout.keyexpr import Role, Token
 from zscout.messages import HoldView, RcmState
 from zscout.scheduling.model import SECOND
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 MAX_ROWS: Final = 500
 """Of one table at a terminal."""
+MAX_NAMED: Final = 8
+"""Components in the row of a host."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +33,15 @@ class Table:
     rows: Sequence[Sequence[str]]
     styles: Sequence[str]
     spare: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A line, and tables below it. `alarm`: the line tells of something that is wrong."""
+
+    headline: str
+    tables: Sequence[Table]
+    alarm: bool = False
 
 
 def _headline(look: Look, state: RcmState | None) -> str:
@@ -106,7 +118,7 @@ def _waiting_table(state: RcmState) -> Table:
 def _host_table(look: Look) -> Table:
     rows, styles = [], []
     for name, host in look.everyone().items():
-        words, style = _condition(look, host)
+        words, style = _condition(look, name, host)
         load, cpu, memory = "-", "-", "-"
         if host.load is not None:
             load = f"{host.load.load_average[0]:.2f} of {host.load.cores}"
@@ -117,14 +129,15 @@ def _host_table(look: Look) -> Table:
     return Table("Hosts", ("HOST", "STATE", "LOAD", "CPU", "MEMORY FREE", "RUNS"), rows, styles)
 
 
-def _condition(look: Look, host: Host) -> tuple[str, str]:
+def _condition(look: Look, name: str, host: Host) -> tuple[str, str]:
     if host.gone is not None:
         return f"gone for {common.span((clock.now() - host.gone) / SECOND)}", "red"
     if not host.tokens:
         return "not there", "red"
     if look.stale(host):
         return "no load report", "yellow"
-    return ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
+    words, style = ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
+    return (f"{words}, cordoned", "yellow") if name in look.cordoned else (words, style)
 
 
 def _doing(host: Host) -> str:
@@ -132,20 +145,36 @@ def _doing(host: Host) -> str:
     parts = ["node"] if host.has(Role.NODE) else []
     parts += ["recorder"] if host.has(Role.RECORDER) else []
     parts += [_many(counts[Role.RC], "RC")] if counts[Role.RC] else []
-    parts += [_many(counts[Role.CLIENT], "client")] if counts[Role.CLIENT] else []
+    components = host.components
+    # Each component is a client too, and is named below.
+    clients = counts[Role.CLIENT] - sum(1 for token in host.tokens if _of_component(token, components))
+    parts += [_many(clients, "client")] if clients > 0 else []
+    parts += components[:MAX_NAMED]
+    parts += [f"{len(components) - MAX_NAMED} more components"] if len(components) > MAX_NAMED else []
     return ", ".join(parts)
+
+
+def _of_component(token: Token, components: Sequence[str]) -> bool:
+    """Whether this is the client of one of these: `<component>.<incarnation>`."""
+    name, _, number = token.name.rpartition(".")
+    return token.role == Role.CLIENT and number.isdigit() and name in components
 
 
 def _many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def print_picture(look: Look, state: RcmState | None) -> None:
+def fleet_picture(look: Look, state: RcmState | None) -> Picture:
+    """RCs, what runs and waits, and the hosts."""
+    return Picture(_headline(look, state), list(_tables(look, state)), alarm=state is None)
+
+
+def print_picture(picture: Picture) -> None:
     if common.at_terminal():
-        common.console().print(rich_picture(look, state))
+        common.console().print(rich_picture(picture))
         return
-    common.print_line(_headline(look, state))
-    for table in _tables(look, state):
+    common.print_line(common.clean(picture.headline))
+    for table in picture.tables:
         rows = [[common.clean(cell) for cell in row] for row in table.rows]
         if rows:
             common.print_line("")
@@ -153,15 +182,15 @@ def print_picture(look: Look, state: RcmState | None) -> None:
                 common.print_line(line)
 
 
-def rich_picture(look: Look, state: RcmState | None, *after: Text) -> Group:
+def rich_picture(picture: Picture, *after: Text) -> Group:
     """The picture for a terminal."""
     from rich import table as rich_table
     from rich.console import Group
     from rich.text import Text
 
     narrow = common.narrow()
-    parts: list[Any] = [Text(_headline(look, state), style="bold" if state is not None else "bold red")]
-    for table in _tables(look, state):
+    parts: list[Any] = [Text(common.clean(picture.headline), style="bold red" if picture.alarm else "bold")]
+    for table in picture.tables:
         if not table.rows:
             continue
         shown = rich_table.Table(

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
-from typing import Any, Final
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import Any
 
 import click
 from msgspec import structs
@@ -15,19 +13,11 @@ from msgspec import structs
 from zscout import clock
 from zscout.cli import common
 from zscout.cli.look import Host, Look
-from zscout.cli.picture import print_picture, rich_picture
+from zscout.cli.picture import Picture, fleet_picture
+from zscout.cli.watching import pause, show_once, shower
 from zscout.keyexpr import Role
 from zscout.messages import Notice, RcmState
 from zscout.scheduling.model import SECOND, Ns
-
-EVERY: Final = 1.0
-"""Seconds between two pictures."""
-HASTE: Final = 0.1
-"""The same where something has changed."""
-PASSING: Final = frozenset(
-    {"held", "remaining", "waited", "starts_in", "seq", "links", "load", "age", "gone"}
-)
-"""Fields that change without anything having happened."""
 
 
 @click.command()
@@ -54,10 +44,7 @@ async def _once(as_json: bool) -> None:
     async with common.connected("status", need_rcm=False) as client:
         look = Look(client)
         state, nobody = await _first(look)
-        if as_json:
-            common.print_json(as_object(look, state))
-        else:
-            print_picture(look, state)
+        show_once(Standing(look, state), as_json=as_json)
         if nobody is not None:
             raise nobody
 
@@ -84,97 +71,30 @@ async def _watch(as_json: bool) -> None:
         # Whatever becomes of an ARC is told to its client.
         heard = client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
         stack.callback(heard.close)
-        if as_json:
-            show = _json_lines(look)
-        elif common.at_terminal():
-            stack.enter_context(_q_ends(end))
-            show = _in_place(stack, look)
-        else:
-            show = _blocks(look)
+        show = shower(stack, as_json=as_json, end=end)
         state, _ = await _first(look)
         while not stop.is_set():
             look.forget_the_gone()
-            show(state)
-            await _within(EVERY, news)
-            await _within(HASTE, stop)
-            news.clear()
+            show(Standing(look, state))
+            await pause(news, stop)
             state = await client.state(forecast=True)
 
 
-async def _within(seconds: float, event: asyncio.Event) -> None:
-    with suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            await event.wait()
-
-
-Show = Callable[[RcmState | None], None]
-
-
-def _json_lines(look: Look) -> Show:
-    return lambda state: common.print_json(as_object(look, state))
-
-
-def _blocks(look: Look) -> Show:
-    """Prints a block where something has changed that is not a load or a span of time."""
-    last: list[Any] = [None]
-
-    def show(state: RcmState | None) -> None:
-        lasting = _lasting(as_object(look, state))
-        if lasting != last[0]:
-            if last[0] is not None:
-                common.print_line("")
-            last[0] = lasting
-            print_picture(look, state)
-
-    return show
-
-
-def _lasting(value: Any) -> Any:
-    """A JSON value without what changes all the time."""
-    if isinstance(value, dict):
-        return {key: _lasting(item) for key, item in value.items() if key not in PASSING}
-    return [_lasting(item) for item in value] if isinstance(value, list) else value
-
-
-def _in_place(stack: AsyncExitStack, look: Look) -> Show:
-    from rich.live import Live
-    from rich.text import Text
-
-    live = stack.enter_context(Live(console=common.console(), auto_refresh=False))
-
-    def show(state: RcmState | None) -> None:
-        live.update(rich_picture(look, state, Text("q or Ctrl-C ends", style="dim")), refresh=True)
-
-    return show
-
-
-@contextmanager
-def _q_ends(end: Callable[[], None]) -> Iterator[None]:
-    """Calls `end` when q is pressed, for as long as the context lasts."""
-    if not sys.stdin.isatty():
-        yield
-        return
-    import termios
-    import tty
-
-    loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
-
-    def pressed() -> None:
-        typed = os.read(terminal, 1024)
-        if not typed or b"q" in typed.lower():
-            end()
-
-    tty.setcbreak(terminal)
-    loop.add_reader(terminal, pressed)
-    try:
-        yield
-    finally:
-        loop.remove_reader(terminal)
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
-
-
 # What is shown
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How the fleet stands; `state` is None where there is no RCM."""
+
+    look: Look
+    state: RcmState | None
+
+    def picture(self) -> Picture:
+        return fleet_picture(self.look, self.state)
+
+    def as_object(self) -> dict[str, Any]:
+        return as_object(self.look, self.state)
 
 
 def as_object(look: Look, state: RcmState | None) -> dict[str, Any]:
@@ -213,6 +133,8 @@ def _host_object(look: Look, name: str, host: Host, now: Ns) -> dict[str, Any]:
         "candidate": host.has(Role.CANDIDATE),
         "rcs": sorted(token.name for token in host.tokens if token.role == Role.RC),
         "clients": sorted({token.name for token in host.tokens if token.role == Role.CLIENT}),
+        "components": host.components,
+        "cordoned": name in look.cordoned,
         "alive": bool(host.tokens),
         "gone": None if host.gone is None else (now - host.gone) / SECOND,
         "stale": look.stale(host),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -60,19 +60,28 @@ class Declared:
 class Overheard(Declared, Generic[S]):
     """Publications that wake nobody: the latest are kept, outside Python, until somebody looks."""
 
-    def __init__(self, subscriber: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]], kind: type[S]) -> None:
+    def __init__(
+        self, subscriber: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]], kind: type[S], depth: int
+    ) -> None:
         super().__init__(subscriber.undeclare)
-        self._subscriber, self._kind = subscriber, kind
+        self._subscriber, self._kind, self._depth = subscriber, kind, depth
 
     def take(self) -> list[S]:
         """What came since the last look, oldest first; malformed ones are dropped without a word."""
-        found: list[S] = []
-        while (sample := self._subscriber.try_recv()) is not None:
+        return [message for _, message in self.each()]
+
+    def each(self) -> Iterator[tuple[str, S]]:
+        """The same one by one, each with its key; what is not asked for is kept for the next look. Ends after
+        as many as there is room for: more may come while one looks."""
+        for _ in range(self._depth):
+            sample = self._subscriber.try_recv()
+            if sample is None:
+                return
             try:
-                found.append(messages.decode(sample.payload.to_bytes(), self._kind, messages.MAX_STATE))
+                message: S = messages.decode(sample.payload.to_bytes(), self._kind, messages.MAX_STATE)
             except Malformed:
                 continue
-        return found
+            yield str(sample.key_expr), message
 
 
 @dataclass(slots=True)

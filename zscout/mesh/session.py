@@ -335,10 +335,10 @@ class Mesh:
 
         return self._session.declare_subscriber(key, Callback(on_sample, _nothing, indirect=False)).undeclare
 
-    def overhear(self, key: str, kind: type[S]) -> Overheard[S]:
-        """Keeps the latest publications on `key` for whoever looks: with a `kind` of few fields, to know now
-        and then who spoke costs next to nothing that way."""
-        return Overheard(self._session.declare_subscriber(key, RingChannel(OVERHEARD)), kind)
+    def overhear(self, key: str, kind: type[S], *, depth: int = OVERHEARD) -> Overheard[S]:
+        """Keeps the latest `depth` publications on `key` for whoever looks: with a `kind` of few fields, to
+        know now and then who spoke costs next to nothing that way."""
+        return Overheard(self._session.declare_subscriber(key, RingChannel(depth)), kind, depth)
 
     # Liveliness
 

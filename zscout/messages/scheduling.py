@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from decimal import Decimal
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
+
+import msgspec
 
 from zscout.messages.base import Amounts, Elapsed, Message, Seconds, State, names_once
 from zscout.scheduling.model import Grant, Place, Term
+
+MAX_OTHERS = 255
+"""ARCs that one hand-over takes along, beside the one that it names first."""
 
 
 class Ask(Message, frozen=True, tag_field="op", tag="request"):
@@ -42,10 +47,14 @@ class Release(Message, frozen=True, tag_field="op", tag="release"):
 
 
 class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
-    """The sender's running ARC goes on in client `to`, under a new grant."""
+    """The sender's ARC goes on in client `to`: under a new grant if it runs, at its place if it waits.
+
+    `others` go along in the same step; what is not open at the sender among them is passed over. Asking again
+    once it is done tells how the ARC `id` stands at `to`."""
 
     id: str
     to: str
+    others: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
 
 
 class Foresee(Message, frozen=True, tag_field="op", tag="foresee"):

@@ -132,8 +132,8 @@ class Core:
             case ClientLost(client, reason):
                 for lost in self.arcs_of(client):
                     self._give_up(lost.id, Outcome.CLIENT_LOST, reason)
-            case HandedOver(arc, to):
-                self._hand_over(arc, to)
+            case HandedOver(arc, to, renamed):
+                self._hand_over(arc, to, renamed)
             case LeadTaken(term, standing, waiting):
                 self._lead(term, standing, waiting)
             case Tick():
@@ -196,15 +196,37 @@ class Core:
         self.floor.leave(name)
         self.votes.forget_rc(name)
 
-    def _hand_over(self, arc_id: ArcId, to: str) -> None:
-        arc = self.floor.running.get(arc_id)
-        if arc is None or arc.hold is None or arc.request.client == to:
+    def _hand_over(self, arc_id: ArcId, to: str, renamed: ArcId) -> None:
+        arc, twin = self.floor.arc(arc_id), self.floor.arc(renamed)
+        if arc is None or arc is twin:
             return
-        old = self._revocation(arc, arc.hold, Outcome.HANDED_OVER, f"handed over to {to}", requeued=False)
-        self._effects.append(old)
-        self.floor.hand_over(arc, to)
-        arc.hold = replace(arc.hold, grant=self._next_grant())
-        self._effects.append(self._granted(arc, arc.hold))
+        reason = f"handed over to {to}"
+        if twin is not None:
+            # Where a change of RCM hid the outcome, both clients may have told of the one ARC.
+            if twin.place != arc.place:
+                return
+            if twin.hold is not None or arc.hold is None:
+                self._give_up(arc_id, Outcome.HANDED_OVER, reason)
+                return
+            self.floor.drop(twin)
+            self._forget(twin)
+        if arc.hold is None:
+            self._effects.append(
+                Dropped(self._cause, arc.id, arc.request.client, Outcome.HANDED_OVER, reason)
+            )
+        else:
+            old = self._revocation(arc, arc.hold, Outcome.HANDED_OVER, reason, requeued=False)
+            self._effects.append(old)
+        for rc in self.floor.of(self.floor.everywhere(arc) & self.floor.sharable):
+            self.votes.rename_arc(rc.name, arc.id, renamed)
+        self.floor.hand_over(arc, to, renamed)
+        if arc.hold is not None:
+            arc.hold = replace(arc.hold, grant=self._next_grant())
+            if arc.hold.end > self._now:
+                self._note_end(arc, arc.hold)
+            self._effects.append(self._granted(arc, arc.hold))
+        elif arc.reason:
+            self._effects.append(Queued(self._cause, arc.id, to, arc.reason))
 
     def _lead(self, term: Term, standing: tuple[Standing, ...], waiting: tuple[Waiting, ...]) -> None:
         if term <= self.term:
@@ -283,6 +305,9 @@ class Core:
 
     def _take(self, arc: Arc, hold: Hold) -> None:
         self.floor.start(arc, hold, self._now)
+        self._note_end(arc, hold)
+
+    def _note_end(self, arc: Arc, hold: Hold) -> None:
         heapq.heappush(self._ends, (hold.end, arc.id, hold.grant.seq))
 
     def _end(

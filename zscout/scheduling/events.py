@@ -87,10 +87,12 @@ class ClientLost:
 
 @dataclass(frozen=True, slots=True)
 class HandedOver:
-    """A running ARC goes on in another client (migration): same RCs, same end, new grant."""
+    """An ARC goes on in another client (migration), by the name `renamed`: same place; if it runs, same RCs,
+    same end, new grant."""
 
     arc: ArcId
     to: ClientId
+    renamed: ArcId
 
 
 @dataclass(frozen=True, slots=True)

@@ -158,24 +158,32 @@ class Floor:
         arcs = self._clients.get(client, {}).values()
         return sorted(arcs, key=lambda arc: (arc.hold is not None, arc.turn))
 
-    def hand_over(self, arc: Arc, to: ClientId) -> None:
-        """A running ARC goes on under another client."""
-        self.forget(arc)
+    def hand_over(self, arc: Arc, to: ClientId, renamed: ArcId) -> None:
+        """An ARC goes on under another client, by another name. Its hold stands, or its wait goes on."""
+        if arc.hold is None:
+            self.drop(arc)
+            self._rename(arc, to, renamed)
+            self.enqueue(arc, arc.since)
+            return
+        del self.running[arc.id]
+        for rc in arc.rcs:
+            del rc.holders[arc.id]
         self._count_out(arc)
-        self.changes += 1
-        arc.request = replace(arc.request, client=to)
-        self.owners[owner_of(to)] += 1
+        self._rename(arc, to, renamed)
+        arc.turn = self._turn()
+        self._add_running(arc)
         self._clients.setdefault(to, {})[arc.id] = arc
+
+    def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
+        self.forget(arc)
+        arc.request, arc.id = replace(arc.request, arc=name, client=client), name
+        arc.rank = (*arc.rank[:3], name)
 
     def start(self, arc: Arc, hold: Hold, now: Ns) -> None:
         self.drop(arc)
         arc.hold, arc.reason, arc.since, arc.turn = hold, "", now, self._turn()
-        self.running[arc.id] = arc
-        self.changes += 1
+        self._add_running(arc)
         self.waits.stirred |= arc.mask
-        self.owners[owner_of(arc.request.client)] += 1
-        for rc in arc.rcs:
-            rc.holders[arc.id] = arc
         self.busy |= arc.mask & ~self.sharable
 
     def stop(self, arc: Arc) -> Hold:
@@ -203,6 +211,13 @@ class Floor:
         if quota is None or self.policy.operator(arc.priority):
             return None
         return max(0, quota - self.owners[owner_of(arc.request.client)])
+
+    def _add_running(self, arc: Arc) -> None:
+        self.running[arc.id] = arc
+        self.changes += 1
+        self.owners[owner_of(arc.request.client)] += 1
+        for rc in arc.rcs:
+            rc.holders[arc.id] = arc
 
     def _count_wanted(self, arc: Arc, by: int) -> None:
         for rc in self.of(arc.named) if arc.slots else arc.rcs:

@@ -87,6 +87,20 @@ class Ballot:
         for holders in [holders for holders in self.vetoed if arc in holders]:
             self._drop_vetoed(holders)
 
+    def rename(self, arc: ArcId, renamed: ArcId) -> list[int]:
+        """An ARC goes on by another name. Returns the proposals that are out and name it."""
+        for holders in list(self._accepted_with.get(arc, ())):
+            self._drop_accepted(holders)
+            self.accept(_renamed(holders, arc, renamed))
+        for holders, reason in [item for item in self.vetoed.items() if arc in item[0]]:
+            self._drop_vetoed(holders)
+            self.veto(_renamed(holders, arc, renamed), reason)
+        self.overdue = {_renamed(holders, arc, renamed) for holders in self.overdue}
+        asked = [holders for holders in self.out if arc in holders]
+        for holders in asked:
+            self.out[_renamed(holders, arc, renamed)] = self.out.pop(holders)
+        return [number for holders in asked for number in self.out[_renamed(holders, arc, renamed)]]
+
     def _drop_accepted(self, holders: HolderSet) -> None:
         del self.accepted[holders]
         for arc in holders:
@@ -96,6 +110,10 @@ class Ballot:
         del self.vetoed[holders]
         for arc in holders:
             _discard(self._vetoed_at, arc, holders)
+
+
+def _renamed(holders: HolderSet, arc: ArcId, renamed: ArcId) -> HolderSet:
+    return holders - {arc} | {renamed} if arc in holders else holders
 
 
 def _discard(index: dict[ArcId, dict[HolderSet, None]], arc: ArcId, holders: HolderSet) -> None:
@@ -210,6 +228,13 @@ class Votes:
         self.changes += 1
         for holders in [holders for holders in ballot.out if arc in holders]:
             self._close(ballot, holders)
+
+    def rename_arc(self, rc: RcName, arc: ArcId, renamed: ArcId) -> None:
+        """An ARC goes on by another name: what was said of it stands, what is asked stays asked."""
+        ballot = self._ballots.get(rc)
+        if ballot is not None:
+            for number in ballot.rename(arc, renamed):
+                self._out[number] = (rc, _renamed(self._out[number][1], arc, renamed))
 
     def out(self) -> Iterator[tuple[int, RcName, HolderSet]]:
         """The proposals that are out."""

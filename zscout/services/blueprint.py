@@ -20,6 +20,8 @@ The viewer makes the column of times in the event list as wide as this name: "ti
 
 OPERATOR: Final = 0xFF1463FF
 """RGBA of operator takeovers and preemptions."""
+FAILED: Final = 0xFF3B1FFF
+"""RGBA of what was given up."""
 PALETTE: Final[tuple[int, ...]] = (
     0x4E79A7FF,  # blue
     0xF28E2BFF,  # orange
@@ -48,47 +50,92 @@ STATES: Final[dict[str, int]] = {
 """RGBA of what an ARC is doing; a state not named here gets `OTHER`."""
 LINES: Final[tuple[int, ...]] = (0x56C1FFFF, 0xFFB454FF, 0xB5E07BFF, 0xD6A6FFFF, 0xFFF08AFF, 0x5FE0CFFF)
 """RGBA of the load curves, host by host; brighter than `PALETTE`, as a line is thin."""
+MARKS: Final[dict[str, tuple[int, rr.components.MarkerShape]]] = {
+    "placed": (0xFFFFFFFF, rr.components.MarkerShape.Up),
+    "restarted": (0xFFE14DFF, rr.components.MarkerShape.Circle),
+    "left": (0xC9A2FFFF, rr.components.MarkerShape.Left),
+    "came": (0xC9A2FFFF, rr.components.MarkerShape.Right),
+    "given_up": (FAILED, rr.components.MarkerShape.Cross),
+}
+"""RGBA and shape of what happened to a component, on the load curve of its host."""
+MARK_WORDS: Final = "▲ placed  ● restarted  ◀ moved away  ▶ moved here  \u00d7 given up"
+"""In the title: a legend of all this would cover the curves."""
 
 MARGIN: Final = 0.03
 """Part of a finished run's length that is left free after its end."""
 LIVE_WINDOW: Final = 60.0
 """Seconds of the past that a live view shows."""
+LIVE_HOST_ROWS: Final = 10
+"""Components that a live view has room for."""
 
 
 def blueprint(
-    live: bool, end: float | None = None, *, begin: float = 0.0, rc_rows: int = 6, arc_rows: int = 6
+    live: bool,
+    end: float | None = None,
+    *,
+    begin: float = 0.0,
+    rc_rows: int = 6,
+    arc_rows: int = 6,
+    host_rows: int = 0,
 ) -> rrb.Blueprint:
-    """The layout: who holds what, what each ARC does and the loads on one time axis, events beside them.
+    """The layout: who holds what, what each ARC does and the loads on one time axis, events beside them; with
+    components, also what runs on each host and what it uses.
 
     `live`: the window slides with the newest data and shows the last minute. Otherwise it is the absolute
-    range `begin` to `end` in seconds of the timeline, or all there is when `end` is None. `rc_rows` and
-    `arc_rows` are the rows expected in the two upper panes, which share the height accordingly.
+    range `begin` to `end` in seconds of the timeline, or all there is when `end` is None. `rc_rows`,
+    `arc_rows` and `host_rows` are the rows expected in the upper panes, which share the height accordingly.
+    Without components `host_rows` is 0; a pane of RCs or ARCs that would be empty beside them is left out.
     """
     axis = rrb.archetypes.TimeAxis(view_range=_window(live, begin, end))
+    lanes = [
+        ("/rc", "Who holds each resource", rc_rows),
+        ("/arc", "What each ARC is doing", arc_rows),
+        ("/host", "What runs on each host", host_rows),
+    ]
+    shown = [lane for lane in lanes if lane[2] or (lane[0] != "/host" and not host_rows)]
     panes = rrb.Vertical(
-        rrb.StateTimelineView(origin="/rc", name="Who holds each resource", time_view=axis),
-        rrb.StateTimelineView(origin="/arc", name="What each ARC is doing", time_view=axis),
+        *(rrb.StateTimelineView(origin=origin, name=name, time_view=axis) for origin, name, _ in shown),
         rrb.TimeSeriesView(
-            origin="/load",
-            name="Load average (1 min) per host",
+            origin="/",
+            contents=["/load/**", "/mark/**"],
+            name="Load average (1 min) per host" + (f"   {MARK_WORDS}" if host_rows else ""),
             axis_x=axis,
             plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
         ),
-        row_shares=[_share(rc_rows), _share(arc_rows), 7],
-    )
-    events = rrb.TextLogView(
-        origin="/events",
-        name="Events",
-        columns=rrb.archetypes.TextLogColumns(timeline_columns=[TIME], text_log_columns=["loglevel", "body"]),
+        row_shares=[*(_share(rows) for _, _, rows in shown), 7],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(panes, events, column_shares=[62, 38]),
+        rrb.Horizontal(panes, _beside(axis, uses=host_rows > 0), column_shares=[62, 38]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=TIME, play_state="following"),
         auto_layout=False,
         auto_views=False,
     )
+
+
+def _beside(axis: rrb.archetypes.TimeAxis, *, uses: bool) -> rrb.View | rrb.Container:
+    events = rrb.TextLogView(
+        origin="/events",
+        name="Events",
+        columns=rrb.archetypes.TextLogColumns(timeline_columns=[TIME], text_log_columns=["loglevel", "body"]),
+    )
+    if not uses:
+        return events
+    curves = [
+        rrb.TimeSeriesView(
+            origin=f"/use/{folder}",
+            name=name,
+            axis_x=axis,
+            # Colours are those of the lanes; a legend of many would cover the curves.
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+        for folder, name in (
+            ("cpu", "CPU of the heaviest components (cores), in the colours of the lanes"),
+            ("memory", "Memory of the heaviest components (MB)"),
+        )
+    ]
+    return rrb.Vertical(events, *curves, row_shares=[5, 3, 3])
 
 
 def save_blueprint(path: Path, *, live: bool = False, end: float | None = None) -> None:

@@ -17,8 +17,10 @@ from zscout.keyexpr import BadName, Role, Token, client_of, new_instance
 from zscout.mesh import Declared, Mesh, Reply
 from zscout.messages import ClientRequests, Grants, RcAsk, RcState, absurd
 from zscout.scheduling.model import NO_TERM, SECOND, Term
+from zscout.services.component_placer import ComponentPlacer
 from zscout.services.election import Election
 from zscout.services.load_balancer import LoadBalancer
+from zscout.services.placement_ledger import PlacementLedger
 from zscout.services.rcm import Rcm
 from zscout.services.rebuild import rebuild
 
@@ -41,7 +43,9 @@ class Candidate:
         """The highest term seen anywhere."""
         self.rcm: Rcm | None = None
         self.balancer: LoadBalancer | None = None
-        """Beside the RCM, while this node leads."""
+        """Beside the RCM, while this node leads; and so is the placer."""
+        self.placer: ComponentPlacer | None = None
+        self.ledger = PlacementLedger(mesh)
         self._changed = asyncio.Event()
         self._declared: list[Declared] = []
         self._task: asyncio.Task[None] | None = None
@@ -54,6 +58,7 @@ class Candidate:
             mesh.watch(keys.alive_any(Role.CANDIDATE), self._on_candidate),
             mesh.alive(Token(mesh.me.host, Role.CANDIDATE, mesh.me.client, new_instance())),
         ]
+        self.ledger.start()
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     async def stop(self) -> None:
@@ -62,12 +67,16 @@ class Candidate:
             await asyncio.gather(self._task, return_exceptions=True)
         if self.rcm is not None:
             self._stop_leading(self.rcm)
+        await self.ledger.stop()
         for declared in self._declared:
             declared.close()
 
     def _stop_leading(self, rcm: Rcm) -> None:
         rcm.stop()
         self.rcm = None
+        if self.placer is not None:
+            self.placer.stop()
+            self.placer = None
         if self.balancer is not None:
             self.balancer.stop()
             self.balancer = None
@@ -183,3 +192,5 @@ class Candidate:
         self.rcm.start(inheritance)
         self.balancer = LoadBalancer(self.mesh)
         self.balancer.start()
+        self.placer = ComponentPlacer(self.mesh, self.fleet, term, self.balancer, self.ledger.inherited())
+        self.placer.start()

@@ -48,8 +48,8 @@ class Desk:
         """Operations of the present burst that are not decided yet."""
         self._given_up: set[ArcId] = set()
         """ARCs that end in this burst by their own client's will."""
-        self._moved: dict[ArcId, ArcId] = {}
-        """What was handed over: by the name that its new client has for it, by which this RCM knows it."""
+        self._finding = 0
+        """Hand-overs that wait until it is known whether their new client is there."""
         self._closed = False
 
     def close(self) -> None:
@@ -109,7 +109,7 @@ class Desk:
                 self._ask(request, operation, sender)
             case Cancel() | Release():
                 owner = client_of(operation.client) if operation.client is not None else sender
-                arc = self._known_as(owner, operation.id)
+                arc = views.arc_id(str(owner), operation.id)
                 self._in_order(arc)
                 if owner == sender:
                     self._given_up.add(arc)
@@ -117,16 +117,19 @@ class Desk:
                 self._answers.setdefault(arc, []).append(request)
                 self._gather(arc, Cancelled(arc, by) if isinstance(operation, Cancel) else Released(arc, by))
             case HandOver():
-                self._hand_over(request, operation, sender)
+                self._on_hand_over(request, operation, sender)
             case Foresee():
                 self._foresee(request, operation, sender)
 
     def _ask(self, request: Request[Operation], ask: Ask, sender: Sender) -> None:
-        arc = self._known_as(sender, ask.id)
+        arc = views.arc_id(str(sender), ask.id)
         self._in_order(arc)
         if arc in self._answers:
             self._answers[arc].append(request)
         elif self.core.floor.arc(arc) is None and not self.notices.ended(arc):
+            if self._goes_on_elsewhere(ask):
+                request.answer(self.notices.handed_over(arc, str(sender), ask.arc))
+                return
             self._check_room(str(sender))
             wanted = admit(ask, sender, arc, self.core, self.fleet.limits)
             self.notices.call(arc, ask.arc)
@@ -138,6 +141,13 @@ class Desk:
             self._gather(arc, Asked(wanted, ask.place, since))
         else:
             request.answer(self.notices.standing(arc, str(sender), ask.id))
+
+    def _goes_on_elsewhere(self, ask: Ask) -> bool:
+        """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
+        if ask.place is None:
+            return False
+        arcs = (*self.core.floor.running.values(), *self.core.floor.queued.values())
+        return any(arc.place == ask.place and views.request_id(arc.id) == ask.id for arc in arcs)
 
     def _check_room(self, client: str) -> None:
         """Refuses what is too much at once; what this burst has brought already counts."""
@@ -154,19 +164,80 @@ class Desk:
         if arc in self._gathered:
             self.decide()
 
-    def _hand_over(self, request: Request[Operation], operation: HandOver, sender: Sender) -> None:
-        arc = self._known_as(sender, operation.id)
+    def _on_hand_over(self, request: Request[Operation], operation: HandOver, sender: Sender) -> None:
         to = str(client_of(operation.to))
-        self._in_order(arc)
-        running = self.core.floor.running.get(arc)
-        if running is None or running.request.client not in (str(sender), to):
-            raise Refused("not_running", f"{operation.id} does not run at {sender}")
-        if not self.presence.alive(to):
-            raise Refused("unknown_client", f"{to} is not on the mesh")
-        self._moved = {name: moved for name, moved in self._moved.items() if self.core.floor.arc(moved)}
-        self._moved[views.arc_id(to, operation.id)] = arc
-        self._carry_out((HandedOver(arc, to),))
-        request.answer(self.notices.standing(arc, str(sender), operation.id))
+        for other in operation.others:
+            check_name(other, "id")
+        self.decide()
+        arc = views.arc_id(str(sender), operation.id)
+        if str(sender) == to or self.core.floor.arc(arc) is None:
+            self._tell_handed_over(request, operation, str(sender), to)
+            return
+        if self._finding >= MAX_GATHERED:
+            raise Refused("busy", f"{MAX_GATHERED} hand-overs wait here already; ask again")
+        self._finding += 1
+
+        def found(alive: bool) -> None:
+            self._finding -= 1
+            try:
+                if self._closed:
+                    raise Refused("not_leading", "this RCM stopped leading; ask again")
+                if not alive:
+                    raise Refused("unknown_client", f"{to} is not on the mesh")
+                self._hand_over(request, operation, str(sender), to)
+            except Refused as refused:
+                request.refuse(refused.problem)
+            except Exception:
+                request.refuse(Refused("internal", "the request failed here; see this node's log").problem)
+                raise
+
+        self.presence.find(to, found)
+
+    def _tell_handed_over(
+        self, request: Request[Operation], operation: HandOver, sender: str, to: str
+    ) -> None:
+        """Answers who asks for what was done before. Raises Refused if it was not."""
+        goal = views.arc_id(to, operation.id)
+        over = self.notices.ended(goal) and self.notices.ended(views.arc_id(sender, operation.id))
+        if self.core.floor.arc(goal) is None and not over:
+            raise Refused("not_running", f"{operation.id} is not open at {sender}")
+        # The new client may have missed it, where the RCM changed just then.
+        for request_id in (operation.id, *operation.others):
+            self.notices.stands(views.arc_id(to, request_id))
+        request.answer(self.notices.standing(goal, to, operation.id))
+
+    def _hand_over(self, request: Request[Operation], operation: HandOver, sender: str, to: str) -> None:
+        """All in one batch of events, and so in one publication: nobody gets in between."""
+        self.decide()
+        moves = self._moves(operation, sender, to)
+        if not moves or moves[0].arc != views.arc_id(sender, operation.id):
+            self._tell_handed_over(request, operation, sender, to)
+            return
+        room = self.fleet.limits.max_requests_per_client - len(self.core.arcs_of(to))
+        if len(moves) > room:
+            raise Refused("too_many", f"{to} has room for {max(0, room)} more requests, not for {len(moves)}")
+        for move in moves:
+            self.notices.call(move.renamed, self.notices.name(move.arc))
+        self.presence.expect(to)
+        self._carry_out(moves)
+        for move in moves:
+            if move.renamed in self.core.floor.queued:
+                self.notices.stands(move.renamed)
+        request.answer(self.notices.standing(moves[0].renamed, to, operation.id))
+
+    def _moves(self, operation: HandOver, sender: str, to: str) -> list[HandedOver]:
+        """What a hand-over comes to: of the ARCs that it names, those that are open at the sender."""
+        moves = []
+        for request_id in dict.fromkeys((operation.id, *operation.others)):
+            arc = self.core.floor.arc(views.arc_id(sender, request_id))
+            if arc is None:
+                continue
+            renamed = views.arc_id(to, request_id)
+            taken = self.core.floor.arc(renamed)
+            if taken is not None and taken.place != arc.place:
+                raise Refused("bad_request", f"{to} has a request {request_id} already; ask under random ids")
+            moves.append(HandedOver(arc.id, to, renamed))
+        return moves
 
     def _foresee(self, request: Request[Operation], operation: Foresee, sender: Sender) -> None:
         self.decide()
@@ -200,8 +271,3 @@ class Desk:
     def _answer_all(self, arcs: list[ArcId]) -> None:
         for arc in arcs:
             self.answer(arc)
-
-    def _known_as(self, client: Sender, request_id: str) -> ArcId:
-        """The ARC that a client calls so: its own, or one that was handed over to it."""
-        arc = views.arc_id(str(client), request_id)
-        return arc if self.core.floor.arc(arc) is not None else self._moved.get(arc, arc)

@@ -6,14 +6,14 @@ import asyncio
 import logging
 import os
 from collections.abc import Iterable
-from typing import Final
+from typing import Final, NamedTuple
 
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declared, Mesh
 from zscout.messages import LoadReport
-from zscout.services.cgroup import Cgroup
+from zscout.services.cgroup import Cgroup, Memory
 from zscout.services.host_figures import CpuMeter, Paced, clock, cores, memory, speed, temperature
-from zscout.services.process_use import Nothing, Processes, UseMeter
+from zscout.services.process_use import LoadAverage, Nothing, Processes, TreeMeter, TreeUse, UseMeter
 
 log = logging.getLogger("zscout.load")
 
@@ -27,13 +27,24 @@ SENSORS_EVERY: Final = 10.0
 SENSORS_SHARE: Final = 0.0002
 USES_SHARE: Final = 0.002
 """Of one core, that is spent on looking at what components use: many are looked at less often."""
+TREE_SHARE: Final = 0.004
+"""Likewise, at looking at this process and its descendants."""
 
 
 class LoadReporter:
-    """Publishes this host's load until stopped. `labels` are the host's; `processes` its components."""
+    """Publishes this host's load until stopped. `labels` are the host's; `processes` its components. With
+    `tree` it tells only of this process and its descendants, as if the host had no other programs."""
 
-    def __init__(self, mesh: Mesh, labels: Iterable[str] = (), processes: Processes | None = None) -> None:
+    def __init__(
+        self,
+        mesh: Mesh,
+        labels: Iterable[str] = (),
+        processes: Processes | None = None,
+        *,
+        tree: bool = False,
+    ) -> None:
         self.mesh = mesh
+        self._tree = tree
         self._labels = tuple(labels)
         self._processes = processes or Nothing()
         self._declared: list[Declared] = []
@@ -57,7 +68,7 @@ class LoadReporter:
         loop = asyncio.get_running_loop()
         due = loop.time() + PERIOD
         # In a thread: it reads files, of which a sensor's may take its time.
-        gauge = await asyncio.to_thread(Gauge, self.mesh.me.host, self._labels, self._processes)
+        gauge = await asyncio.to_thread(self._gauge)
         failed = False
         while True:
             await asyncio.sleep(due - loop.time())
@@ -73,6 +84,51 @@ class LoadReporter:
                 failed = False
                 self._publisher.put(report)
 
+    def _gauge(self) -> Gauge:
+        load = TreeLoad(TreeMeter()) if self._tree else None
+        return Gauge(self.mesh.me.host, self._labels, self._processes, load=load)
+
+
+class Load(NamedTuple):
+    """How busy a host is, or what is taken for one."""
+
+    averages: tuple[float, float, float]
+    cpu: float
+    """Percent of all cores."""
+    available: int
+    """Bytes of memory."""
+
+
+class HostLoad:
+    """The load of the whole host, or of the container where that has limits."""
+
+    def __init__(self, cgroup: Cgroup) -> None:
+        self._cpu = CpuMeter(cgroup)
+
+    def __call__(self, size: float, ram: Memory) -> Load:
+        """Of so many cores, with this memory; CPU use since the last call."""
+        return Load(os.getloadavg(), self._cpu.percent(size), ram.available)
+
+
+class TreeLoad:
+    """The load of one process tree, as if there were no other programs."""
+
+    def __init__(self, meter: TreeMeter) -> None:
+        self._meter = meter
+        self._average = LoadAverage()
+        self._uses = Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
+
+    def __call__(self, size: float, ram: Memory) -> Load:
+        """Of so many cores, with this memory; CPU use since the tree was last looked at."""
+        use = self._uses()
+        percent = min(100.0, 100 * use.cores / size)
+        return Load(self._average.averages, percent, max(0, ram.total - use.memory))
+
+    def _measure(self) -> TreeUse:
+        use = self._meter.measure()
+        self._average.add(use.wanted, use.elapsed)
+        return use
+
 
 class Gauge:
     """Measures one host again and again. Takes 30 ms to make; use it from one thread at a time."""
@@ -83,10 +139,12 @@ class Gauge:
         labels: tuple[str, ...] = (),
         processes: Processes | None = None,
         cgroup: Cgroup | None = None,
+        *,
+        load: TreeLoad | None = None,
     ) -> None:
         self._host, self._labels = host, labels
         self._cgroup = cgroup or Cgroup()
-        self._cpu = CpuMeter(self._cgroup)
+        self._load = load or HostLoad(self._cgroup)
         self._number = 0
         self._speed = speed()
         self._fresh = True
@@ -99,17 +157,18 @@ class Gauge:
     def report(self) -> LoadReport:
         """The host's load now; CPU use since the last call."""
         self._number += 1
-        size, free = cores(self._cgroup), memory(self._cgroup)
+        size, ram = cores(self._cgroup), memory(self._cgroup)
+        load = self._load(size, ram)
         now, rated = self._clocks()
         return LoadReport(
             host=self._host,
             number=self._number,
             # Readers of the first version take whole numbers only.
             cores=int(size) if size.is_integer() else size,
-            load_average=os.getloadavg(),
-            cpu=self._cpu.percent(size),
-            memory_available=free.available,
-            memory_total=free.total,
+            load_average=load.averages,
+            cpu=load.cpu,
+            memory_available=load.available,
+            memory_total=ram.total,
             speed=round(self._speeds(), 3),
             clock=round(now, 1),
             clock_rated=round(rated, 1),

@@ -12,7 +12,7 @@ from zscout.keyexpr import BadName, client_of, is_pattern
 from zscout.mesh import Mesh
 from zscout.messages import Notice, State
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Dropped, Granted, Revoked
+from zscout.scheduling.effects import Dropped, Granted, Outcome, Revoked
 from zscout.scheduling.model import SECOND, Arc, ArcId, Ns, Term
 from zscout.services import views
 from zscout.services.story import Story
@@ -87,7 +87,6 @@ class Notices:
         )
         if not answered:
             self._notify(notice)
-        # What was handed over goes on under its own name.
         if self.core.floor.arc(effect.arc) is None:
             self._remember(effect.arc, notice)
 
@@ -96,6 +95,13 @@ class Notices:
         if not self._untold:
             asyncio.get_running_loop().call_later(REASONS_EVERY, self._tell_reasons)
         self._untold.add(arc)
+
+    def stands(self, arc_id: ArcId) -> None:
+        """Tells an ARC's client how it stands, now."""
+        arc = self.core.floor.arc(arc_id)
+        if arc is not None:
+            self._untold.discard(arc_id)
+            self._notify(self.of_arc(arc))
 
     def _tell_reasons(self) -> None:
         untold, self._untold = self._untold, set()
@@ -174,6 +180,11 @@ class Notices:
             return self._ended[arc_id][1]
         return self._notice(arc_id, client, request_id, "ended", reason="no such request is open")
 
+    def handed_over(self, arc: ArcId, client: str, name: str) -> Notice:
+        """That a request goes on in another client, where no more than that is known."""
+        reason = "handed over to another client"
+        return self._notice(arc, client, name, "ended", reason=reason, outcome=Outcome.HANDED_OVER)
+
     def _notify(self, notice: Notice) -> None:
         try:
             self.mesh.put(self.mesh.keys.notice(client_of(notice.client)), notice)
@@ -184,6 +195,7 @@ class Notices:
         now = clock.now()
         self._names.pop(arc, None)
         self._ended[arc] = (now + REMEMBER, notice)
+        self._ended.move_to_end(arc)
         while self._ended and (
             len(self._ended) > MAX_REMEMBERED or next(iter(self._ended.values()))[0] < now
         ):

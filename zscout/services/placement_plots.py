@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from zscout.balancing.model import POLICIES, SECOND, Ns, Policy
 from zscout.balancing.simulation import Outcome
 from zscout.balancing.study import SCENARIOS, Report
-from zscout.services.study_plots import page
 from zscout.strict import BadInput
 
 if TYPE_CHECKING:
@@ -24,10 +23,20 @@ TIME: Final = "virtual_time"
 """The timeline of the curves: a duration in seconds."""
 COLOURS: Final = (0x56C1FFFF, 0xFFB454FF, 0xB5E07BFF)
 """RGBA by host."""
+WIDTHS: Final = (6.0, 3.5, 1.5)
+"""Of the curves, by host: where they are the same, all can be seen."""
+TITLES: Final = {"simultaneous": "(a) all at once", "staggered": "(b) one net a minute"}
+MARKS: Final = 30
+"""Marks that would fill a plot from top to bottom: those of one moment stand above each other."""
+MARGIN: Final = 0.03
+"""Part of the whole that is left free at the sides of a plot."""
 WRITE_SECONDS: Final = 10.0
 
+Outcomes: TypeAlias = Mapping[tuple[str, Policy], Outcome]
+Points: TypeAlias = list[tuple[Ns, float]]
 
-def record(path: Path, report: Report, outcomes: Mapping[tuple[str, Policy], Outcome]) -> None:
+
+def record(path: Path, report: Report, outcomes: Outcomes) -> None:
     """Writes the recording, replacing what was there. `outcomes` are by scenario and policy.
 
     Raises BadInput where the file can't be written."""
@@ -35,11 +44,21 @@ def record(path: Path, report: Report, outcomes: Mapping[tuple[str, Policy], Out
 
     recording = rr.RecordingStream(APPLICATION)
     try:
-        recording.save(path, default_blueprint=_blueprint())
+        recording.save(path, default_blueprint=_blueprint(outcomes))
         for (scenario, policy), outcome in outcomes.items():
-            for number, host in enumerate(outcome.curves):
-                colour = COLOURS[number % len(COLOURS)]
-                _host(recording, f"{scenario}/{policy}", host, colour, outcome)
+            marks = _marks(outcome, _top(outcomes, scenario) / MARKS)
+            for number, (host, curve) in enumerate(outcome.curves.items()):
+                colour, width = COLOURS[number % len(COLOURS)], WIDTHS[number % len(WIDTHS)]
+                line = rr.SeriesLines(colors=[colour], names=[host], widths=[width])
+                _draw(recording, f"{scenario}/{policy}/load/{host}", line, curve)
+                if marks[host]:
+                    points = rr.SeriesPoints(
+                        colors=[colour],
+                        names=[f"▲ {host}"],
+                        markers="up",
+                        marker_sizes=[5.0],
+                    )
+                    _draw(recording, f"{scenario}/{policy}/placed/{host}", points, marks[host])
         recording.log("summary", rr.TextDocument(_words(report), media_type="text/markdown"), static=True)
         recording.flush(timeout_sec=WRITE_SECONDS)
     except (RuntimeError, OSError, ValueError) as error:
@@ -48,66 +67,110 @@ def record(path: Path, report: Report, outcomes: Mapping[tuple[str, Policy], Out
         recording.disconnect()
 
 
-def _host(recording: rr.RecordingStream, view: str, host: str, colour: int, outcome: Outcome) -> None:
-    """A host's load curve, and on it a mark for each component at the moment it was placed there."""
+def _marks(outcome: Outcome, apart: float) -> dict[str, Points]:
+    """By host, a mark above its curve for each component, at the moment it was placed. Those of one moment
+    stand `apart`, in load average, in the order in which they were placed, so that all can be counted."""
+    marks: dict[str, Points] = {host: [] for host in outcome.curves}
+    taken: dict[Ns, list[float]] = {}
+    for component, host in outcome.placed.items():
+        at = outcome.placed_at[component]
+        others = taken.setdefault(at, [])
+        mark = apart + next((load for time, load in reversed(outcome.curves[host]) if time <= at), 0.0)
+        for other in sorted(others):
+            if abs(mark - other) < apart * 0.99:
+                mark = other + apart
+        others.append(mark)
+        marks[host].append((at, mark))
+    return marks
+
+
+def _top(outcomes: Outcomes, scenario: str) -> float:
+    """The highest load average of a scenario, under whatever policy: all its plots have one scale."""
+    curves = [
+        curve
+        for (name, _), outcome in outcomes.items()
+        for curve in outcome.curves.values()
+        if name == scenario
+    ]
+    return max((load for curve in curves for _, load in curve), default=1.0) or 1.0
+
+
+def _draw(
+    recording: rr.RecordingStream, path: str, look: rr.SeriesLines | rr.SeriesPoints, points: Points
+) -> None:
     import rerun as rr
 
-    curve = outcome.curves[host]
-    path = f"{view}/load/{host}"
-    recording.log(path, rr.SeriesLines(colors=[colour], names=[host], widths=[1.5]), static=True)
-    _send(recording, path, curve)
-
-    came = sorted(outcome.placed_at[name] for name, where in outcome.placed.items() if where == host)
-    if not came:
-        return
-    path = f"{view}/placed/{host}"
-    look = rr.SeriesPoints(colors=[colour], names=[f"placed on {host}"], markers="up", marker_sizes=[6.0])
     recording.log(path, look, static=True)
-    # Marks of one instant stand above each other, so that they can be counted.
-    marks = [(at, _load_at(curve, at) + 0.1 * came[:number].count(at)) for number, at in enumerate(came)]
-    _send(recording, path, marks)
-
-
-def _load_at(curve: list[tuple[Ns, float]], at: Ns) -> float:
-    return next((load for time, load in reversed(curve) if time <= at), 0.0)
-
-
-def _send(recording: rr.RecordingStream, path: str, points: list[tuple[Ns, float]]) -> None:
-    import rerun as rr
-
     times = rr.TimeColumn(TIME, duration=[at / SECOND for at, _ in points])
     recording.send_columns(
         path, indexes=[times], columns=rr.Scalars.columns(scalars=[value for _, value in points])
     )
 
 
-def _blueprint() -> rrb.Blueprint:
+def _blueprint(outcomes: Outcomes) -> rrb.Blueprint:
+    """Both axes are fixed, so that the plots of a scenario show all there is, and compare."""
+    import rerun as rr
     import rerun.blueprint as rrb
 
-    def tab(scenario: str) -> rrb.Container:
-        views = [
-            rrb.TimeSeriesView(
-                origin=f"/{scenario}/{policy}",
-                name=f"{policy}: load average",
-                plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-            )
-            for policy in POLICIES
-        ]
-        return rrb.Grid(*views, grid_columns=2, name=scenario)
+    boundary = rr.TimeRangeBoundary
 
-    return page([tab(scenario) for scenario in SCENARIOS], TIME)
+    def plot(scenario: str, policy: Policy, outcome: Outcome) -> rrb.TimeSeriesView:
+        end = max((curve[-1][0] for curve in outcome.curves.values() if curve), default=SECOND) / SECOND
+        top, counts = _top(outcomes, scenario), outcome.counts()
+        window = rr.TimeRange(
+            start=boundary.absolute(seconds=-MARGIN * end), end=boundary.absolute(seconds=(1 + MARGIN) * end)
+        )
+        given = ", ".join(map(str, counts[:-1])) + f" and {counts[-1]}" if counts[1:] else str(counts[0])
+        return rrb.TimeSeriesView(
+            origin=f"/{scenario}/{policy}",
+            name=f"{policy}: {given} components; load average of each host",
+            axis_x=rrb.archetypes.TimeAxis(view_range=window),
+            axis_y=rrb.archetypes.ScalarAxis(range=(-MARGIN * top, (1 + 2 * MARGIN) * top)),
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        )
+
+    tabs = [
+        rrb.Grid(
+            *(plot(scenario, policy, outcomes[scenario, policy]) for policy in POLICIES),
+            grid_columns=2,
+            name=TITLES[scenario],
+        )
+        for scenario in SCENARIOS
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Tabs(*tabs, active_tab=0),
+            rrb.TextDocumentView(origin="/summary", name="What was found"),
+            column_shares=[74, 26],
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        # Else it plays, and the cursor runs over plots that show everything anyway.
+        rrb.TimePanel(state="collapsed", timeline=TIME, play_state="following"),
+        auto_layout=False,
+        auto_views=False,
+    )
 
 
 def _words(report: Report) -> str:
-    lines = ["# Where components go", f"{report.seeds} seeds; the curves are of the first."]
+    seeds = "1 seed" if report.seeds == 1 else f"{report.seeds} seeds; the curves are of the first"
+    lines = [
+        "# Where components go",
+        f"{seeds}.",
+        "",
+        "A triangle is one component: its colour says where it was placed, and it stands at the moment when.",
+        "Hosts with the same load have their curves one upon the other.",
+        "",
+        "*Load apart*: highest less lowest load average, mean over the run.",
+    ]
     for scenario in SCENARIOS:
-        lines += ["", f"## {scenario}", "| policy | usual split | load apart |", "|---|---|---|"]
+        lines += ["", f"## {TITLES[scenario]}", "| policy | usual split | load apart |", "|---|---|---|"]
         lines += [
             f"| {one.policy} | {next(iter(one.splits))} | {one.apart:.2f} |"
             for one in report.spreads
             if one.scenario == scenario
         ]
-    lines += ["", "## A mixed batch", "| metric, policy | last end | mean |", "|---|---|---|"]
+    lines += ["", "## A mixed batch on unlike hosts", "| metric, policy | last end | mean |", "|---|---|---|"]
     lines += [
         f"| {one.metric}, {one.policy} | {one.makespan:.0f} s | {one.completion:.0f} s |"
         for one in report.batches

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any, Protocol
 
 from zscout import clock
@@ -90,6 +90,19 @@ class Presence:
 
     def alive(self, client: str) -> bool:
         return client in self._clients
+
+    def find(self, client: str, then: Callable[[bool], None]) -> None:
+        """Calls `then` with whether a client has a token: at once where it was seen, else once the mesh was
+        asked, because a new leader has not yet heard of all."""
+        if self.alive(client):
+            then(True)
+        else:
+            self.reign.spawn(self._find(client, then))
+
+    async def _find(self, client: str, then: Callable[[bool], None]) -> None:
+        timeout = self.fleet.timing.rebuild / SECOND
+        tokens = await self.mesh.living(self.mesh.keys.alive_any(Role.CLIENT), timeout=timeout)
+        then(any(f"{token.host}/{token.name}" == client for token in tokens))
 
     def expect(self, client: str) -> None:
         """A client with requests must live; one that nobody has seen yet gets a lease to show itself."""

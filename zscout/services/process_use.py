@@ -1,8 +1,10 @@
-"""What each component of a node uses: the sum over its process tree, read from /proc in one pass."""
+"""What process trees use, read from /proc in one pass: each component of a node, or the whole node."""
 
 from __future__ import annotations
 
+import math
 import os
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -14,7 +16,7 @@ from zscout.messages import MAX_COMPONENTS, ComponentUse
 TICK: Final = 1 / os.sysconf("SC_CLK_TCK")
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 MAX_THREADS: Final = 4_096
-"""Of one component whose waiting for a processor is looked at."""
+"""Of one tree whose waiting for a processor is looked at."""
 SECOND: Final = 1_000_000_000
 
 
@@ -84,9 +86,7 @@ class UseMeter:
         if not running:
             return ()
         now, table = self._now(), _table(self._proc)
-        children: dict[int, list[int]] = {}
-        for pid, process in table.items():
-            children.setdefault(process.parent, []).append(pid)
+        children = _children(table)
         found = []
         for one in running:
             root = table.get(one.pid)
@@ -118,17 +118,90 @@ class UseMeter:
         return use, _Last(now, cpu, threads)
 
 
+class TreeUse(NamedTuple):
+    """What one process tree used since it was last looked at."""
+
+    elapsed: float
+    """Seconds since then."""
+    cores: float
+    """That it had on average."""
+    wanted: float
+    """Cores that it wanted: those that it had, and those that its threads waited for."""
+    memory: int
+    """Bytes resident; what processes share counts for each."""
+
+
+class TreeMeter:
+    """Measures the process `root` (this one, if not given) and all its descendants again and again.
+
+    Where the system does not tell how long threads waited, `wanted` is how many could run at this moment. Use
+    it from one thread at a time. Raises OSError where there is no /proc."""
+
+    def __init__(
+        self,
+        root: int | None = None,
+        *,
+        proc: Path = Path("/proc"),
+        now: Callable[[], float] | None = None,
+    ) -> None:
+        self._root = os.getpid() if root is None else root
+        self._proc = proc
+        self._now = now or _since_boot
+        self._last, _, _ = self._look()
+
+    def measure(self) -> TreeUse:
+        before = self._last
+        self._last, memory, pids = self._look()
+        elapsed = self._last.at - before.at
+        if elapsed <= 0:
+            return TreeUse(0.0, 0.0, 0.0, memory)
+        # What leaves the tree takes its time with it; what comes late from ended children is no use of now.
+        cores = min(max(0.0, self._last.cpu - before.cpu) / elapsed, float(os.cpu_count() or 1))
+        if self._last.threads:
+            ran, waited = _demand(before.threads, self._last.threads)
+            wanted = min((ran + waited) / SECOND / elapsed, float(len(self._last.threads)))
+        else:
+            wanted = float(_runnable(self._proc, pids))
+        return TreeUse(elapsed, cores, max(cores, wanted), memory)
+
+    def _look(self) -> tuple[_Last, int, list[int]]:
+        # A child that ended keeps its time until somebody waits for it, and then hands it on.
+        now, table = self._now(), _table(self._proc, ended=True)
+        if self._root not in table:
+            raise OSError(f"{self._proc} does not tell of process {self._root}; mount it, or set load = true")
+        pids = _tree(self._root, _children(table))
+        tree = [table[pid] for pid in pids]
+        last = _Last(now, sum(one.cpu for one in tree), _threads(self._proc, pids))
+        return last, sum(one.memory for one in tree), pids
+
+
+class LoadAverage:
+    """Averages over 1, 5 and 15 minutes in which the past fades, as the kernel's do; 0 at first."""
+
+    def __init__(self) -> None:
+        self.averages = 0.0, 0.0, 0.0
+
+    def add(self, wanted: float, seconds: float) -> tuple[float, float, float]:
+        """`wanted` cores, for so long; returns the averages."""
+        one, five, fifteen = (
+            wanted + (past - wanted) * math.exp(-seconds / (60 * minutes))
+            for past, minutes in zip(self.averages, (1, 5, 15), strict=True)
+        )
+        self.averages = one, five, fifteen
+        return self.averages
+
+
 def _since_boot() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
-def _table(proc: Path) -> dict[int, _Process]:
-    """All processes that live: no zombies."""
+def _table(proc: Path, *, ended: bool = False) -> dict[int, _Process]:
+    """All processes that live; with `ended` also those that nobody has waited for yet."""
     table = {}
     for name in _names(str(proc)):
         if name.isascii() and name.isdigit():
             process = _parse(_read(f"{proc}/{name}/stat"))
-            if process is not None and process.state not in "ZXx":
+            if process is not None and (ended or process.state not in "ZXx"):
                 table[int(name)] = process
     return table
 
@@ -147,6 +220,13 @@ def _parse(stat: bytes) -> _Process | None:
         )
     except (ValueError, IndexError):  # it ended just now
         return None
+
+
+def _children(table: Mapping[int, _Process]) -> dict[int, list[int]]:
+    children: dict[int, list[int]] = {}
+    for pid, process in table.items():
+        children.setdefault(process.parent, []).append(pid)
+    return children
 
 
 def _tree(root: int, children: Mapping[int, list[int]]) -> list[int]:
@@ -180,6 +260,12 @@ def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Wanted]:
 def _served(before: Mapping[int, _Wanted], now: Mapping[int, _Wanted]) -> float | None:
     """The share of the time in which threads wanted a processor that they had one, from 0 to 1; None if they
     wanted none, or the system does not tell."""
+    ran, waited = _demand(before, now)
+    return round(ran / (ran + waited), 4) if ran + waited > 0 else None
+
+
+def _demand(before: Mapping[int, _Wanted], now: Mapping[int, _Wanted]) -> _Wanted:
+    """What the threads that are there now ran and waited since."""
     ran = waited = 0
     for thread, wanted in now.items():
         last = before.get(thread)
@@ -187,7 +273,22 @@ def _served(before: Mapping[int, _Wanted], now: Mapping[int, _Wanted]) -> float 
             last = _Wanted(0, 0)
         ran += wanted.ran - last.ran
         waited += wanted.waited - last.waited
-    return round(ran / (ran + waited), 4) if ran + waited > 0 else None
+    return _Wanted(ran, waited)
+
+
+def _runnable(proc: Path, pids: Iterable[int]) -> int:
+    """Threads that run or wait for a processor at this moment, but for the one that asks."""
+    mine, found, looked = str(threading.get_native_id()), 0, 0
+    for pid in pids:
+        folder = f"{proc}/{pid}/task"
+        for name in _names(folder):
+            looked += 1
+            if looked > MAX_THREADS:
+                return found
+            stat = _read(f"{folder}/{name}/stat")
+            if name != mine and stat[stat.rfind(b")") + 1 :].split()[:1] == [b"R"]:
+                found += 1
+    return found
 
 
 def _names(folder: str) -> list[str]:

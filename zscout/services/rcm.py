@@ -76,13 +76,15 @@ class Rcm:
         keys, mesh = self.mesh.keys, self.mesh
         self._grants = mesh.publisher(keys.grants, Grants)
         joined = self.presence.inherit(inheritance.rcs)
-        for request in (
-            *(held.request for held in inheritance.standing),
-            *(one.request for one in inheritance.waiting),
-        ):
+        # Who handed over a hold and did not hear that it is done tells of it as well: the RCs know better.
+        stands = {(held.place, views.request_id(held.request.arc)) for held in inheritance.standing}
+        waiting = [
+            one for one in inheritance.waiting if (one.place, views.request_id(one.request.arc)) not in stands
+        ]
+        for request in (*(held.request for held in inheritance.standing), *(one.request for one in waiting)):
             self.notices.call(request.arc, request.name)
             self.presence.expect(request.client)
-        lead = LeadTaken(self.term, tuple(inheritance.standing), tuple(inheritance.waiting))
+        lead = LeadTaken(self.term, tuple(inheritance.standing), tuple(waiting))
         effects = self.core.handle(clock.now(), *joined, lead)
         # RCs hear of the new term first; full lists end whatever was found to be half a gang.
         self._published = 0

@@ -1,8 +1,9 @@
 """The recorder: what is heard on the mesh, written to the timeline.
 
 It only listens. The holders of each RC come from what the RCM publishes; why an ARC waits, from the notices
-to its client; hosts and RCs that come and go, from liveliness. `rcm/state` is read at the start and where
-something was missed, so that a recorder may begin in the middle of things.
+to its client; hosts and RCs that come and go, from liveliness; what runs on which host, from the component
+placer. `rcm/state` is read at the start and where something was missed, so that a recorder may begin in the
+middle of things.
 
 As a program, `python -m zscout.services.recorder`, it is told what to do as `recorder_process.Job` says.
 """
@@ -31,6 +32,8 @@ from zscout.messages import (
 )
 from zscout.messages import Holder as ToldHolder
 from zscout.scheduling.model import NO_TERM, SECOND, Grant, Term
+from zscout.services.host_pane import Use
+from zscout.services.recorder_placements import PlacementFollower
 from zscout.services.timeline import Holder, Timeline
 
 log = logging.getLogger(__name__)
@@ -79,6 +82,7 @@ class Recorder:
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
         self._declared: list[Declared] = []
         self._leaders: set[Token] = set()
+        self._placements = PlacementFollower(mesh, timeline, self._now)
         self._wanted = asyncio.Event()
         self._missed = 0
         self._caught_up = False
@@ -91,15 +95,20 @@ class Recorder:
             mesh.subscribe(keys.notice_any, Notice, self._on_notice, depth=DEPTH),
             mesh.subscribe(keys.rc_state_any, RcState, self._on_rc_state, depth=DEPTH),
             mesh.subscribe(keys.load_any, LoadReport, self._on_load),
+            self._placements.subscribe(),
             mesh.watch(keys.alive_any(), self._on_token),
         ]
         self._wanted.set()
-        reading = asyncio.create_task(self._keep_reading())
+        reading = [
+            asyncio.create_task(self._keep_reading()),
+            asyncio.create_task(self._placements.keep_reading()),
+        ]
         try:
             await stop.wait()
         finally:
-            reading.cancel()
-            await asyncio.gather(reading, return_exceptions=True)
+            for task in reading:
+                task.cancel()
+            await asyncio.gather(*reading, return_exceptions=True)
             for declared in reversed(self._declared):
                 declared.close()
 
@@ -200,6 +209,7 @@ class Recorder:
                     continue
                 log.warning("%d publications were missed; the state is read", missed - self._missed)
                 self._missed = missed
+                self._placements.read_again()
             self._wanted.clear()
             if not await self._read() and self._leaders:
                 await asyncio.sleep(PAUSE)
@@ -261,7 +271,11 @@ class Recorder:
     def _on_load(self, key: str, report: LoadReport) -> None:
         host = self.mesh.keys.host_of(key)
         if host == report.host:
-            self.timeline.load(self._now(), host, report.load_average[0], report.cpu / 100)
+            at = self._now()
+            self.timeline.load(at, host, report.load_average[0], report.cpu / 100)
+            self.timeline.uses(
+                at, host, [Use(one.component, one.cpu, one.memory) for one in report.components]
+            )
 
     def _on_token(self, token: Token, alive: bool) -> None:
         instances = self._tokens.setdefault((token.host, token.role, token.name), set())
@@ -273,6 +287,7 @@ class Recorder:
             (self._leaders.add if alive else self._leaders.discard)(token)
             if alive:
                 self._wanted.set()
+                self._placements.read_again()
         if bool(instances) == before and token.role != Role.RCM:
             return
         at = self._now()

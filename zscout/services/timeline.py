@@ -9,7 +9,6 @@ from __future__ import annotations
 import ipaddress
 import math
 import os
-import re
 import socket
 import threading
 from collections.abc import Sequence
@@ -18,23 +17,32 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, NamedTuple
 
-import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
-from zscout.services.blueprint import APPLICATION, LINES, OPERATOR, OTHER, PALETTE, STATES, TIME, blueprint
+from zscout.services.blueprint import (
+    APPLICATION,
+    LIVE_HOST_ROWS,
+    OPERATOR,
+    OTHER,
+    PALETTE,
+    STATES,
+    TIME,
+    blueprint,
+)
+from zscout.services.host_pane import HostPane, Mark, Running, Use
+from zscout.services.lanes import Lane, clean_path, clean_text, rows_of
 from zscout.strict import BadInput
 
 SERVER_MEMORY: Final = "200MB"
 """What the live server keeps for viewers that come late; the oldest goes first."""
 MAX_ARCS: Final = 2000
 MAX_RCS: Final = 1000
-MAX_HOSTS: Final = 256
-MAX_SLOTS: Final = 8
-"""Rows of one sharable RC; more holders are summed up in the last row."""
+MAX_COMPONENTS: Final = 10_000
+"""Components that have a colour of their own."""
 RC_STATES: Final = 256
 ARC_STATES: Final = 16
 """Distinct texts of one lane that keep their colour; past it, the one longest unused loses it."""
-MAX_STATE: Final = 120
 MAX_EVENT: Final = 500
 """Characters."""
 MAX_SECONDS: Final = 9e9
@@ -55,44 +63,6 @@ class Holder(NamedTuple):
 
     arc: str
     operator: bool = False
-
-
-class _Lane:
-    """One lane of a state timeline: what it shows, and the texts it has given a colour."""
-
-    def __init__(self, path: list[object], capacity: int) -> None:
-        self.path = path
-        self.capacity = capacity
-        self.states: list[str] | None = None
-        self.colours: dict[str, int] = {}
-        """By text, the one longest unused first."""
-        self.slots: list[str] = []
-        """Holder by row, "" where the row is free."""
-
-    def learn(self, state: str, colour: int) -> bool:
-        """Whether the viewer must be told a colour."""
-        known = self.colours.pop(state, None)
-        self.colours[state] = colour
-        if len(self.colours) > self.capacity:
-            del self.colours[next(iter(self.colours))]
-        return known != colour
-
-    def seat(self, names: Sequence[str]) -> list[str]:
-        """Holders by row. Whoever stays keeps the row, so that no bar jumps; no row is taken away."""
-        wanted = dict.fromkeys(names)
-        crowded = len(wanted) > MAX_SLOTS
-        rows = MAX_SLOTS - 1 if crowded else MAX_SLOTS
-        self.slots = [name if name in wanted else "" for name in self.slots[:rows]] + [""] * len(
-            self.slots[rows:]
-        )
-        for name in (name for name in wanted if name not in self.slots):
-            if "" in self.slots[:rows]:
-                self.slots[self.slots.index("")] = name
-            elif len(self.slots) < rows:
-                self.slots.append(name)
-        if not crowded:
-            return self.slots or [""]
-        return [*self.slots[:rows], f"{len(wanted) - rows} more"]
 
 
 class Timeline:
@@ -116,15 +86,18 @@ class Timeline:
         self._lock = threading.RLock()
         self._closed = False
         self._arcs: dict[str, int] = {}
-        self._arc_lanes: dict[str, _Lane] = {}
-        self._rc_lanes: dict[str, _Lane] = {}
-        self._hosts: set[str] = set()
+        self._arc_lanes: dict[str, Lane] = {}
+        self._rc_lanes: dict[str, Lane] = {}
         self._noted: set[str] = set()
         self._begin, self._end = math.inf, -math.inf
         start = datetime.now(UTC)
         self._recording = rr.RecordingStream(
             APPLICATION, recording_id=f"{fleet}-{start.strftime('%Y%m%dT%H%M%S.%fZ')}"
         )
+        self._hosts = HostPane(self._recording, self._note, self._component_colour)
+        self._components: dict[str, int] = {}
+        self._coloured = 0
+        self._placing = False
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
         self._open(path, bind, port)
@@ -161,13 +134,13 @@ class Timeline:
             if rc not in self._rc_lanes and len(self._rc_lanes) >= MAX_RCS:
                 self._note(at, f"more than {MAX_RCS} RCs: the others have no lane")
                 return
-            lane = self._rc_lanes.setdefault(rc, _Lane(_path("rc", rc), RC_STATES))
+            lane = self._rc_lanes.setdefault(rc, Lane(clean_path("rc", rc), RC_STATES))
             colours: dict[str, int] = {"": OTHER}
             for holder in holders:
-                name = _text(holder.arc, MAX_STATE) + (OPERATOR_MARK if holder.operator else "")
+                name = clean_text(holder.arc) + (OPERATOR_MARK if holder.operator else "")
                 colours[name] = OPERATOR if holder.operator else self._colour(at, holder.arc)
             rows = lane.seat([name for name in colours if name])
-            self._show(lane, [(row, colours.get(row, OTHER)) for row in rows])
+            lane.show(self._recording, [(row, colours.get(row, OTHER)) for row in rows])
 
     def arc(self, at: float, arc: str, state: str, detail: str = "") -> None:
         """From `at` on, the ARC is in `state`: "waiting", "running", "preempted", "done" or another word.
@@ -179,29 +152,39 @@ class Timeline:
             self._colour(at, arc)
             if arc not in self._arcs:
                 return
-            lane = self._arc_lanes.setdefault(arc, _Lane(_path("arc", arc), ARC_STATES))
-            text = _text(f"{state} · {detail}" if state and detail else state, MAX_STATE)
-            self._show(lane, [(text, STATES.get(state, OTHER))])
+            lane = self._arc_lanes.setdefault(arc, Lane(clean_path("arc", arc), ARC_STATES))
+            text = clean_text(f"{state} · {detail}" if state and detail else state)
+            lane.show(self._recording, [(text, STATES.get(state, OTHER))])
 
     def load(self, at: float, host: str, load1: float, cpu: float | None = None) -> None:
         """A host's load average over 1 minute and, kept under `/cpu`, its CPU use (0 to 1).
 
         What is not a finite number leaves a gap."""
         with self._lock:
-            if not self._ready(at):
-                return
-            if host not in self._hosts:
-                if len(self._hosts) >= MAX_HOSTS:
-                    self._note(at, f"more than {MAX_HOSTS} hosts: the load of the others is not drawn")
-                    return
-                colour = LINES[len(self._hosts) % len(LINES)]
-                self._hosts.add(host)
-                line = rr.SeriesLines(names=[_text(host, MAX_STATE)], colors=[colour], widths=[2.0])
-                for folder in ("load", "cpu"):
-                    self._recording.log(_path(folder, host), line, static=True)
-            for folder, value in (("load", load1), ("cpu", cpu)):
-                if value is not None and math.isfinite(value):
-                    self._recording.log(_path(folder, host), rr.Scalars(value))
+            if self._ready(at):
+                self._hosts.load(at, host, load1, cpu)
+
+    def runs(self, at: float, host: str, components: Sequence[Running]) -> None:
+        """From `at` on, exactly these components are on the host; none if empty. Each gets a row."""
+        with self._lock:
+            if self._ready(at):
+                if not self._placing:
+                    # Only now: a fleet without components has no use for empty panes.
+                    self._placing = True
+                    self._recording.send_blueprint(self._layout(live=True))
+                self._hosts.runs(at, host, components)
+
+    def mark(self, at: float, host: str, mark: Mark, component: str) -> None:
+        """Marks on the host's load curve what happened to a component there."""
+        with self._lock:
+            if self._ready(at):
+                self._hosts.mark(at, host, mark, component)
+
+    def uses(self, at: float, host: str, uses: Sequence[Use]) -> None:
+        """What all components of a host use; the curve of one that is not named ends."""
+        with self._lock:
+            if self._ready(at):
+                self._hosts.uses(at, host, uses)
 
     def event(self, at: float, text: str, level: str = "INFO") -> None:
         """One line in words; `level` as in logging, WARN for what people should look at."""
@@ -209,7 +192,7 @@ class Timeline:
             if not self._ready(at):
                 return
             known = level if level in LEVELS else "INFO"
-            self._recording.log("events", rr.TextLog(_text(text, MAX_EVENT), level=known))
+            self._recording.log("events", rr.TextLog(clean_text(text, MAX_EVENT), level=known))
 
     def close(self) -> None:
         """Ends file and server, within seconds. The file then opens on the whole run.
@@ -220,11 +203,7 @@ class Timeline:
                 return
             self._closed = True
         if self._end >= self._begin:
-            rows = sum(len(lane.states or [""]) for lane in self._rc_lanes.values())
-            final = blueprint(
-                False, self._end, begin=self._begin, rc_rows=rows, arc_rows=len(self._arc_lanes)
-            )
-            self._recording.send_blueprint(final)
+            self._recording.send_blueprint(self._layout(live=False))
         try:
             self._recording.flush(timeout_sec=FLUSH_SECONDS)
         except (RuntimeError, ValueError) as error:
@@ -234,6 +213,15 @@ class Timeline:
             ) from error
         finally:
             self._disconnect()
+
+    def _layout(self, *, live: bool) -> rrb.Blueprint:
+        """Panes for what there is; those of a live view may fill yet."""
+        rc_rows, arc_rows, host_rows = rows_of(self._rc_lanes), len(self._arc_lanes), self._hosts.rows
+        if live:
+            rc_rows, arc_rows, host_rows = max(rc_rows, 1), max(arc_rows, 1), LIVE_HOST_ROWS
+        return blueprint(
+            live, self._end, begin=self._begin, rc_rows=rc_rows, arc_rows=arc_rows, host_rows=host_rows
+        )
 
     def __enter__(self) -> Timeline:
         return self
@@ -257,20 +245,22 @@ class Timeline:
                     at, f"more than {MAX_ARCS} ARC names: the others have no lane and no colour of their own"
                 )
                 return OTHER
-            self._arcs[arc] = PALETTE[len(self._arcs) % len(PALETTE)]
+            self._arcs[arc] = self._components.get(arc) or self._next_colour()
         return self._arcs[arc]
 
-    def _show(self, lane: _Lane, rows: list[tuple[str, int]]) -> None:
-        news = [lane.learn(state, colour) for state, colour in rows if state]
-        if any(news):
-            configuration = rr.StateConfiguration(
-                values=list(lane.colours), colors=np.array(list(lane.colours.values()), np.uint32)
-            )
-            self._recording.log(lane.path, configuration, static=True)
-        states = [state for state, _ in rows]
-        if states != lane.states:
-            lane.states = states
-            self._recording.log(lane.path, rr.StateChange(state=states))
+    def _component_colour(self, component: str) -> int:
+        """That of the ARC with this name, if there is one."""
+        if component in self._arcs:
+            return self._arcs[component]
+        if component not in self._components:
+            if len(self._components) >= MAX_COMPONENTS:
+                return OTHER
+            self._components[component] = self._next_colour()
+        return self._components[component]
+
+    def _next_colour(self) -> int:
+        self._coloured += 1
+        return PALETTE[(self._coloured - 1) % len(PALETTE)]
 
     def _note(self, at: float, text: str) -> None:
         if text not in self._noted:
@@ -286,18 +276,6 @@ class Timeline:
         self._begin, self._end = min(self._begin, at), max(self._end, at)
         self._recording.set_time(TIME, duration=at)
         return True
-
-
-def _path(folder: str, name: str) -> list[object]:
-    parts = (re.sub(r"[^A-Za-z0-9_.-]", "_", part)[:64] for part in name.split("/")[:4])
-    return [folder, *(part or "_" for part in parts)]
-
-
-def _text(text: str, limit: int) -> str:
-    """One line of at most `limit` characters."""
-    line = " ".join(text[: 2 * limit].split())
-    line = "".join(letter for letter in line if letter.isprintable())
-    return line if len(line) <= limit else line[: limit - 1] + "…"
 
 
 def _free_port(bind: str, port: int) -> int:

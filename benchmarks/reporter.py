@@ -1,0 +1,28 @@
+"""What one load report takes: of the whole host, and of the process tree of a node."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from benchmarks.stats import Row, Samples
+from zscout.services.load_reporter import Gauge
+from zscout.services.process_use import TreeMeter
+
+
+def costs(node: int, rounds: int = 200) -> list[Row]:
+    """Processor time for each; `node` is the process whose tree is looked at."""
+    gauge, meter = Gauge("bench"), TreeMeter(node)
+    return [
+        _row("CPU of a load report", gauge.report, rounds),
+        _row("CPU of a look at a node's process tree", meter.measure, rounds),
+    ]
+
+
+def _row(name: str, measure: Callable[[], object], rounds: int) -> Row:
+    samples = Samples()
+    for _ in range(rounds):
+        start = time.thread_time()
+        measure()
+        samples.add(time.thread_time() - start)
+    return Row(name, samples.median * 1e6, "us", samples.p99 * 1e6, rounds=rounds)

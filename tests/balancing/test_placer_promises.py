@@ -1,0 +1,158 @@
+"""What the placer promises, in a world in which everything goes wrong that can; then all comes to rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from tests.balancing.placer_world import RULES, STANDS_BY, World
+from zscout.balancing.model import SECOND, HostName
+from zscout.balancing.placing import (
+    DrainAsked,
+    MoveAsked,
+    PlaceAsked,
+    Restart,
+    Spec,
+    StopAsked,
+    UncordonAsked,
+)
+
+NAMES = ("a", "b", "c", "d")
+OPS = (
+    *["place"] * 4,
+    *["move"] * 4,
+    *["crash"] * 3,
+    "stop",
+    "complete",
+    "drain",
+    "uncordon",
+    *["host dies", "host is cut off"],
+    *["host is back"] * 3,
+    "leader",
+    *["time"] * 6,
+)
+SETTLING = 90 * SECOND
+"""Longer than any back-off, grace, look or time to stand by."""
+SEEDS = 3_000
+TRIES = 1_000
+"""Starts in a row, in runs that are to give nothing up."""
+FINAL = {"running", "waiting", "ended", "given_up"}
+
+
+class Chaos:
+    """A run of operations, and what must hold when all has come to rest."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = Random(seed)  # noqa: S311
+        self.patient = seed % 2 == 0
+        rules = replace(RULES, restarts=TRIES) if self.patient else RULES
+        self.world = World(seed, self.rng.randint(1, 4), rules)
+        self.world.slow = self.rng.choice([SECOND // 10, SECOND, 3 * SECOND])
+        self.world.loss = self.rng.choice([0, 0.05, 0.3])
+        self.asked: dict[str, bool] = {}
+        """Whether each component is to run, by what was asked for last and not refused."""
+
+    def do(self, op: str) -> None:
+        world, rng = self.world, self.rng
+        name = rng.choice(NAMES)
+        host = world.hosts[rng.choice(list(world.hosts))]
+        running = [(there, one) for each in NAMES for there, one in world.live(each) if one.token]
+        match op:
+            case "place":
+                self.place(name)
+            case "stop":
+                world.send(StopAsked(name))
+                self.asked[name] = False
+            case "move":
+                world.send(MoveAsked(name, rng.choice([None, host.name])))
+            case "drain":
+                world.send(DrainAsked(host.name))
+            case "uncordon":
+                world.send(UncordonAsked(host.name))
+            case "crash" | "complete" if running:
+                there, one = rng.choice(running)
+                world.end(there, one, "failed" if op == "crash" else "completed")
+            case "host dies" | "host is cut off":
+                world.go(host, dies=op == "host dies")
+            case "host is back":
+                world.come(host)
+            case "leader":
+                world.new_leader()
+            case _:
+                world.run(world.now + rng.randrange(4 * SECOND))
+
+    def place(self, name: str) -> None:
+        policy: Restart = self.rng.choice(["never", "on_failure", "on_failure", "always", "always"])
+        some = frozenset(self.rng.sample(list(self.world.hosts), 1))
+        hosts: frozenset[HostName] | None = self.rng.choice([None, None, None, some])
+        refused = len(self.world.refusals)
+        self.world.send(PlaceAsked(name, Spec("job", policy, hosts=hosts)))
+        if len(self.world.refusals) == refused:
+            self.asked[name] = True
+
+    def settle(self) -> None:
+        """Nothing fails any more; some hosts stay away."""
+        world = self.world
+        world.loss = world.failing = 0
+        for host in world.hosts.values():
+            if host.cut_off or self.rng.random() < 0.7:
+                world.come(host)
+        world.run(world.now + SETTLING + STANDS_BY)
+
+    def check(self) -> None:
+        world = self.world
+        records = world.placer.records
+        assert records == world.published
+        assert world.alive == {host.name for host in world.hosts.values() if host.there}
+        for name in NAMES:
+            record, live = records.get(name), world.live(name)
+            found = [(host.name, one.incarnation, one.phase) for host, one in live]
+            assert len(live) <= 1, f"{name} lives {found}"
+            if record is None:
+                assert not live
+                continue
+            assert record.state in FINAL, record
+            assert record.wanted == self.asked.get(name, record.wanted), record
+            assert record.to is None
+            assert bool(record.host) == (record.state == "running"), record
+            if record.state == "running":
+                assert found == [(record.host, record.incarnation, "running")], record
+                assert record.wanted, record
+                continue
+            assert not live, (found, record)
+            fit = world.alive - world.balancer.cordoned
+            fit &= record.spec.hosts if record.spec.hosts is not None else fit
+            if record.state == "waiting":
+                assert not fit, record
+            elif record.wanted and record.state == "given_up":
+                assert record.spec.restart == "never" or not self.patient, record
+            elif record.wanted:
+                assert record.spec.restart != "always", record
+        self.check_drained()
+
+    def check_drained(self) -> None:
+        """What could leave a drained host has left it."""
+        world = self.world
+        usable = world.alive - world.balancer.cordoned
+        for record in world.placer.records.values():
+            if record.host in world.balancer.cordoned:
+                assert not (usable & (record.spec.hosts or usable)), record
+
+
+def run(seed: int) -> None:
+    chaos = Chaos(seed)
+    for _ in range(chaos.rng.randint(5, 60)):
+        chaos.do(chaos.rng.choice(OPS))
+    chaos.settle()
+    chaos.check()
+
+
+@pytest.mark.parametrize("part", range(10))
+def test_whatever_happens_one_incarnation_of_each_component_runs_in_the_end(part: int) -> None:
+    for seed in range(part, SEEDS, 10):
+        try:
+            run(seed)
+        except Exception as error:
+            raise AssertionError(f"seed {seed}: {error}") from error

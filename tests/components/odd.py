@@ -1,0 +1,151 @@
+"""Kinds of components that behave badly, or say what they do, for the tests."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from typing import Any
+
+from zscout.components.component import Component, Stage
+from zscout.components.shipped import Counter
+from zscout.messages import MAX_CHECKPOINT
+
+MEGABYTE = 1_000_000
+
+
+class Still(Component):
+    """Does nothing, and can't be moved."""
+
+    async def run(self, stage: Stage) -> None:
+        print(f"{stage.component} {stage.incarnation} on {stage.client.mesh.me.host}", flush=True)
+        await asyncio.Event().wait()
+
+
+class Brief(Component):
+    """Ends at once: by returning, raising, leaving, or a signal, as `how` says."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        self.how = params["how"]
+
+    async def run(self, stage: Stage) -> None:
+        print("last words", flush=True)
+        match self.how:
+            case "raise":
+                raise RuntimeError("the camera fell off")
+            case "exit":
+                sys.exit(3)
+            case "vanish":
+                os._exit(0)
+            case "abort":
+                os.kill(os.getpid(), signal.SIGABRT)
+            case "children":
+                await asyncio.create_subprocess_exec("sleep", "600", start_new_session=True)
+
+
+class Deaf(Component):
+    """Does not let itself be cancelled."""
+
+    async def run(self, stage: Stage) -> None:
+        while True:
+            with suppress(asyncio.CancelledError):
+                await asyncio.sleep(600)
+
+
+class Flood(Component):
+    """Writes as fast as it can; now and then what is no UTF-8."""
+
+    async def run(self, stage: Stage) -> None:
+        line = b"\xff" + b"f" * 62 + b"\n"
+        while True:
+            sys.stdout.buffer.write(line * 1024)
+            await asyncio.sleep(0)
+
+
+class Eater(Component):
+    """Uses `memory` MB, in a child if `child` is true: how that ended it prints."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        self.memory = params["memory"] * MEGABYTE
+
+    async def run(self, stage: Stage) -> None:
+        held = [b"x" * MEGABYTE for _ in range(self.memory // MEGABYTE)]
+        print(len(held), flush=True)
+        await asyncio.Event().wait()
+
+
+class Parent(Component):
+    """Starts a child, one in a session of its own, and one of that; prints their process ids."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        self.busy = params.get("busy", False)
+
+    async def run(self, stage: Stage) -> None:
+        self._start_children()
+        if self.busy:
+            self._hog()
+        await asyncio.Event().wait()
+
+    def _start_children(self) -> None:
+        apart = ["sh", "-c", "sleep 600 & echo $!; wait"]
+        children = [subprocess.Popen(["sleep", "600"]), subprocess.Popen(apart, start_new_session=True)]
+        # In one piece: the others write as well.
+        print(f"{children[0].pid} {children[1].pid}\n", end="", flush=True)
+
+    def _hog(self) -> None:
+        while True:
+            pass
+
+
+class Never(Component):
+    """Does not get ready."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        print("warming up", flush=True)
+        time.sleep(600)
+
+
+class Restless(Component):
+    """Can be moved, but comes to no safe point; with `size` it does, and its state has so many bytes."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        self.size = params.get("size")
+        self.broken = params.get("broken", False)
+
+    async def run(self, stage: Stage) -> None:
+        while True:
+            await asyncio.sleep(0.01)
+            if self.size is not None:
+                await stage.safe_point()
+
+    def checkpoint(self) -> bytes:
+        return b"x" * (self.size or 0)
+
+    def restore(self, state: bytes) -> None:
+        if self.broken:
+            raise ValueError("this state is rotten")
+
+
+class Homesick(Counter):
+    """Counts as `counter` does, but fails wherever it was moved to."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        super().__init__(params)
+        self.at_home = True
+
+    async def run(self, stage: Stage) -> None:
+        if not self.at_home:
+            raise RuntimeError("it is not nice here")
+        await super().run(stage)
+
+    def restore(self, state: bytes) -> None:
+        super().restore(state)
+        self.at_home = False
+
+
+TOO_LARGE = MAX_CHECKPOINT + 1
+NO_COMPONENT = 7

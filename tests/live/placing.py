@@ -1,0 +1,216 @@
+"""For tests of the placer on a real mesh: asking it, an RC that writes down what it was told, and a kind of
+component that can be held up at every step of its life."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import msgspec
+
+from tests.live.lab import START, Lab
+from zscout.behaviors.arc import Revoked, holds
+from zscout.behaviors.client import Client, CommandRefused
+from zscout.components.component import Component, Stage
+from zscout.drivers.base import ResourceController
+from zscout.drivers.generic import ExclusiveDriver
+from zscout.keyexpr import Sender
+from zscout.mesh import Mesh
+from zscout.messages import (
+    ComponentList,
+    ComponentSpec,
+    ComponentView,
+    Holder,
+    HostRanking,
+    ListComponents,
+    ListPlacements,
+    PlaceComponent,
+    Placement,
+    Placements,
+    Problem,
+    RankAsk,
+)
+from zscout.scheduling.model import SECOND
+from zscout.stall import StallWatch
+
+R = TypeVar("R")
+
+
+class Placing:
+    """Asks the placer, and hosts, until they answer."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+
+    async def ask(self, operation: msgspec.Struct, kind: type[R], host: str | None = None) -> R | Problem:
+        keys = self.client.mesh.keys
+        key = keys.placer if host is None else keys.component(host)
+        async with asyncio.timeout(2 * START):
+            while True:
+                reply = await self.client.mesh.ask_one(key, operation, kind, timeout=START)
+                answer = None if reply is None else reply.message or reply.problem
+                if isinstance(answer, Problem) and answer.code == "not_leading":
+                    answer = None
+                if answer is not None:
+                    return answer
+                await asyncio.sleep(0.05)
+
+    async def get(self, operation: msgspec.Struct, kind: type[R], host: str | None = None) -> R:
+        answer = await self.ask(operation, kind, host)
+        assert not isinstance(answer, Problem), answer
+        return answer
+
+    async def place(
+        self, component: str, kind: str, params: Mapping[str, Any] | None = None, **spec: Any
+    ) -> Placement:
+        """Has it run; returns how it stands when it does, or can't."""
+        return await self.get(
+            PlaceComponent(component, ComponentSpec(kind, dict(params or {}), **spec), wait=15), Placement
+        )
+
+    async def placement(self, component: str) -> Placement:
+        listed = await self.get(ListPlacements(component), Placements)
+        assert listed.components, f"nobody knows of {component}"
+        return listed.components[0]
+
+    async def until(self, component: str, holds: Callable[[Placement], bool]) -> Placement:
+        """The placement, as soon as `holds` is true of it."""
+        seen: Placement | None = None
+        try:
+            async with asyncio.timeout(START):
+                while True:
+                    listed = await self.get(ListPlacements(component), Placements)
+                    seen = next(iter(listed.components), None)
+                    if seen is not None and holds(seen):
+                        return seen
+                    await asyncio.sleep(0.02)
+        except TimeoutError:
+            raise AssertionError(f"waited in vain; last seen {seen}") from None
+
+    async def hosts(self, count: int) -> None:
+        """Waits until the balancer ranks so many hosts."""
+        async with asyncio.timeout(START):
+            while True:
+                reply = await self.client.mesh.ask_one(
+                    self.client.mesh.keys.rank, RankAsk(), HostRanking, timeout=1
+                )
+                if reply is not None and reply.message is not None and len(reply.message.hosts) == count:
+                    return
+                await asyncio.sleep(0.05)
+
+    async def views(self, component: str, *hosts: str) -> list[ComponentView]:
+        """What these hosts tell of a component."""
+        found = []
+        for host in hosts:
+            told = await self.get(ListComponents(component), ComponentList, host)
+            found += told.components
+        return found
+
+
+class Witness(ExclusiveDriver):
+    """Writes down what it was told, and when it was let go."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: list[int] = []
+        self.released = 0
+        self._told = asyncio.Event()
+
+    async def safe(self) -> None:
+        self.released += 1
+
+    async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
+        if do.get("name") == "echo":
+            self.counts.append(do["value"])
+            self._told.set()
+        return await super().command(holder, do)
+
+    async def more(self, count: int = 1) -> None:
+        """Waits until it was told so many more."""
+        wanted = len(self.counts) + count
+        try:
+            async with asyncio.timeout(START):
+                while len(self.counts) < wanted:
+                    self._told.clear()
+                    await self._told.wait()
+        except TimeoutError:
+            raise AssertionError(f"told {self.counts[-5:]}, and no more") from None
+
+    def check(self) -> None:
+        """Nothing was lost, and nothing doubled."""
+        assert self.counts == list(range(1, len(self.counts) + 1)), self.counts[-20:]
+
+
+class WitnessRc:
+    """An RC with a witness, in this process, on a host of its own."""
+
+    def __init__(self, lab: Lab, name: str) -> None:
+        self.lab, self.name, self.witness = lab, name, Witness()
+
+    async def __aenter__(self) -> Self:
+        fleet = self.lab.fleet
+        self._stall = StallWatch().start()
+        self._mesh = await Mesh.open(fleet.name, Sender("devices", "node"), fleet.mesh)
+        self._rc = ResourceController(
+            self._mesh,
+            self.name,
+            self.witness,
+            hold_lease=fleet.timing.hold_lease / SECOND,
+            stall=self._stall,
+        )
+        await self._rc.start()
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self._rc.stop()
+        await self._mesh.close()
+        self._stall.stop()
+
+
+class Stepper(Component):
+    """Counts by commands to `rc`. In `folder`, a file `at-STEP` tells that it has come to a step, and it
+    stays there for as long as there is a file `hold-STEP`. Steps: init, checkpoint, restore."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        self.folder, self.rc, self.count = Path(params["folder"]), params["rc"], 0
+        self._step("init")
+
+    def _step(self, name: str) -> None:
+        (self.folder / f"at-{name}").touch()
+        while (self.folder / f"hold-{name}").exists():
+            time.sleep(0.005)
+
+    async def run(self, stage: Stage) -> None:
+        while True:
+            with suppress(Revoked, CommandRefused):
+                async for attempt in holds(stage.client, stage.component, {self.rc: {}}, min_runtime=3600):
+                    async with attempt as held:
+                        while True:
+                            await held.command(self.rc, {"name": "echo", "value": self.count + 1})
+                            self.count += 1
+                            await stage.safe_point()
+                            await asyncio.sleep(0.005)
+            await asyncio.sleep(0.02)
+
+    def checkpoint(self) -> bytes:
+        self._step("checkpoint")
+        return json.dumps(self.count).encode()
+
+    def restore(self, state: bytes) -> None:
+        self._step("restore")
+        self.count = json.loads(state)
+        (self.folder / "restored").touch()
+
+
+def register(lab: Lab) -> None:
+    """Makes `stepper` a kind that the lab's nodes can start, as if it were installed."""
+    info = lab.folder / "site" / "stepper-1.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stepper\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[zscout.components]\nstepper = tests.live.placing:Stepper\n")
+    lab.env["PYTHONPATH"] = f"{lab.folder / 'site'}:{Path(__file__).parents[2]}"

@@ -1,0 +1,252 @@
+"""Components on the move between real nodes: with their state, their ARCs and their holds, or not at all."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from tests.components.kit import ComponentLab, Hosts, gone
+from tests.live.lab import START
+from zscout.messages import (
+    ComponentList,
+    ComponentView,
+    ListComponents,
+    MoveComponent,
+    Moved,
+    Output,
+    Problem,
+    RcState,
+    ReadOutput,
+)
+
+QUICK: dict[str, Any] = {"period": 0.02}
+
+
+async def counts(hosts: Hosts, host: str) -> list[int]:
+    """What the component "c" has counted on a host, as far as it is kept."""
+    text = (await hosts.get(host, ReadOutput("c"), Output)).text
+    return [int(line) for line in text.splitlines() if line.isdecimal()]
+
+
+async def counts_on(hosts: Hosts, host: str) -> None:
+    """Waits until it goes on counting there."""
+    last = max(await counts(hosts, host), default=0)
+    async with asyncio.timeout(START):
+        while max(await counts(hosts, host), default=0) <= last + 2:  # noqa: ASYNC110 - asked each time
+            await asyncio.sleep(0.02)
+
+
+async def move(
+    hosts: Hosts, source: str, target: str, incarnation: int, kind: str, params: dict[str, Any]
+) -> Moved:
+    """Moves "c" as a placer does."""
+    view = await hosts.start(target, "c", kind, params, incarnation=incarnation + 1, standby=True)
+    assert view.phase == "standby", view
+    order = MoveComponent("c", incarnation, target, incarnation + 1)
+    moved = await hosts.get(source, order, Moved)
+    assert (moved.component, moved.host, moved.incarnation) == ("c", target, incarnation + 1)
+    # Asked again it tells the same.
+    assert await hosts.get(source, order, Moved) == moved
+    return moved
+
+
+def test_a_component_without_arcs_moves_there_and_back_and_counts_on(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a")
+            lab.node("b")
+            client = await lab.client()
+            hosts = Hosts(client)
+            first = await hosts.start("a", "c", "counter", QUICK)
+            await lab.ready(client)
+            await counts_on(hosts, "a")
+            there = await move(hosts, "a", "b", 1, "counter", QUICK)
+            await counts_on(hosts, "b")
+            old = await counts(hosts, "a")
+            assert (await counts(hosts, "b"))[0] == old[-1] + 1
+            left = await hosts.ended("a", "c")
+            assert (left.ended, left.incarnation) == ("moved", 1)
+            assert first.pid is not None
+            await gone(first.pid)
+            back = await move(hosts, "b", "a", 2, "counter", QUICK)
+            await counts_on(hosts, "a")
+            old = await counts(hosts, "b")
+            assert (await counts(hosts, "a"))[0] == old[-1] + 1
+            assert old == list(range(old[0], old[-1] + 1))
+            print(f"dead for {there.dead * 1000:.1f} and {back.dead * 1000:.1f} ms")
+            assert max(there.dead, back.dead) < 1
+
+    asyncio.run(story())
+
+
+def test_a_component_takes_its_hold_along_and_a_rival_gets_nothing(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a")
+            lab.node("b")
+            lab.node("r", "robot/x", "robot/y")
+            client = await lab.client()
+            hosts = Hosts(client)
+            await lab.ready(client, "robot/x", "robot/y")
+            params = QUICK | {"rc": "robot/x"}
+            await hosts.start("a", "c", "counter", params)
+            await counts_on(hosts, "a")
+            rival = await client.request("rival", {"robot/x": {}}, min_runtime=1)
+            holders: list[list[str]] = []
+            client.mesh.subscribe(
+                client.mesh.keys.rc_state("robot/x"),
+                RcState,
+                lambda _, state: holders.append([holder.arc for holder in state.holders]),
+            )
+            dead = []
+            hosts_by_turn = ["a", "b", "a", "b"]
+            for incarnation, (source, target) in enumerate(pairwise(hosts_by_turn), 1):
+                dead.append((await move(hosts, source, target, incarnation, "counter", params)).dead)
+                await counts_on(hosts, target)
+                old, new = await counts(hosts, source), await counts(hosts, target)
+                assert new[0] == old[-1] + 1
+                assert "lost" not in (await hosts.get(target, ReadOutput("c"), Output)).text
+                (holder,) = (await lab.rc(client, "robot/x")).holders
+                assert (holder.arc, holder.client) == ("c", f"{target}/c.{incarnation + 1}")
+            assert holders
+            assert all(arcs == ["c"] for arcs in holders), holders
+            assert rival.state == "queued"
+            print("dead for", *(f"{1000 * seconds:.1f}" for seconds in dead), "ms")
+            await hosts.stop("b", "c")
+            await lab.held_by(client, "robot/x", "rival")
+
+    asyncio.run(story())
+
+
+def test_what_waits_for_its_arc_moves_with_its_place(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a")
+            lab.node("b", "robot/x")
+            client = await lab.client()
+            hosts = Hosts(client)
+            await lab.ready(client, "robot/x")
+            first = await client.request("first", {"robot/x": {}}, min_runtime=600)
+            assert await client.granted(first) is not None
+            params = {"rc": "robot/x"}
+            await hosts.start("a", "c", "counter", QUICK | params)
+            await lab.state(client, lambda state: [view.arc for view in state.queue] == ["c"])
+            # It waits in `async with`, where it comes to no safe point.
+            await hosts.start("b", "c", "counter", QUICK | params, incarnation=2, standby=True)
+            assert await hosts.refused("a", MoveComponent("c", 1, "b", 2, patience=0.2)) == "not_safe"
+            await client.end(first)
+            await counts_on(hosts, "a")
+            assert (await hosts.get("a", ListComponents("c"), ComponentList)).components[0].incarnation == 1
+            moved = await hosts.get("a", MoveComponent("c", 1, "b", 2), Moved)
+            assert moved.host == "b"
+            await counts_on(hosts, "b")
+
+    asyncio.run(story())
+
+
+def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a", "robot/x")
+            lab.node("b")
+            client = await lab.client()
+            hosts = Hosts(client)
+            await lab.ready(client, "robot/x")
+            await hosts.start("a", "c", "counter", QUICK | {"rc": "robot/x"})
+            await counts_on(hosts, "a")
+            (holder,) = (await lab.rc(client, "robot/x")).holders
+
+            async def fails(host: str, incarnation: int) -> str:
+                problem = await hosts.ask("a", MoveComponent("c", 1, host, incarnation), Moved)
+                assert isinstance(problem, Problem)
+                assert problem.code == "move_failed"
+                await counts_on(hosts, "a")
+                return problem.message
+
+            assert "no component 'c'" in await fails("b", 2)
+            assert "nowhere did not answer" in await fails("nowhere", 2)
+            await hosts.start("b", "c", "still", incarnation=2, standby=True)
+            assert "no checkpoint() and restore()" in await fails("b", 2)
+            await hosts.stop("b", "c")
+            assert "it is ended here" in await fails("b", 2)
+            await hosts.start("b", "c", "restless", {"broken": True}, incarnation=3, standby=True)
+            assert "this state is rotten" in await fails("b", 3)
+            assert (await hosts.ended("b", "c")).ended == "failed"
+            # A node that is frozen: nobody knows what it did, and nothing was committed.
+            await hosts.start("b", "c", "counter", QUICK | {"rc": "robot/x"}, incarnation=4, standby=True)
+            lab.signal("b", signal.SIGKILL)
+            assert "b did not answer" in await fails("b", 4)
+
+            lost = [
+                line
+                for line in (await hosts.get("a", ReadOutput("c"), Output)).text.splitlines()
+                if "lost" in line
+            ]
+            assert lost == []
+            numbers = await counts(hosts, "a")
+            assert numbers == list(range(numbers[0], numbers[-1] + 1))
+            assert (await lab.rc(client, "robot/x")).holders[0].grant == holder.grant
+
+    asyncio.run(story())
+
+
+def test_who_handed_over_takes_back_where_the_new_one_fails(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a", "robot/x")
+            lab.node("b")
+            client = await lab.client()
+            hosts = Hosts(client)
+            await lab.ready(client, "robot/x")
+            params = QUICK | {"rc": "robot/x"}
+            await hosts.start("a", "c", "homesick", params)
+            await counts_on(hosts, "a")
+            before = (await lab.rc(client, "robot/x")).holders[0].grant
+            await hosts.start("b", "c", "homesick", params, incarnation=2, standby=True)
+            problem = await hosts.ask("a", MoveComponent("c", 1, "b", 2), Moved)
+            assert isinstance(problem, Problem)
+            assert problem.code == "move_failed"
+            assert "asked anew here" in problem.message
+            there = await hosts.ended("b", "c")
+            assert (there.ended, there.reason) == ("failed", "RuntimeError: it is not nice here")
+            await counts_on(hosts, "a")
+            numbers = await counts(hosts, "a")
+            assert numbers == list(range(numbers[0], numbers[-1] + 1))
+            (holder,) = (await lab.rc(client, "robot/x")).holders
+            assert (holder.arc, holder.client) == ("c", "a/c.1")
+            assert holder.grant > before
+
+    asyncio.run(story())
+
+
+def test_a_target_that_is_killed_while_it_is_moved_to_leaves_one_that_counts(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a")
+            lab.node("b")
+            lab.node("r", "robot/x")
+            client = await lab.client()
+            hosts = Hosts(client)
+            await lab.ready(client, "robot/x")
+            params = QUICK | {"rc": "robot/x"}
+            await hosts.start("a", "c", "counter", params)
+            await counts_on(hosts, "a")
+            view: ComponentView = await hosts.start("b", "c", "counter", params, incarnation=2, standby=True)
+            assert view.phase == "standby"
+            # Wherever in the move it dies, either it had gone, or it is here.
+            moving = asyncio.create_task(hosts.ask("a", MoveComponent("c", 1, "b", 2), Moved))
+            await lab.state(
+                client, lambda state: any(hold.client == "b/c.2" for hold in state.holds) or moving.done()
+            )
+            lab.signal("b", signal.SIGKILL)
+            answer = await moving
+            if isinstance(answer, Problem):
+                assert answer.code == "move_failed"
+                await counts_on(hosts, "a")
+            else:
+                assert (await hosts.ended("a", "c")).ended == "moved"
+
+    asyncio.run(story())

@@ -1,0 +1,258 @@
+"""A component that moves on a real mesh: nothing is lost or doubled, and nobody gets in between."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.live.lab import START, Lab
+from tests.live.placing import Placing, WitnessRc, register
+from zscout.behaviors.client import Client
+from zscout.behaviors.request import OpenArc
+from zscout.messages import DrainHost, Grants, MigrateComponent, Placement, Placements, RcState
+from zscout.scheduling.model import Grant
+
+pytestmark = pytest.mark.live
+
+RC = "robot/scout33"
+MOVES = 100
+ARC = "tally"
+
+
+class Rival:
+    """Somebody who wants the same RC at the same priority, and all that was published of its holders."""
+
+    def __init__(self, client: Client, arc: OpenArc) -> None:
+        self.client, self.arc = client, arc
+        self.states: set[str] = {arc.state}
+        self.holders: list[tuple[str, ...]] = []
+        client.watch(lambda arc: self.states.add(arc.state))
+        client.mesh.subscribe(client.mesh.keys.grants, Grants, self._on_grants)
+        client.mesh.subscribe(client.mesh.keys.rc_state(RC), RcState, self._on_state)
+
+    def _on_grants(self, _key: str, said: Grants) -> None:
+        if RC in said.rcs:
+            self.holders.append(tuple(holder.arc for holder in said.rcs[RC]))
+
+    def _on_state(self, _key: str, state: RcState) -> None:
+        self.holders.append(tuple(holder.arc for holder in state.holders))
+
+    def check(self) -> None:
+        """It waited all the while, and the RC was never anybody's but the component's."""
+        assert self.states == {"queued"}, self.arc
+        assert set(self.holders) <= {(ARC,)}, set(self.holders)
+
+
+async def rival_of(lab: Lab) -> Rival:
+    client = await lab.client("rival")
+    return Rival(client, await client.request("rival", {RC: {}}, min_runtime=1))
+
+
+def test_a_component_that_moves_keeps_its_count_and_its_hold(tmp_path: Path) -> None:
+    asyncio.run(_moves(tmp_path))
+
+
+async def _moves(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
+        for host in ("h0", "h1", "h2"):
+            lab.node(host)
+        client = await lab.client()
+        placing = Placing(client)
+        await lab.ready(client, RC)
+        await placing.hosts(3)
+        placed = await placing.place(ARC, "counter", {"rc": RC, "period": 0.005}, hosts=["h1", "h2"])
+        assert placed.state == "running"
+        await rc.witness.more()
+        rival = await rival_of(lab)
+        dead, grants = [], set[Grant]()
+        for number in range(MOVES):
+            to = "h1" if placed.host == "h2" else "h2"
+            placed = await placing.get(MigrateComponent(ARC, to), Placement)
+            assert (placed.state, placed.host, placed.moves) == ("running", to, number + 1), placed
+            assert placed.dead is not None
+            dead.append(placed.dead)
+            await rc.witness.more()
+            grants.update(holder.grant for holder in (await lab.rc(client, RC)).holders)
+        rival.check()
+        rc.witness.check()
+        assert len(grants) == MOVES
+        assert rc.witness.released == 0
+        worst = max(dead)
+        print(
+            f"\n{MOVES} moves, {len(rc.witness.counts)} counts; dead time median "
+            f"{1000 * statistics.median(dead):.1f} ms, longest {1000 * worst:.1f} ms"
+        )
+
+
+# Each step at which the target may die: how the move is held there.
+STEPS = ("starting", "standing by", "restoring", "restored", "handed over", "running")
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("victim", ["node", "component"])
+def test_the_target_dies_and_the_component_lives_in_exactly_one_place(
+    tmp_path: Path, step: str, victim: str
+) -> None:
+    asyncio.run(_target_dies(tmp_path, step, victim))
+
+
+async def appears(path: Path) -> None:
+    async with asyncio.timeout(START):
+        while True:
+            if there(path):
+                return
+            await asyncio.sleep(0.002)
+
+
+def there(path: Path) -> bool:
+    return path.exists()
+
+
+def let_go(folder: Path) -> None:
+    """Holds up nothing any more."""
+    for held in folder.glob("hold-*"):
+        held.unlink()
+
+
+async def _target_dies(folder: Path, step: str, victim: str) -> None:
+    async with Lab(folder, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
+        register(lab)
+        for host in ("h0", "h1", "h2"):
+            lab.node(host)
+        client = await lab.client()
+        placing = Placing(client)
+        await lab.ready(client, RC)
+        await placing.hosts(3)
+        params = {"rc": RC, "folder": str(folder)}
+        placed = await placing.place(ARC, "stepper", params, hosts=["h1", "h2"], restart="always")
+        source, target = placed.host, "h1" if placed.host == "h2" else "h2"
+        assert source is not None
+        await rc.witness.more()
+        (folder / "at-init").unlink()
+        moving = asyncio.create_task(placing.ask(MigrateComponent(ARC, target), Placement))
+        await MOVE_TO[step](lab, placing, folder, target)
+        await kill(placing, lab, target, victim)
+        let_go(folder)
+        await moving
+        # It goes on: where it was, or, where the target ran already, wherever the placer starts it again.
+        await rc.witness.more(5)
+        if step != "running":
+            rc.witness.check()
+        living = await placing.until(ARC, lambda one: one.state == "running")
+        alive = [host for host in ("h1", "h2") if lab.nodes[host].poll() is None]
+        running = [view for view in await placing.views(ARC, *alive) if view.phase == "running"]
+        assert [(view.host, view.incarnation) for view in running] == [(living.host, living.incarnation)]
+        if step not in ("handed over", "running"):
+            assert (living.host, living.incarnation) == (source, placed.incarnation)
+        if step in ("starting", "standing by", "restoring"):
+            assert rc.witness.released == 0
+
+
+async def kill(placing: Placing, lab: Lab, host: str, victim: str) -> None:
+    """Kills a node with all it started, as if its host had lost power, or only the component there."""
+    children = psutil.Process(lab.nodes[host].pid).children(recursive=True)
+    if victim == "node":
+        lab.signal(host, signal.SIGKILL)
+    for child in children:
+        child.kill()
+    await asyncio.to_thread(psutil.wait_procs, children, START)
+
+
+async def at_starting(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
+    (folder / "hold-init").touch()
+    await appears(folder / "at-init")
+
+
+async def at_standing_by(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
+    (folder / "hold-checkpoint").touch()
+    await appears(folder / "at-checkpoint")
+
+
+async def at_restoring(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
+    (folder / "hold-restore").touch()
+    await appears(folder / "at-restore")
+
+
+async def at_restored(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
+    """The RCM stands still, so that the hand-over is asked for and not carried out."""
+    await at_restoring(lab, placing, folder, target)
+    lab.signal("h0", signal.SIGSTOP)
+    (folder / "hold-restore").unlink()
+    await appears(folder / "restored")
+    asyncio.get_running_loop().call_later(0.3, lab.signal, "h0", signal.SIGCONT)
+
+
+async def at_handed_over(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
+    """The target stands still from the moment in which it has its state: it is handed the ARC, and can't say
+    that it runs."""
+    given, seen = asyncio.Event(), placing.client
+
+    def on_grants(_key: str, said: Grants) -> None:
+        if any(holder.client.startswith(f"{target}/") for holder in said.rcs.get(RC, [])):
+            given.set()
+
+    declared = seen.mesh.subscribe(seen.mesh.keys.grants, Grants, on_grants)
+    await at_restoring(lab, placing, folder, target)
+    lab.signal("h0", signal.SIGSTOP)
+    (folder / "hold-restore").unlink()
+    await appears(folder / "restored")
+    await asyncio.sleep(0.05)
+    for child in psutil.Process(lab.nodes[target].pid).children(recursive=True):
+        child.suspend()
+    lab.signal("h0", signal.SIGCONT)
+    async with asyncio.timeout(START):
+        await given.wait()
+    declared.close()
+
+
+async def at_running(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
+    await placing.until(ARC, lambda one: one.state == "running" and one.host == target)
+
+
+MOVE_TO: dict[str, Callable[..., object]] = {
+    "starting": at_starting,
+    "standing by": at_standing_by,
+    "restoring": at_restoring,
+    "restored": at_restored,
+    "handed over": at_handed_over,
+    "running": at_running,
+}
+
+
+def test_drain_empties_a_host_without_a_lost_grant(tmp_path: Path) -> None:
+    asyncio.run(_drains(tmp_path))
+
+
+async def _drains(tmp_path: Path) -> None:
+    names = [f"part-{number}" for number in range(4)]
+    async with Lab(tmp_path, candidates=["h0"]) as lab:
+        lab.node("h0", *(f"robot/{name}" for name in names))
+        lab.node("h1")
+        client = await lab.client()
+        placing = Placing(client)
+        await lab.ready(client, *(f"robot/{name}" for name in names))
+        await placing.hosts(2)
+        for name in names:
+            await placing.place(name, "counter", {"rc": f"robot/{name}", "period": 0.01}, hosts=["h0", "h1"])
+        revoked: list[str] = []
+
+        def on_grants(_key: str, said: Grants) -> None:
+            revoked.extend(one.outcome for one in said.revoked)
+
+        client.mesh.subscribe(client.mesh.keys.grants, Grants, on_grants)
+        for name in names:
+            placed = await placing.placement(name)
+            if placed.host == "h0":
+                await placing.get(MigrateComponent(name, "h1"), Placement)
+        revoked.clear()
+        drained = await placing.get(DrainHost("h1"), Placements)
+        assert drained.cordoned == ["h1"]
+        for name in names:
+            await placing.until(name, lambda one: (one.state, one.host) == ("running", "h0"))
+        assert revoked == ["handed_over"] * len(names)

@@ -1,0 +1,470 @@
+"""All that a client has goes on in another one, in one step, whatever dies around it.
+
+python -m tests.live.test_hand_over NAME     a client in a process of its own that takes over (`heir`)
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, running, until
+from tests.live.crew import Body
+from tests.live.lab import START, Lab
+from tests.live.stranger import Stranger, beside_a_node, good_ask
+from zscout.behaviors import moving
+from zscout.behaviors.arc import Held, holds
+from zscout.behaviors.client import Client, RequestRefused
+from zscout.behaviors.request import OpenArc
+from zscout.keyexpr import Sender
+from zscout.messages import Grants, OpenRequest, RcmState, RcState
+from zscout.scheduling.model import Grant
+
+pytestmark = pytest.mark.live
+
+NEEDS: dict[str, dict[str, dict[str, int]]] = {
+    "drive": {"robot/x": {}},
+    "talk": {"radio/f": {"rate": 2}},
+    "later": {"robot/x": {}},
+}
+ROUNDS = 200
+ENCODER = msgspec.json.Encoder(decimal_format="number")
+
+
+def me(client: Client) -> Sender:
+    return client.mesh.me
+
+
+async def settle_down(old: Client, new: Client, names: Sequence[str]) -> dict[str, OpenArc]:
+    """Moves all of `old` to `new`, which asks for it by `names`."""
+    old.pause()
+    new.expect(old.open_requests())
+    await old.hand_over_all(me(new))
+    return await claimed(new, names)
+
+
+async def claimed(client: Client, names: Sequence[str]) -> dict[str, OpenArc]:
+    return {name: await client.request(name, NEEDS[name], min_runtime=600) for name in names}
+
+
+def holding(state: RcmState) -> dict[str, tuple[str, Grant]]:
+    return {view.arc: (view.client, view.grant) for view in state.holds}
+
+
+# Who was the owner, and is no longer
+
+
+@pytest.fixture
+def stranger(tmp_path: Path) -> Iterator[Stranger]:
+    yield from beside_a_node(tmp_path)
+
+
+def test_the_old_id_of_what_was_handed_over_does_nothing(stranger: Stranger) -> None:
+    token = stranger.token("t/client/next/1")
+    runs = good_ask(id="runs", needs={"robot/a": {}}, min_runtime=60)
+    waits = good_ask(id="waits", needs={"robot/a": {}}, min_runtime=60)
+    for asked in (runs, waits):
+        stranger.ask("rcm/schedule/t/good", asked)
+    place = stranger.ask("rcm/schedule/t/good", waits)["place"]
+    over = {"op": "hand_over", "id": "runs", "to": "t/next", "others": ["waits", "nothing"]}
+    moved = stranger.ask("rcm/schedule/t/good", over)
+    assert (moved["client"], moved["state"]) == ("t/next", "running")
+    for asked in (runs, waits):
+        for operation in ({"op": "cancel", "id": asked["id"]}, {"op": "release", "id": asked["id"]}, asked):
+            told = stranger.ask("rcm/schedule/t/good", operation)
+            assert (told["state"], told["outcome"]) == ("ended", "handed_over")
+    # A leader that knows nothing of it knows the ARC by its place.
+    known = stranger.ask("rcm/schedule/t/other", waits | {"place": place})
+    assert (known["state"], known["outcome"]) == ("ended", "handed_over")
+    # Doing it again changes nothing.
+    assert stranger.ask("rcm/schedule/t/good", over)["grant"] == moved["grant"]
+    stranger.ask("rc/robot/a/command/t/next", {"grant": moved["grant"], "do": {"name": "confirm"}})
+    still = stranger.ask("rcm/schedule/t/next", waits)
+    assert (still["state"], still["place"]) == ("queued", place)
+    stranger.ask("rcm/schedule/t/next", {"op": "release", "id": "runs"})
+    assert stranger.ask("rcm/schedule/t/next", waits)["state"] == "running"
+    stranger.ask("rcm/schedule/t/next", {"op": "release", "id": "waits"})
+    again = stranger.ask("rcm/schedule/t/good", over)
+    assert (again["state"], again["outcome"]) == ("ended", "released")
+    token.undeclare()
+    stranger.serves()
+
+
+def test_a_hand_over_takes_no_other_request_of_that_name(stranger: Stranger) -> None:
+    token = stranger.token("t/client/next/1")
+    for client, rc in (("good", "robot/a"), ("next", "radio/a")):
+        stranger.ask(f"rcm/schedule/t/{client}", good_ask(id="same", needs={rc: {}}, min_runtime=60))
+    message = b'{"op": "hand_over", "id": "same", "to": "t/next"}'
+    [(kind, answer_)] = stranger.get("rcm/schedule/t/good", message)
+    assert (kind, answer_["code"]) == ("err", "bad_request")
+    # No room at the new client: nothing moves.
+    for number in range(4):
+        stranger.ask("rcm/schedule/t/next", good_ask(id=f"n{number}", needs={"robot/ghost": {}}))
+    stranger.ask("rcm/schedule/t/good", good_ask(id="more", needs={"robot/ghost": {}}))
+    [(kind, answer_)] = stranger.get("rcm/schedule/t/good", message.replace(b"same", b"more"))
+    assert (kind, answer_["code"]) == ("err", "too_many")
+    holders = {view["client"]: list(view["needs"]) for view in stranger.state()["holds"]}
+    assert holders == {"t/good": ["robot/a"], "t/next": ["radio/a"]}
+    for client in ("good", "next"):
+        stranger.ask(f"rcm/schedule/t/{client}", {"op": "release", "id": "same"})
+    token.undeclare()
+    stranger.serves()
+
+
+# All at once
+
+
+class Record:
+    """What the RCM and the RCs published about holders."""
+
+    def __init__(self, client: Client) -> None:
+        self.said: list[Grants] = []
+        self.held: list[tuple[str, list[str]]] = []
+        mesh = client.mesh
+        mesh.subscribe(mesh.keys.grants, Grants, self._on_grants)
+        mesh.subscribe(mesh.keys.rc_state_any, RcState, self._on_state)
+
+    def _on_grants(self, _key: str, said: Grants) -> None:
+        if said.rcs:
+            self.said.append(said)
+
+    def _on_state(self, _key: str, state: RcState) -> None:
+        self.held.append((state.rc, [holder.arc for holder in state.holders]))
+
+
+def test_all_goes_over_in_one_step_and_nobody_gets_in_between(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab, Stand(lab) as stand:
+            lab.node("a")
+            robot, radio = Bench(), SharedBench()
+            await stand.rc("robot/x", robot)
+            await stand.rc("radio/f", radio)
+            old, new, other = await lab.client("old"), await lab.client("new"), await lab.client("rival")
+            await lab.ready(old, "robot/x", "radio/f")
+            before = await claimed(old, list(NEEDS))
+            assert [arc.state for arc in before.values()] == ["running", "running", "queued"]
+            grants = {name: arc.grant for name, arc in before.items()}
+            rival = await other.request("rival", {"robot/x": {}}, min_runtime=600)
+            robot.calls.clear()
+            radio.calls.clear()
+            record = Record(other)
+
+            old.pause()
+            told = old.open_requests()
+            new.expect(told)
+            # Who asks too early is given what is expected, as soon as it comes.
+            early = asyncio.create_task(new.request("drive", NEEDS["drive"], min_runtime=1))
+            await asyncio.sleep(0)
+            assert not new.expected_came.is_set()
+            await old.hand_over_all(me(new))
+            await asyncio.wait_for(new.expected_came.wait(), START)
+            drive = await early
+            after = {"drive": drive} | await claimed(new, ["talk", "later"])
+
+            assert [after[name].id for name in NEEDS] == [before[name].id for name in NEEDS]
+            assert [after[name].place for name in NEEDS] == [before[name].place for name in NEEDS]
+            assert [arc.state for arc in before.values()] == ["moved"] * 3
+            for name in ("drive", "talk"):
+                old_grant, new_grant = grants[name], await new.granted(after[name])
+                assert old_grant is not None
+                assert new_grant is not None
+                assert new_grant > old_grant
+                rc = min(NEEDS[name])
+                assert await answer(new.command(rc, new_grant, ECHO)) == "done"
+                assert await answer(old.command(rc, old_grant, ECHO)) == "ended"
+            assert after["later"].state == rival.state == "queued"
+            # One publication told of both holds, and none of anything else.
+            [said] = record.said
+            assert {rc: [(one.arc, one.client) for one in found] for rc, found in said.rcs.items()} == {
+                "robot/x": [("drive", "test/new")],
+                "radio/f": [("talk", "test/new")],
+            }
+            assert {gone.outcome for gone in said.revoked} == {"handed_over"}
+            assert record.held == []
+            assert (robot.calls, radio.calls) == (["begin drive"], ["begin talk"])
+
+            # The old client leaves: that touches nobody. What waited is next, at its old place.
+            await old.leave()
+            await lab.living(new, "client", lambda hosts: len(hosts) == 2)
+            await new.end(drive)
+            await until(lambda: after["later"].state == "running")
+            assert rival.state == "queued"
+            assert new.open_requests()[0].arc == "talk"
+
+    asyncio.run(story())
+
+
+def test_back_and_forth_without_end(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab, Stand(lab) as stand:
+            lab.node("a")
+            robot = Bench()
+            await stand.rc("robot/x", robot)
+            await stand.rc("radio/f", SharedBench())
+            here, there = await lab.client("here"), await lab.client("there")
+            other = await lab.client("rival")
+            await lab.ready(here, "robot/x", "radio/f")
+            arcs = await claimed(here, list(NEEDS))
+            rival = await other.request("rival", {"robot/x": {}}, min_runtime=600)
+            record = Record(other)
+            seen: list[Grant | None] = [arcs["drive"].grant]
+            for _ in range(ROUNDS):
+                arcs = await settle_down(here, there, list(NEEDS))
+                seen.append(arcs["drive"].grant)
+                here.resume()
+                here, there = there, here
+            assert None not in seen
+            assert seen == sorted(set(seen), key=seen.index)
+            assert len(set(seen)) == ROUNDS + 1
+            assert len(record.said) == ROUNDS
+            assert {tuple(one.arc for one in said.rcs["robot/x"]) for said in record.said} == {("drive",)}
+            assert "safe" not in robot.calls
+            grant = await here.granted(arcs["drive"])
+            assert grant is not None
+            assert await answer(here.command("robot/x", grant, ECHO)) == "done"
+            assert rival.state == arcs["later"].state == "queued"
+
+    asyncio.run(story())
+
+
+# What comes to nothing
+
+
+def test_bodies_go_on_after_a_hand_over_that_was_refused(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/x")
+            client, other = await lab.client("old"), await lab.client("rival")
+            await lab.ready(client, "robot/x")
+            body = Body(client, "drive", "robot/x")
+            await body.entered()
+            client.pause()
+            with pytest.raises(RequestRefused, match="no/body is not on the mesh") as refused:
+                await client.hand_over_all(Sender("no", "body"))
+            assert refused.value.code == "unknown_client"
+            client.resume()
+            await body.beats_on(body.beats[-1])
+            # What happens to a hold while the client is paused is told when it is not any more.
+            client.pause()
+            taker, _ = await running(other, "operator", "robot/x", priority=9)
+            await asyncio.sleep(0.1)
+            interrupted = not body.task.done() and body.task.cancelling()
+            assert not interrupted
+            assert client.open_requests()[0].grant is None
+            client.resume()
+            await asyncio.wait({body.task}, timeout=START)
+            assert "preempted by operator" in str(body.task.exception())
+            await other.end(taker)
+
+    asyncio.run(story())
+
+
+def test_what_was_handed_to_one_who_died_is_taken_back(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/x", "radio/f:rate=5")
+            old, new, other = await lab.client("old"), await lab.client("new"), await lab.client("rival")
+            await lab.ready(old, "robot/x", "radio/f")
+            entered: list[Held] = []
+            done = asyncio.Event()
+
+            async def drive() -> None:
+                async for attempt in holds(old, "drive", NEEDS["drive"], min_runtime=600):
+                    async with attempt as held:
+                        entered.append(held)
+                        await done.wait()
+
+            body = asyncio.create_task(drive())
+            await until(lambda: bool(entered))
+            later = await old.request("later", NEEDS["later"], min_runtime=600)
+            rival = await other.request("rival", {"robot/x": {}}, min_runtime=600)
+            places, ids = (entered[0].arc.place, later.place), (entered[0].arc.id, later.id)
+            old.pause()
+            new.expect(old.open_requests())
+            await old.hand_over_all(me(new))
+            assert (entered[0].arc.state, later.state, len(entered)) == ("moved", "moved", 1)
+            assert not entered[0].active
+            await new.leave()
+            old.take_back()
+            await until(lambda: rival.state == "running" or len(entered) == 2)
+            # Where the rival was quicker, the places decide once it ends.
+            await other.end(rival)
+            await until(lambda: len(entered) == 2 and entered[1].active)
+            assert (entered[1].arc.place, later.place) == places
+            assert not {entered[1].arc.id, later.id} & set(ids)
+            assert later.state == "queued"
+            done.set()
+            await asyncio.wait_for(body, START)
+            await until(lambda: later.state == "running")
+
+    asyncio.run(story())
+
+
+def test_what_comes_and_nobody_wants_or_does_not_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(moving, "CLAIM", 0.2)
+    monkeypatch.setattr(moving, "COME", 0.2)
+
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/x", "radio/f:rate=5")
+            old, new = await lab.client("old"), await lab.client("new")
+            await lab.ready(old, "robot/x", "radio/f")
+            arcs = await claimed(old, ["drive"])
+            old.pause()
+            new.expect([*old.open_requests(), *(await ghost())])
+            await old.hand_over_all(me(new))
+            # It was wanted by nobody: given back. What did not come is asked for anew.
+            await lab.state(new, lambda state: not state.holds and not state.queue)
+            anew = await new.request("talk", NEEDS["talk"], min_runtime=600)
+            assert (anew.id != "ghost", anew.state) == (True, "running")
+            assert arcs["drive"].state == "moved"
+            with pytest.raises(ValueError, match="is open here already"):
+                new.expect(new.open_requests())
+            with pytest.raises(RuntimeError, match="pause"):
+                await new.hand_over_all(me(old))
+
+    async def ghost() -> list[OpenRequest]:
+        asked = {"id": "ghost", "arc": "talk", "needs": NEEDS["talk"], "priority": 0, "min_runtime": 600}
+        return [msgspec.convert(asked, OpenRequest, strict=False)]
+
+    asyncio.run(story())
+
+
+# Who dies in the middle
+
+
+def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=("a", "b", "c")) as lab:
+            lab.node("rcs", "robot/x", "radio/f:rate=5", extra="candidate = false")
+            lab.node("a")
+            old, new = await lab.client("old"), await lab.client("new")
+            await lab.ready(old, "robot/x", "radio/f")
+            for host in ("b", "c"):
+                lab.node(host)
+            await lab.living(old, "candidate", lambda hosts: {"b", "c"} <= set(hosts))
+            before = await claimed(old, list(NEEDS))
+
+            place = before["later"].place
+
+            # Right after it: the next leader has it from the new client and the RCs.
+            after = await settle_down(old, new, list(NEEDS))
+            lab.signal("a", signal.SIGKILL)
+            state = await lab.state(new, lambda state: state.host == "b" and len(state.holds) == 2)
+            stood = {name: ("test/new", after[name].grant) for name in ("drive", "talk")}
+            assert holding(state) == stood
+            assert [(view.client, view.place) for view in state.queue] == [("test/new", place)]
+            grant = after["drive"].grant
+            assert grant is not None
+            assert await answer(new.command("robot/x", grant, ECHO)) == "done"
+
+            # Right before it, and again in the middle: it ends at one of both.
+            old.resume()
+            lab.signal("b", signal.SIGKILL)
+            back = await settle_down(new, old, list(NEEDS))
+            state = await lab.state(old, lambda state: state.host == "c" and len(state.holds) == 2)
+            assert {client for client, _ in holding(state).values()} == {"test/old"}
+            assert [(view.client, view.place) for view in state.queue] == [("test/old", place)]
+            assert [arc.place for arc in back.values()] == [arc.place for arc in before.values()]
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("delay", [k*0.0004 for k in range(16)])
+def test_the_leader_dies_in_a_hand_over(tmp_path: Path, delay: float) -> None:
+    """Whenever that is: all is at one of both, once, and the other knows."""
+
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=("a", "b")) as lab:
+            t00=__import__('time').monotonic()
+            lab.node("rcs", "robot/x", "radio/f:rate=5", extra="candidate = false")
+            lab.node("a")
+            old, new = await lab.client("old"), await lab.client("new")
+            await lab.ready(old, "robot/x", "radio/f")
+            lab.node("b")
+            await lab.living(old, "candidate", lambda hosts: "b" in hosts)
+            before = await claimed(old, list(NEEDS))
+            old.pause()
+            new.expect(old.open_requests())
+            moving_ = asyncio.create_task(old.hand_over_all(me(new)))
+            await asyncio.sleep(delay)
+            lab.signal("a", signal.SIGKILL)
+            await moving_
+            print('MOVED', delay, old.term, __import__('time').monotonic()-t00)
+            after = await claimed(new, list(NEEDS))
+            assert [arc.id for arc in after.values()] == [arc.id for arc in before.values()]
+            await asyncio.wait_for(new.granted(after["drive"]), START)
+            await asyncio.wait_for(new.granted(after["talk"]), START)
+            state = await lab.state(
+                new, lambda state: state.host == "b" and len(state.holds) == 2 and len(state.queue) == 1
+            )
+            clients = [*(view.client for view in state.holds), *(view.client for view in state.queue)]
+            assert clients == ["test/new"] * 3
+            assert [view.place for view in state.queue] == [before["later"].place]
+
+    asyncio.run(story())
+
+
+def test_the_old_process_dies_right_after_it(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/x", "radio/f:rate=5")
+            old = await lab.client("old")
+            await lab.ready(old, "robot/x", "radio/f")
+            await claimed(old, list(NEEDS))
+            grants = holding(await lab.state(old, lambda state: len(state.holds) == 2))
+            heir = await asyncio.create_subprocess_exec(
+                sys.executable,
+                *("-m", "tests.live.test_hand_over", "new"),
+                env=lab.env,
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+            )
+            try:
+                assert heir.stdin is not None
+                assert heir.stdout is not None
+                old.pause()
+                heir.stdin.write(ENCODER.encode(old.open_requests()) + b"\n")
+                assert await asyncio.wait_for(heir.stdout.readline(), START) == b"ready\n"
+                await old.hand_over_all(Sender("test", "new"))
+                await old.leave()
+                line = await asyncio.wait_for(heir.stdout.readline(), START)
+                told = msgspec.json.decode(line, type=dict[str, Grant])
+                watcher = await lab.client("watcher")
+                await lab.living(watcher, "client", lambda hosts: len(hosts) == 2)
+                state = await lab.state(watcher, lambda state: len(state.holds) == 2)
+                assert {client for client, _ in holding(state).values()} == {"test/new"}
+                for name, (_, grant) in holding(state).items():
+                    assert grant > grants[name][1]
+                    assert grant == told[name]
+                assert [view.arc for view in state.queue] == ["later"]
+            finally:
+                heir.kill()
+                await heir.wait()
+
+    asyncio.run(story())
+
+
+async def heir(name: str) -> None:
+    """Expects what stdin names, and tells the grants under which it goes on."""
+    async with await Client.connect(name, host="test") as client:
+        line = await asyncio.to_thread(sys.stdin.readline)
+        client.expect(msgspec.json.decode(line, type=list[OpenRequest]))
+        print("ready", flush=True)
+        await client.expected_came.wait()
+        arcs = await claimed(client, list(NEEDS))
+        grants = {name: await client.granted(arcs[name]) for name in ("drive", "talk")}
+        print(msgspec.json.encode(grants).decode(), flush=True)
+        await asyncio.to_thread(sys.stdin.read)
+
+
+if __name__ == "__main__":
+    asyncio.run(heir(sys.argv[1]))

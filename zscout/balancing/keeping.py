@@ -1,0 +1,381 @@
+"""Starting components and keeping them running: which host is next, when again, and when no more."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from zscout.balancing.entry import Entry, Fate
+from zscout.balancing.ground import ANSWER, Ground
+from zscout.balancing.model import SECOND, ComponentId, HostName, Ns, Ranked
+from zscout.balancing.placing import Spec, StartAnswered, StopAnswered
+from zscout.balancing.strays import Strays
+
+TRY_AGAIN: Final[Ns] = SECOND
+"""A component for which there is no host looks for one as often."""
+GRACE: Final[Ns] = 2 * SECOND
+"""What is inherited, or went on elsewhere, has as long to be heard of."""
+LOOKS: Final = 3
+"""A component whose token is missing and of which its host tells nothing so often is lost."""
+AT_ONCE: Final = 200
+"""Components that are placed in one instant; the next follow in the next."""
+SHORTLY: Final[Ns] = SECOND // 100
+
+
+class Keeper:
+    """Places, restarts and stops. A component that is being moved is `moving.Mover`'s."""
+
+    def __init__(self, ground: Ground, strays: Strays) -> None:
+        self.ground, self.strays = ground, strays
+
+    # What is asked for
+
+    def place(self, component: ComponentId, spec: Spec) -> None:
+        ground = self.ground
+        entry = ground.entry(component)
+        if entry is None:
+            entry = ground.new_entry(component, spec)
+            if entry is None:
+                ground.refuse(component, "too_many", f"{len(ground.entries)} components are placed already")
+                return
+            self.again(entry)
+        elif entry.state in ("ended", "given_up"):
+            ground.revived(entry)
+            self._anew(entry, spec)
+            self.again(entry)
+        elif not entry.wanted:
+            # It is being stopped; what is asked for now comes after that.
+            self._anew(entry, spec)
+        elif entry.spec != spec:
+            message = f"{component} is placed already, and is another: stop it first, or take another name"
+            ground.refuse(component, "exists", message)
+            return
+        ground.touch(component, asked=True)
+
+    def _anew(self, entry: Entry, spec: Spec) -> None:
+        entry.spec, entry.wanted, entry.movable = spec, True, False
+        entry.restarts = entry.rounds = 0
+        entry.reason = entry.cause = entry.tail = ""
+        entry.tried.clear()
+
+    def stop(self, entry: Entry) -> None:
+        """For good. A move must have been called off before."""
+        entry.wanted = False
+        self.ground.touch(entry.component, asked=True)
+        match entry.state:
+            case "ended" | "stopping":
+                pass
+            case "given_up":
+                self._finish(entry, "ended", "stopped")
+            case "waiting" | "backing_off":
+                entry.state, entry.reason = "stopping", "asked to stop"
+                self._check_stopped(entry)
+            case _:
+                entry.state, entry.reason, entry.asks = "stopping", "asked to stop", 0
+                self._stop_now(entry)
+
+    # Placing
+
+    def again(self, entry: Entry, cause: str = "") -> None:
+        """Has it placed at the end of this instant."""
+        entry.state, entry.cause, entry.missing = "waiting", cause, False
+        self.ground.wake(entry, None)
+        self.ground.to_place[entry.component] = None
+
+    def place_all(self) -> None:
+        """Places what is to be placed, the heaviest first."""
+        ground = self.ground
+        entries = [ground.entries[name] for name in ground.to_place if name in ground.entries]
+        ground.to_place = {}
+        waiting = [(one.component, one.spec.kind) for one in entries if one.state == "waiting"]
+        order = ground.balancer.heaviest_first(waiting) if len(waiting) > 1 else [name for name, _ in waiting]
+        for number, component in enumerate(order):
+            entry = ground.entries[component]
+            ground.touch(component)
+            if number < AT_ONCE:
+                self._put(entry)
+            else:
+                entry.reason = entry.reason or "others are placed first"
+                ground.wake(entry, ground.now + SHORTLY)
+
+    def _put(self, entry: Entry) -> None:
+        fit = self.ground.fit(entry.spec)
+        untried = [one for one in fit.hosts if one.host not in entry.tried]
+        if untried:
+            self._start(entry, untried[0])
+        elif not fit.hosts:
+            entry.tried.clear()
+            self._wait(entry, fit.why_none())
+        elif not any(entry.tried[one.host] for one in fit.hosts):
+            self._finish(entry, "given_up", f"no host can start it: {entry.cause}")
+        else:
+            entry.tried.clear()
+            pause = self.ground.pause(entry.rounds)
+            entry.rounds += 1
+            self._back_off(
+                entry, f"no host started it; tried again after {_seconds(pause)}: {entry.cause}", pause
+            )
+
+    def _wait(self, entry: Entry, why: str) -> None:
+        # Ages and amounts in the reason change all the time: that is no news.
+        if _words(entry.reason) != _words(reason := f"no host will do: {why}"):
+            entry.reason = reason
+        self.ground.wake(entry, self.ground.now + TRY_AGAIN)
+
+    def _start(self, entry: Entry, ranked: Ranked) -> None:
+        ground = self.ground
+        entry.incarnation = ground.fresh(entry.component)
+        entry.host, entry.state = ranked.host, "starting"
+        entry.since, entry.token, entry.told, entry.looked, entry.asks = None, False, False, False, 0
+        entry.why = f"{entry.cause}; here: {ranked.reason}" if entry.cause else ranked.reason
+        entry.reason = entry.why
+        ground.came(entry.component, entry.spec.kind, ranked.host)
+        ground.start(entry)
+
+    def _back_off(self, entry: Entry, reason: str, pause: Ns) -> None:
+        entry.state, entry.reason = "backing_off", reason
+        self.ground.wake(entry, self.ground.now + pause)
+
+    def _finish(self, entry: Entry, state: str, reason: str) -> None:
+        entry.state = "ended" if state == "ended" else "given_up"
+        entry.reason, entry.stays, entry.cause, entry.missing = reason, "", "", False
+        self.ground.ended(entry)
+
+    # What came of a start
+
+    def start_answered(self, entry: Entry, answer: StartAnswered) -> None:
+        """Of the entry's own incarnation, which is no move's."""
+        entry.start_until = None
+        if entry.state == "stopping":
+            # The stop may have come before the start: once more.
+            if answer.result in ("refused", "failed"):
+                self.over(entry)
+            else:
+                self._stop_now(entry)
+        elif answer.result == "failed" and entry.state != "starting":
+            self.ended(entry, Fate("failed", answer.reason, answer.tail))
+        elif answer.result == "ok":
+            entry.movable, entry.told = answer.movable, True
+            self.runs(entry)
+        elif entry.state == "starting":
+            self._not_started(entry, answer)
+
+    def _not_started(self, entry: Entry, answer: StartAnswered) -> None:
+        ground, host = self.ground, answer.host
+        if answer.result == "unknown":
+            pause = ground.pause(entry.asks)
+            entry.asks += 1
+            entry.reason = f"{host} does not say whether it started: {answer.reason or 'no answer'}"
+            ground.wake(entry, ground.now + pause)
+            return
+        if answer.result == "refused":
+            entry.over.append(entry.incarnation)
+            ground.left(entry)
+            if answer.again:
+                # It may know what the placer does not: another incarnation that lives there.
+                ground.look(entry.component, host)
+            entry.tried[host] = answer.again
+            self.again(entry, f"{host} refused it: {answer.reason}")
+            return
+        self.start_failed(entry, Fate("failed", answer.reason, answer.tail), again=answer.again)
+
+    def start_failed(self, entry: Entry, fate: Fate, *, again: bool = True) -> None:
+        """It was started and ended before it ran: the next host at once, a few times."""
+        host = entry.host or "its host"
+        entry.over.append(entry.incarnation)
+        entry.start_until, entry.tail = None, fate.tail
+        self.ground.left(entry)
+        entry.tried[host] = again
+        entry.restarts += 1
+        cause = f"it did not start on {host}: {fate.reason or fate.how}"
+        if not self._exhausted(entry, cause):
+            self.again(entry, cause)
+
+    def runs(self, entry: Entry) -> None:
+        """It is known to run where it is; also what was believed gone."""
+        if entry.state != "running":
+            entry.state, entry.since, entry.missing = "running", self.ground.now, False
+            entry.rounds, entry.reason = 0, entry.why
+            entry.tried.clear()
+        entry.asks, entry.start_until = 0, None
+        self.watch(entry)
+        self.ground.drain_soon(entry.host)
+
+    def watch(self, entry: Entry) -> None:
+        """Sets when a running component is to be looked at next."""
+        ground, settles = self.ground, None
+        if not (entry.token and entry.told):
+            settles = ground.now + ANSWER
+        elif entry.restarts and entry.since is not None:
+            settles = max(ground.now, entry.since + ground.rules.settled)
+        ground.wake(entry, settles)
+
+    # What ended
+
+    def ended(self, entry: Entry, fate: Fate) -> None:
+        """The entry's incarnation is gone for sure, or given up for lost."""
+        ground, rules = self.ground, self.ground.rules
+        if entry.state == "stopping":
+            self.over(entry, sure=fate.how != "lost")
+            return
+        if entry.state == "starting" and fate.how in ("failed", "lost") and not fate.with_host:
+            self.start_failed(entry, fate)
+            return
+        host, ran = entry.host or "its host", ground.now - entry.since if entry.since is not None else 0
+        if fate.how != "lost":
+            # What is lost may come back with its host.
+            entry.over.append(entry.incarnation)
+        entry.start_until, entry.tail, entry.stays, entry.asks = None, fate.tail, "", 0
+        ground.left(entry)
+        if fate.how in ("moved", "superseded") and not entry.missing:
+            entry.missing = True
+            self._back_off(entry, f"it went on elsewhere ({fate.how}), it is not known where", GRACE)
+            return
+        cause = _cause(fate, host)
+        if fate.how == "completed" and entry.spec.restart != "always":
+            self._finish(entry, "ended", cause)
+        elif entry.spec.restart == "never":
+            self._finish(entry, "given_up" if fate.how == "failed" else "ended", cause)
+        elif fate.with_host:
+            entry.tried.clear()
+            self.again(entry, cause)
+        elif ran >= rules.settled:
+            entry.restarts = 0
+            self.again(entry, cause)
+        else:
+            pause = ground.pause(entry.restarts)
+            entry.restarts += 1
+            if fate.how == "completed" or not self._exhausted(entry, cause):
+                self._back_off(entry, f"{cause}; started again after {_seconds(pause)}", pause)
+                entry.cause = cause
+
+    def _exhausted(self, entry: Entry, cause: str) -> bool:
+        """Whether that was the last try; if so it is given up."""
+        if entry.spec.restart == "never":
+            self._finish(entry, "given_up", cause)
+        elif entry.restarts >= self.ground.rules.restarts:
+            self._finish(entry, "given_up", f"{cause}; {entry.restarts} starts in a row failed")
+        return entry.state == "given_up"
+
+    def host_lost(self, entry: Entry, host: HostName) -> None:
+        """The host that it was on is gone."""
+        self.ended(entry, Fate("lost", f"host {host} is gone", with_host=True))
+
+    # Stopping
+
+    def _stop_now(self, entry: Entry) -> None:
+        if entry.host is None or entry.host not in self.ground.alive:
+            if entry.host is None or self.ground.now >= entry.retry_at:
+                self.over(entry, sure=False)
+            else:
+                # Inherited: its host may be there, and has not been seen yet.
+                self.ground.wake(entry, entry.retry_at)
+            return
+        self.ground.stop(entry.component, entry.incarnation, entry.host)
+        self.ground.wake(entry, self.ground.now + self.ground.pause(20))
+
+    def stop_answered(self, entry: Entry, answer: StopAnswered) -> None:
+        if not answer.done:
+            entry.asks += 1
+            self.ground.wake(entry, self.ground.now + self.ground.pause(entry.asks))
+        elif entry.start_until is not None:
+            self.ground.wake(entry, self.ground.now + SECOND)
+        else:
+            self.over(entry)
+
+    def over(self, entry: Entry, *, sure: bool = True) -> None:
+        """What was stopped has ended, or its host is gone."""
+        if sure:
+            entry.over.append(entry.incarnation)
+        entry.start_until = None
+        self.ground.left(entry)
+        self.ground.wake(entry, None)
+        self._check_stopped(entry)
+
+    def _check_stopped(self, entry: Entry) -> None:
+        if entry.host is not None or self.strays.any(entry.component):
+            return
+        if entry.wanted:
+            self.again(entry)
+        else:
+            self._finish(entry, "ended", "stopped")
+
+    def stray_over(self, component: ComponentId) -> None:
+        """One of its strays has ended: perhaps that was what a stop waited for."""
+        entry = self.ground.entry(component)
+        if entry is not None and entry.state == "stopping":
+            self._check_stopped(entry)
+
+    # Time
+
+    def woke(self, entry: Entry) -> None:
+        ground = self.ground
+        match entry.state:
+            case "waiting":
+                self.again(entry, entry.cause)
+            case "backing_off" if entry.missing:
+                self.ended(entry, Fate("lost", "it went on elsewhere and was not heard of again"))
+            case "backing_off":
+                self.again(entry, entry.cause)
+            case "starting":
+                self._start_again(entry)
+            case "running":
+                if (fate := self.check(entry)) is not None:
+                    self.ended(entry, fate)
+            case "stopping":
+                if entry.start_until is not None and entry.start_until <= ground.now:
+                    entry.start_until = None
+                self._stop_now(entry)
+            case _:
+                ground.forget(entry.component)
+
+    def _start_again(self, entry: Entry) -> None:
+        if entry.host is None or entry.host not in self.ground.alive:
+            self.host_lost(entry, entry.host or "of its start")
+        elif entry.start_until is not None:
+            answer = StartAnswered(entry.component, entry.incarnation, entry.host, "unknown")
+            self.start_answered(entry, answer)
+        else:
+            self.ground.start(entry)
+
+    def check(self, entry: Entry) -> Fate | None:
+        """Of a running component whose token is missing, or that nobody has told of, asks its host; and
+        forgives what has settled.
+        Returns what became of it, if it is to be given up for lost."""
+        ground, host = self.ground, entry.host
+        if entry.since is not None and ground.now - entry.since >= ground.rules.settled:
+            entry.restarts = 0
+        if entry.token and entry.told:
+            self.watch(entry)
+            return None
+        if host is None or host not in ground.alive:
+            return Fate("lost", f"host {host} is gone", with_host=True)
+        if entry.asks >= LOOKS and not entry.token:
+            self.strays.add(entry.component, entry.incarnation, host)
+            return Fate("lost", f"its token is gone, and {host} tells nothing of it")
+        entry.asks += 1
+        entry.looked = True
+        ground.look(entry.component, host)
+        ground.wake(entry, ground.now + ANSWER)
+        return None
+
+
+def _cause(fate: Fate, host: HostName) -> str:
+    match fate.how:
+        case "completed":
+            return f"it completed on {host}" + (f": {fate.reason}" if fate.reason else "")
+        case "failed":
+            return f"it failed on {host}: {fate.reason or 'no reason was told'}"
+        case "stopped":
+            return f"it was stopped on {host}, and not by the placer"
+        case _:
+            return fate.reason
+
+
+def _seconds(pause: Ns) -> str:
+    return f"{pause / SECOND:g} s"
+
+
+def _words(reason: str) -> str:
+    """A reason without its figures."""
+    return re.sub(r"[\d.,]+", "#", reason)

@@ -1,0 +1,187 @@
+"""A client that moves: paused, it hands all that it has to another one, which expects it.
+
+The RCM's answer to the hand-over is the commit point. Before it the old client can go on as if nothing had
+been; after it only the new one, unless that is gone: then the old one takes back, and asks anew.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any
+
+from zscout import clock
+from zscout.behaviors.asking import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN, Asking, answered
+from zscout.behaviors.book import Book
+from zscout.behaviors.hearing import Hearing
+from zscout.behaviors.refusals import RequestRefused
+from zscout.behaviors.request import OpenArc
+from zscout.keyexpr import Sender, new_instance
+from zscout.mesh import Mesh
+from zscout.messages import Amounts, HandOver, Notice, OpenRequest, Problem
+from zscout.messages.scheduling import MAX_OTHERS
+
+log = logging.getLogger(__name__)
+
+HAND_OVER = 10.0
+"""Seconds within which the outcome of a hand-over must be known."""
+COME = 2.0
+"""Seconds for which a request waits for the ARC that is expected in its stead."""
+CLAIM = 10.0
+"""Seconds after which an ARC that came and that nobody asked for is given back."""
+
+
+class Moving:
+    """What one client hands over, and what it expects to be handed."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        book: Book,
+        hearing: Hearing,
+        asking: Asking,
+        spawn: Callable[[Coroutine[Any, Any, None]], None],
+    ) -> None:
+        self.mesh, self.book, self.hearing, self.asking = mesh, book, hearing, asking
+        self._spawn = spawn
+        self.came = asyncio.Event()
+        self._unclaimed: dict[str, OpenArc] = {}
+        """What is expected, come or not, and was not asked for yet."""
+
+    # The new client
+
+    def expect(self, requests: Sequence[OpenRequest]) -> None:
+        """These will be handed to this client; they replace what was expected and has not come.
+
+        Raises BadName, and ValueError for what is too much or open here already."""
+        if len(requests) > MAX_OTHERS + 1:
+            raise ValueError(f"{len(requests)} ARCs are too many to take over; at most {MAX_OTHERS + 1} are")
+        now = clock.now()
+        arcs = {request.id: OpenArc.expected(request, now) for request in requests}
+        if here := arcs.keys() & self.book.arcs.keys():
+            raise ValueError(f"request {min(here)} is open here already; nobody else can hand it over")
+        for arc in list(self.book.expected.values()):
+            self._unclaimed.pop(arc.id, None)
+            self.book.forget(arc)
+        self.book.expected.update(arcs)
+        self._unclaimed |= arcs
+        self.came.clear()
+        for arc in arcs.values():
+            # What comes back: words from before it went are old.
+            if (before := self.book.moved.pop(arc.id, None)) is not None:
+                arc.last = before.last
+            self.book.listen(arc)
+
+    def heard(self, notice: Notice) -> bool:
+        """Takes a word about what is expected, or was handed over. False if it is about neither."""
+        arc = self.book.expected.get(notice.id)
+        if arc is not None:
+            if arc.come(notice, clock.now()):
+                del self.book.expected[arc.id]
+                self.book.enter(arc)
+                self.book.wake(arc)
+                self.came.set()
+                asyncio.get_running_loop().call_later(CLAIM, self._unwanted, arc)
+            return True
+        arc = self.book.moved.get(notice.id)
+        if arc is not None and notice.state == "ended" and notice.outcome != "handed_over":
+            # It was over before it could be handed over: there is nothing to take back.
+            arc.finish(notice.outcome or "lost", notice.reason, clock.now())
+            self.book.wake(arc)
+            self.book.forget(arc)
+            return True
+        return False
+
+    async def claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
+        """The ARC of this name and these needs that is expected, once it has come; None if there is none."""
+        unclaimed = self._unclaimed.values()
+        arc = next((arc for arc in unclaimed if (arc.name, arc.needs) == (name, needs)), None)
+        if arc is None:
+            return None
+        del self._unclaimed[arc.id]
+        try:
+            async with asyncio.timeout(COME):
+                while arc.id in self.book.expected:
+                    await self.book.changed(arc)
+        except TimeoutError:
+            log.warning("%s was not handed over within %g s; it is asked for anew", name, COME)
+        finally:
+            if arc.id in self.book.expected:
+                self.book.forget(arc)
+        return arc if arc.open else None
+
+    def _unwanted(self, arc: OpenArc) -> None:
+        if self._unclaimed.get(arc.id) is arc:
+            del self._unclaimed[arc.id]
+            if arc.open:
+                log.warning("%s was handed over and nobody asked for it: it is given back", arc.name)
+                self._spawn(self.asking.end(arc))
+
+    # The old client
+
+    def resume(self) -> None:
+        self.book.resumed.set()
+        self._spawn(self.asking.ask_all())
+
+    async def hand_over_all(self, to: Sender) -> None:
+        """Hands over all that is queued or running, in one step. Raises RequestRefused: nothing has moved,
+        or, with code `unknown`, nobody could tell."""
+        if self.book.resumed.is_set():
+            raise RuntimeError("pause() the client before it hands over all: it would ask for it again")
+        arcs = sorted(self.book.standing, key=lambda arc: arc.grant is None)
+        if len(arcs) > MAX_OTHERS + 1:
+            raise RequestRefused(
+                Problem("too_many", f"{len(arcs)} ARCs can't be handed over at once; {MAX_OTHERS + 1} can")
+            )
+        try:
+            async with asyncio.timeout(HAND_OVER):
+                await self._hand_over(arcs, to)
+        except TimeoutError:
+            unknown = f"no RCM told within {HAND_OVER:g} s whether {to} has taken over; ask again"
+            raise RequestRefused(Problem("unknown", unknown)) from None
+
+    async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:
+        """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
+        term = self.hearing.term
+        pause, longest = BACKOFF
+        while arcs := [arc for arc in arcs if arc.open]:
+            first, *others = arcs
+            operation = HandOver(id=first.id, to=str(to), others=[arc.id for arc in others])
+            self.hearing.leader_came.clear()
+            replies = await self.mesh.ask(
+                self.asking.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=answered
+            )
+            notices = [reply.message for reply in replies if reply.message is not None]
+            notice = next((notice for notice in notices if self.hearing.believe(notice.term)), None)
+            if notice is not None:
+                # An RCM that came in between answers for the first alone: it may not know of the others.
+                for arc in arcs if notice.term == term else [first]:
+                    self.book.move(arc, notice)
+                continue
+            problem = next((reply.problem for reply in replies if reply.problem is not None), None)
+            if problem is not None and problem.code == "not_running":
+                # It is over, or an RCM that has just taken the lead has not heard of it: this settles which.
+                await self.asking.ask(first)
+            elif problem is not None and problem.code not in TRY_AGAIN:
+                raise RequestRefused(problem)
+            if not await self.hearing.leader_within(pause):
+                pause = min(longest, pause * 2)
+
+    def take_back(self) -> None:
+        """Asks anew for all that was handed over, at its old place: its new client is gone."""
+        arcs = list(self.book.moved.values())
+        for arc in arcs:
+            self.book.take_back(arc, new_instance(), "it was handed over, and its new client is gone")
+        self.resume()
+        for arc in arcs:
+            self.book.wake(arc)
+            self._spawn(self._ask_anew(arc))
+
+    async def _ask_anew(self, arc: OpenArc) -> None:
+        try:
+            await self.asking.submit(arc)
+        except RequestRefused as refused:
+            log.warning("%s is not taken back: %s", arc.name, refused)
+            self.book.wake(arc)
+            self.book.forget(arc)

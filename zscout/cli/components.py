@@ -1,0 +1,253 @@
+"""`zscout components`: what runs where and how it does, and what each host can start."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, ExitStack, suppress
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from zscout import clock
+from zscout.cli import common, offers
+from zscout.cli.look import FIND_LOADS, Look
+from zscout.cli.picture import Picture, Table, print_picture
+from zscout.cli.placing import Placed, component_named, placement_object, tail_of, unknown
+from zscout.cli.watching import pause, show_once, shower
+from zscout.keyexpr import Role
+from zscout.messages import ComponentList, ComponentUse, ListComponents, Placement
+from zscout.scheduling.model import SECOND, Ns
+from zscout.strict import BadInput
+
+if TYPE_CHECKING:
+    from zscout.behaviors.client import Client
+
+ASK_NODES: Final = 1.0
+QUIET: Final = 0.3
+"""Seconds without a new host after which all have been seen."""
+STYLES: Final = {
+    "running": "green",
+    "waiting": "yellow",
+    "backing_off": "yellow",
+    "ended": "dim",
+    "given_up": "red",
+}
+
+
+@click.command()
+@click.argument("name", required=False, shell_complete=offers.components)
+@click.option("--kinds", is_flag=True, help="List what can be started, and on which hosts.")
+@click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
+@common.json_option("Print one JSON object; with --watch, one on each line.")
+def components(name: str | None, kinds: bool, watch: bool, as_json: bool) -> int:
+    """List the components of the fleet: where each runs, since when, what it uses, and why it is there.
+
+    Ended ones are listed for an hour. RESTARTS are those in a row, CORES and MEMORY what it uses with all its
+    processes; MOVES has the time that the last one took. With NAME only that one, and the end of its output
+    where it has failed. Exit code 3: no RCM.
+
+    \b
+    Examples:
+      zscout components
+      zscout components --watch
+      zscout components counter --json | jq -r .components[0].host
+      zscout components --kinds
+    """
+    if kinds and (name is not None or watch):
+        raise BadInput("--kinds lists what can be started; leave NAME and --watch out")
+    if kinds:
+        return common.run(_kinds(as_json=as_json))
+    if name is not None:
+        component_named(name)
+    return common.run(_watch(name, as_json=as_json) if watch else _once(name, as_json=as_json))
+
+
+class Listing:
+    """Components as placer, nodes and load reports tell of them."""
+
+    def __init__(self, client: Client, name: str | None) -> None:
+        self.client, self.name = client, name
+        self.placed = Placed(client, None if name is None else {name})
+        self.look = Look(client)
+        self._began: dict[tuple[str, int], Ns] = {}
+        """When each incarnation that runs was started, on this host's clock."""
+
+    async def find(self) -> None:
+        """All of them, with what they use. Raises NobodyThere; Failed for a name that nobody knows."""
+        await self.placed.look()
+        if self.name is not None and self.name not in self.placed.records:
+            async with AsyncExitStack() as stack:
+                everyone = stack.enter_context(Placed(self.client))
+                await everyone.look()
+            raise unknown(self.name, everyone.records)
+        hosts = {one.host for one in self._running()}
+
+        def told() -> bool:
+            found = [self.look.hosts.get(host or "") for host in hosts]
+            return all(host is not None and (host.load or not host.has(Role.LOAD)) for host in found)
+
+        await self.look.until(told, FIND_LOADS)
+        await self.find_ages()
+
+    async def find_ages(self) -> None:
+        """Asks the nodes since when what runs has run, where that is not known."""
+        running = {(one.component, one.incarnation) for one in self._running()}
+        self._began = {key: began for key, began in self._began.items() if key in running}
+        if running <= self._began.keys():
+            return
+        for told in await ask_nodes(self.client, ListComponents(self.name)):
+            now = clock.now()
+            for view in told.components:
+                key = (view.component, view.incarnation)
+                if key in running:
+                    self._began[key] = now - round(view.uptime * SECOND)
+
+    def picture(self) -> Picture:
+        rows, styles = [], []
+        for one in self._all():
+            use, up = self._use(one), self._uptime(one)
+            rows.append(
+                (
+                    one.component,
+                    one.spec.kind,
+                    one.state.replace("_", " "),
+                    f"{one.host or '-'} > {one.to}" if one.to is not None else one.host or "-",
+                    "-" if up is None else common.span(up),
+                    str(one.restarts),
+                    str(one.moves) + (f" ({one.dead * 1000:.0f} ms)" if one.dead is not None else ""),
+                    "-" if use is None else f"{use.cpu:.2f}",
+                    "-" if use is None else f"{use.memory / 2**20:.0f} MiB",
+                    one.reason,
+                )
+            )
+            styles.append(STYLES.get(one.state, ""))
+        columns = ("NAME", "KIND", "STATE", "HOST", "UP", "RESTARTS", "MOVES", "CORES", "MEMORY", "WHY")
+        table = Table("Components", columns, rows, styles, ("KIND", "RESTARTS", "MOVES"))
+        return Picture(self._headline(), [table])
+
+    def as_object(self) -> dict[str, Any]:
+        """What `--json` prints: `cpu` in cores, `memory` in bytes, spans in seconds."""
+        found = []
+        for one in self._all():
+            use = self._use(one)
+            found.append(
+                placement_object(one)
+                | {
+                    "uptime": self._uptime(one),
+                    "cpu": None if use is None else use.cpu,
+                    "memory": None if use is None else use.memory,
+                    "processes": None if use is None else use.processes,
+                }
+            )
+        return {
+            "fleet": self.client.fleet.name,
+            "components": found,
+            "cordoned": sorted(self.placed.cordoned),
+        }
+
+    def _headline(self) -> str:
+        running = self._running()
+        hosts = len({one.host for one in running})
+        on = f" on {hosts} host{'' if hosts == 1 else 's'}" if running else ""
+        cordoned = f"; cordoned: {', '.join(sorted(self.placed.cordoned))}" if self.placed.cordoned else ""
+        return f"Fleet {self.client.fleet.name}: {len(running)} of {len(self._all())} run{on}{cordoned}"
+
+    def _all(self) -> list[Placement]:
+        return [one for _, one in sorted(self.placed.records.items())]
+
+    def _running(self) -> list[Placement]:
+        return [one for one in self._all() if one.state in ("running", "moving")]
+
+    def _use(self, one: Placement) -> ComponentUse | None:
+        host = self.look.hosts.get(one.host or "")
+        if host is None or host.load is None or self.look.stale(host):
+            return None
+        uses = (use for use in host.load.components if use.component == one.component)
+        return next((use for use in uses if use.incarnation == one.incarnation), None)
+
+    def _uptime(self, one: Placement) -> float | None:
+        began = self._began.get((one.component, one.incarnation))
+        return None if began is None else (clock.now() - began) / SECOND
+
+
+async def ask_nodes(client: Client, asked: ListComponents) -> list[ComponentList]:
+    """What the nodes tell that answer in time, by host."""
+    replies = await client.mesh.ask(client.mesh.keys.component_any, asked, ComponentList, timeout=ASK_NODES)
+    told = (reply.message for reply in replies if reply.message is not None)
+    return sorted(told, key=lambda one: one.host)
+
+
+async def _once(name: str | None, *, as_json: bool) -> int:
+    async with common.connected("components") as client:
+        listing = Listing(client, name)
+        with listing.placed:
+            await listing.find()
+        show_once(listing, as_json=as_json)
+        if name is not None and not as_json and (tail := tail_of(listing.placed.records[name])):
+            common.print_line("\nThe end of its output:")
+            for line in tail:
+                common.print_line(line)
+    return 0
+
+
+async def _watch(name: str | None, *, as_json: bool) -> int:
+    stop = asyncio.Event()
+    async with AsyncExitStack() as stack:
+        client = await stack.enter_async_context(common.connected("components"))
+        listing = Listing(client, name)
+        placed = stack.enter_context(listing.placed)
+        stack.callback(listing.look.close)
+        await listing.find()
+
+        def end() -> None:
+            stop.set()
+            placed.changed.set()
+
+        show = shower(stack, as_json=as_json, end=end)
+        while not stop.is_set():
+            show(listing)
+            await pause(placed.changed, stop)
+            # Without a leader what was known last is shown on.
+            await placed.glance()
+            await listing.find_ages()
+    return 0
+
+
+async def _kinds(*, as_json: bool) -> int:
+    async with common.connected("components", need_rcm=False) as client:
+        with suppress(common.NobodyThere):
+            await common.see_rcm(client)
+        with ExitStack() as stack:
+            look = Look(client)
+            stack.callback(look.close)
+            await seen_all(look)
+        told = await ask_nodes(client, ListComponents())
+        fleet = client.fleet.name
+    if not told:
+        raise common.NobodyThere(
+            f"no host of fleet {fleet} told what it can start; start zscout-node there, or see its log"
+        )
+    if as_json:
+        hosts = [{"host": one.host, "kinds": sorted(one.kinds)} for one in told]
+        common.print_json({"fleet": fleet, "hosts": hosts})
+        return 0
+    kinds = sorted({kind for one in told for kind in one.kinds})
+    rows = [(kind, ", ".join(one.host for one in told if kind in one.kinds)) for kind in kinds]
+    nothing = [one.host for one in told if not one.kinds]
+    without = f"; nothing on {', '.join(nothing)}" if nothing else ""
+    print_picture(
+        Picture(
+            f"Fleet {fleet}: {len(kinds)} kinds can be started{without}",
+            [Table("Kinds", ("KIND", "ON"), rows, [""] * len(rows))],
+        )
+    )
+    return 0
+
+
+async def seen_all(look: Look) -> None:
+    """Returns when no host has come into sight for a while: links are made one after another."""
+    deadline = clock.now() + round(FIND_LOADS * SECOND)
+    while clock.now() < deadline:
+        known = set(look.hosts)
+        if not await look.until(lambda known=known: set(look.hosts) != known, QUIET):  # type: ignore[misc]
+            return
