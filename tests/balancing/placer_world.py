@@ -77,13 +77,19 @@ class Host:
     name: HostName
     up: bool = True
     cut_off: bool = False
+    frozen: bool = False
+    """Its node does not move, and what it started does."""
     procs: dict[tuple[ComponentId, Incarnation], Proc] = field(default_factory=dict)
     heard_at: dict[str, Ns] = field(default_factory=dict)
     """When the last news of each of its tokens arrives: they do not overtake each other."""
 
     @property
-    def there(self) -> bool:
+    def linked(self) -> bool:
         return self.up and not self.cut_off
+
+    @property
+    def there(self) -> bool:
+        return self.linked and not self.frozen
 
     def of(self, component: ComponentId) -> list[Proc]:
         return [one for (name, _), one in self.procs.items() if name == component]
@@ -168,6 +174,7 @@ class World:
             if host.there:
                 self._report_now(host)
                 self.token(host, "node", partial(self._seen, host))
+            if host.linked:
                 for proc in host.procs.values():
                     if proc.token:
                         self._appear(host, proc)
@@ -300,7 +307,7 @@ class World:
     def activate(self, host: Host, proc: Proc) -> None:
         """It runs, and says so; what is lower and sees that, ends itself."""
         proc.phase, proc.token = "running", True
-        if host.there:
+        if host.linked:
             self._appear(host, proc)
         self.supersede(proc.component)
 
@@ -311,7 +318,7 @@ class World:
         running = [(host, one) for host in self.hosts.values() for one in host.of(component) if one.token]
         for host, one in running:
             if any(
-                other.incarnation > one.incarnation and (there is host or (there.there and host.there))
+                other.incarnation > one.incarnation and (there is host or (there.linked and host.linked))
                 for there, other in running
             ):
                 self.end(host, one, "superseded")
@@ -377,7 +384,7 @@ class World:
         proc.phase, proc.ended = "ended", how
         if proc.token:
             proc.token = False
-            if host.there:
+            if host.linked:
                 self._vanish(host, proc)
 
     # Tokens
@@ -398,26 +405,30 @@ class World:
 
     # What befalls hosts
 
-    def go(self, host: Host, *, dies: bool) -> None:
-        """It dies with all that it has, or is cut off from the mesh."""
+    def go(self, host: Host, how: Literal["dies", "is cut off", "freezes"]) -> None:
+        """It dies with all that it has, is cut off from the mesh, or its node moves no more."""
         if not host.there:
             return
-        for proc in host.procs.values():
-            if proc.token:
-                self._vanish(host, proc, self.rng.randrange(LEASE))
+        if how != "freezes":
+            for proc in host.procs.values():
+                if proc.token:
+                    self._vanish(host, proc, self.rng.randrange(LEASE))
         self.token(host, "node", lambda: self.send(HostLost(host.name)), self.rng.randrange(LEASE))
-        if dies:
+        if how == "dies":
             host.up, host.procs = False, {}
+        elif how == "freezes":
+            host.frozen = True
         else:
             host.cut_off = True
 
     def come(self, host: Host) -> None:
         if host.there:
             return
-        host.up, host.cut_off = True, False
+        unheard = not host.linked
+        host.up, host.cut_off, host.frozen = True, False, False
         self.token(host, "node", lambda: self._seen(host))
         for proc in host.procs.values():
-            if proc.token:
+            if proc.token and unheard:
                 self._appear(host, proc)
                 self.supersede(proc.component)
 

@@ -28,8 +28,8 @@ OPS = (
     "complete",
     "drain",
     "uncordon",
-    *["host dies", "host is cut off"],
-    *["host is back"] * 3,
+    *["dies", "is cut off", "freezes"],
+    *["is back"] * 3,
     "leader",
     *["time"] * 6,
 )
@@ -74,9 +74,9 @@ class Chaos:
             case "crash" | "complete" if running:
                 there, one = rng.choice(running)
                 world.end(there, one, "failed" if op == "crash" else "completed")
-            case "host dies" | "host is cut off":
-                world.go(host, dies=op == "host dies")
-            case "host is back":
+            case "dies" | "is cut off" | "freezes":
+                world.go(host, op)
+            case "is back":
                 world.come(host)
             case "leader":
                 world.new_leader()
@@ -97,7 +97,7 @@ class Chaos:
         world = self.world
         world.loss = world.failing = 0
         for host in world.hosts.values():
-            if host.cut_off or self.rng.random() < 0.7:
+            if host.up or self.rng.random() < 0.7:
                 world.come(host)
         world.run(world.now + SETTLING + STANDS_BY)
 

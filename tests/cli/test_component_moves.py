@@ -160,6 +160,9 @@ def test_followed_output_begins_when_the_component_does(fleet: CliFleet) -> None
 
 def test_followed_output_goes_over_when_a_host_dies(fleet: CliFleet) -> None:
     clamp = fleet.lab.node("clamp")
+    # From now on it is known to the balancer.
+    start(fleet, "first", "--host", "clamp")
+    stop(fleet, "first")
     hosts = ("--host", "clamp", "--host", "bellows")
     if start(fleet, "survivor", "--set", "period=0.02", *hosts) != "clamp":
         assert fleet.zscout("migrate", "survivor").returncode == 0

@@ -35,7 +35,6 @@ ODD = {
     "parent": "Parent",
     "never": "Never",
     "restless": "Restless",
-    "homesick": "Homesick",
     "no-component": "NO_COMPONENT",
 }
 
@@ -100,7 +99,10 @@ class Hosts:
         memory_limit: int = 0,
         cpu_limit: float = 0.0,
     ) -> ComponentView:
-        spec = ComponentSpec(kind, params or {}, memory_limit=memory_limit, cpu_limit=cpu_limit)
+        # The placer beside the leading RCM adopts what it sees; it is to leave alone what ends here.
+        spec = ComponentSpec(
+            kind, params or {}, restart="never", memory_limit=memory_limit, cpu_limit=cpu_limit
+        )
         return await self.get(host, StartComponent(component, incarnation, spec, standby), ComponentView)
 
     async def stop(self, host: str, component: str, grace: float = 5.0) -> ComponentView:
@@ -127,6 +129,20 @@ class Hosts:
                     await asyncio.sleep(0.02)
         except TimeoutError:
             raise AssertionError(f"{component} wrote only {text!r}") from None
+
+
+async def counts(hosts: Hosts, host: str) -> list[int]:
+    """What the component "c" has counted on a host, as far as it is kept."""
+    text = (await hosts.get(host, ReadOutput("c"), Output)).text
+    return [int(line) for line in text.splitlines() if line.isdecimal()]
+
+
+async def counts_on(hosts: Hosts, host: str) -> None:
+    """Waits until it goes on counting there."""
+    last = max(await counts(hosts, host), default=0)
+    async with asyncio.timeout(START):
+        while max(await counts(hosts, host), default=0) <= last + 2:  # noqa: ASYNC110 - asked each time
+            await asyncio.sleep(0.02)
 
 
 async def gone(*pids: int) -> None:

@@ -12,7 +12,6 @@ from contextlib import suppress
 from typing import Any
 
 from zscout.components.component import Component, Stage
-from zscout.components.shipped import Counter
 from zscout.messages import MAX_CHECKPOINT
 
 MEGABYTE = 1_000_000
@@ -128,23 +127,6 @@ class Restless(Component):
     def restore(self, state: bytes) -> None:
         if self.broken:
             raise ValueError("this state is rotten")
-
-
-class Homesick(Counter):
-    """Counts as `counter` does, but fails wherever it was moved to."""
-
-    def __init__(self, params: dict[str, Any]) -> None:
-        super().__init__(params)
-        self.at_home = True
-
-    async def run(self, stage: Stage) -> None:
-        if not self.at_home:
-            raise RuntimeError("it is not nice here")
-        await super().run(stage)
-
-    def restore(self, state: bytes) -> None:
-        super().restore(state)
-        self.at_home = False
 
 
 TOO_LARGE = MAX_CHECKPOINT + 1

@@ -32,7 +32,7 @@ from zscout.messages import (
     StopComponent,
 )
 
-COUNTER = ComponentSpec("counter", {"period": 0.02})
+COUNTER = ComponentSpec("counter", {"period": 0.02}, restart="never")
 
 
 def test_a_component_is_started_once_listed_read_checkpointed_and_stopped(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_what_a_node_does_not_do_it_refuses_with_the_reason(tmp_path: Path) -> N
             hosts = Hosts(await lab.client())
 
             def start(name: str, incarnation: int, kind: str = "still") -> StartComponent:
-                return StartComponent(name, incarnation, ComponentSpec(kind))
+                return StartComponent(name, incarnation, ComponentSpec(kind, restart="never"))
 
             assert await hosts.refused("a", start("x", 1, "nothing")) == "unknown_kind"
             assert await hosts.refused("a", start("x y", 1)) == "bad_request"

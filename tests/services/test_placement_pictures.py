@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from tests.services.placed_hour import play
-from tests.services.test_viewer_picture import DIMMED, WIDTH, Rgb, near, rgb, settled_picture, viewer
+from tests.services.test_viewer_picture import DIMMED, WIDTH, Rgb, rgb, settled_picture, viewer
 from zscout.balancing.model import POLICIES
 from zscout.balancing.study import SCENARIOS, study
 from zscout.messages import Placements
@@ -24,14 +25,9 @@ STUDY = 0.74
 
 
 def pixels(picture: Image.Image, colour: Rgb) -> list[tuple[int, int]]:
-    """Where this colour is."""
-    raw = picture.tobytes()
-    width = picture.width
-    return [
-        ((at // 3) % width, at // 3 // width)
-        for at in range(0, len(raw), 3)
-        if near((raw[at], raw[at + 1], raw[at + 2]), colour)
-    ]
+    """Where this colour is: x and y."""
+    off = np.abs(np.asarray(picture, np.int16) - np.array(colour, np.int16)).max(axis=2)
+    return [(int(x), int(y)) for y, x in np.argwhere(off <= 3)]
 
 
 def test_an_hour_of_placements_at_a_glance(tmp_path: Path) -> None:
@@ -57,8 +53,9 @@ def test_an_hour_of_placements_at_a_glance(tmp_path: Path) -> None:
         assert len(columns) > 0.5 * curves.width
     for colour, _ in MARKS.values():
         assert len(pixels(curves, rgb(colour))) > 8
-    (given_up,) = {x // 40 for x, _ in pixels(curves, rgb(FAILED))} or {0}
-    assert abs(given_up * 40 / curves.width - 2600 / 3600) < 0.06
+    cross = [x for x, _ in pixels(curves, rgb(FAILED))]
+    assert max(cross) - min(cross) < 20
+    assert abs(min(cross) / curves.width - 2600 / 3600) < 0.04
 
 
 def test_words_that_the_viewer_can_t_draw_do_not_end_it(tmp_path: Path) -> None:
@@ -78,7 +75,7 @@ def test_words_that_the_viewer_can_t_draw_do_not_end_it(tmp_path: Path) -> None:
 
 def test_the_study_s_plots_show_all_and_compare(tmp_path: Path) -> None:
     path = tmp_path / "study.rrd"
-    report, outcomes = study([1], lambda: None)
+    report, outcomes = study([1])
     record(path, report, outcomes)
     panes = len(SCENARIOS) * len(POLICIES) + 1
     with viewer(path, tmp_path, panes=panes, height=HEIGHT) as client:
@@ -99,6 +96,8 @@ def test_the_study_s_plots_show_all_and_compare(tmp_path: Path) -> None:
     # 12 components on one host come to a load of 6, a third of them to 2: on one scale.
     assert heights[0] > 0.85
     assert 0.25 < heights[1] < 0.5
-    # Each of the 12 is marked, with 4 on each of the hosts.
-    marks = [pixels(even.crop((0, 0, even.width // 10, even.height)), rgb(colour)) for colour in COLOURS]
-    assert all(len(found) > 50 for found in marks)
+    # Most of the 12 marks stand clear of the curves, about as many of each host.
+    stack = even.crop(
+        (even.width // 100, round(even.height * 0.57), even.width // 12, round(even.height * 0.88))
+    )
+    assert all(len(pixels(stack, rgb(colour))) > 40 for colour in COLOURS)

@@ -29,6 +29,8 @@ from tests.services.paper_run import (
     rows,
     second_by_second,
 )
+from zscout.services import host_pane
+from zscout.services import lanes as lanes_module
 from zscout.services import timeline as module
 from zscout.services.blueprint import LINES, OPERATOR, PALETTE, STATES, save_blueprint
 from zscout.services.timeline import OPERATOR_MARK, Holder, Timeline, TimelineError
@@ -157,7 +159,7 @@ def test_what_does_not_change_is_not_written_again(tmp_path: Path) -> None:
 def test_names_past_the_limit_are_noted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_ARCS", 3)
     monkeypatch.setattr(module, "MAX_RCS", 2)
-    monkeypatch.setattr(module, "MAX_HOSTS", 1)
+    monkeypatch.setattr(host_pane, "MAX_HOSTS", 1)
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         for number in range(6):
@@ -187,15 +189,15 @@ def test_hostile_names_and_texts_are_tamed(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         timeline.arc(0, "../a b\n/\x00/" + "x" * 1000, "waiting", "because\n\x1b[31mof " + "y" * 1000)
-        timeline.event(0, "one\ntwo\x07 " + "z" * 10_000, "SHOUT")
+        timeline.event(0, "one\ntwo\x07 \u65e5\u2716 é " + "z" * 10_000, "SHOUT")
         timeline.load(0, "anvil", math.nan, math.inf)
         timeline.load(1, "anvil", 0.5, 0.25)
     ((lane, changes),) = lanes(path, "/arc/**").items()
     assert lane == "/arc/../a_b_/_/" + "x" * 64
     assert changes[0][1][0].startswith("waiting · because [31mof yyy")
-    assert len(changes[0][1][0]) == module.MAX_STATE
+    assert len(changes[0][1][0]) == lanes_module.MAX_STATE
     (text,) = events(path)
-    assert text.startswith("one two zzz")
+    assert text.startswith("one two ?? é zzz")
     assert len(text) == module.MAX_EVENT
     assert [value for _, _, value in rows(path, "/load/**", "Scalars:scalars")] == [[0.5]]
     assert [value for _, _, value in rows(path, "/cpu/**", "Scalars:scalars")] == [[0.25]]

@@ -53,6 +53,8 @@ class Entry:
     spec: Spec
     state: State = "waiting"
     incarnation: Incarnation = 0
+    past: bool = False
+    """That incarnation is of what was placed before under this name, and must not live."""
     host: HostName | None = None
     wanted: bool = True
     reason: str = ""

@@ -4,25 +4,19 @@ truth. Of two that live the higher is; the lower is told to stop.
 
 from __future__ import annotations
 
-from typing import Final
-
 from zscout.balancing.entry import Entry, Fate
-from zscout.balancing.ground import ANSWER, Ground
+from zscout.balancing.ground import Ground
+from zscout.balancing.inquiries import Inquiries
 from zscout.balancing.keeping import GRACE, Keeper
 from zscout.balancing.model import ComponentId, HostName
 from zscout.balancing.moving import Mover
 from zscout.balancing.placing import HostTold, Incarnation, Record, Seen
 
-LOOKS: Final = 3
-"""A host is asked so often of what runs there and nobody knows."""
-MAX_STRANGERS: Final = 1_000
-
 
 class Hearing:
     def __init__(self, ground: Ground, keeper: Keeper, mover: Mover) -> None:
         self.ground, self.strays, self.keeper, self.mover = ground, keeper.strays, keeper, mover
-        self._strangers: dict[ComponentId, tuple[HostName, int]] = {}
-        """Whose token was seen and of which nothing is known; and how often its host was asked."""
+        self.inquiries = Inquiries(ground)
 
     # Tokens
 
@@ -33,12 +27,12 @@ class Hearing:
             return
         ground.heard(component, incarnation)
         if entry is None:
-            self._stranger(component, host)
+            self.inquiries.add(host, component)
         elif incarnation in entry.over:
             pass
         elif (move := entry.move) is not None and incarnation == move.incarnation:
             self.mover.target_appeared(entry, move)
-        elif incarnation != entry.incarnation:
+        elif incarnation != entry.incarnation or entry.past:
             self._other(entry, incarnation, host, token=True)
         elif entry.state in ("ended", "given_up"):
             self.strays.add(component, incarnation, host)
@@ -52,8 +46,6 @@ class Hearing:
         ground = self.ground
         entry = ground.entry(component)
         if entry is None:
-            if self._strangers.get(component, ("", 0))[0] == host:
-                self._forget_stranger(component)
             return
         move = entry.move
         if incarnation == entry.incarnation and host == entry.host:
@@ -78,7 +70,8 @@ class Hearing:
         ground = self.ground
         if self.strays.has(entry.component, incarnation):
             return
-        if incarnation < entry.incarnation or entry.state in ("stopping", "ended", "given_up"):
+        stopped = entry.state in ("stopping", "ended", "given_up")
+        if stopped or incarnation < entry.incarnation + entry.past:
             self.strays.add(entry.component, incarnation, host)
             return
         if host not in ground.alive:
@@ -88,7 +81,7 @@ class Hearing:
         self.mover.cancel(entry)
         ground.left(entry)
         entry.incarnation, entry.host, entry.token, entry.told = incarnation, host, token, False
-        entry.start_until, entry.state = None, "starting"
+        entry.start_until, entry.state, entry.past = None, "starting", False
         entry.why = f"found running on {host}"
         self.keeper.runs(entry)
 
@@ -96,6 +89,7 @@ class Hearing:
 
     def told(self, told: HostTold) -> None:
         """A host's list, or of one component what it knows."""
+        self.inquiries.answered(told.host, told.only)
         for seen in told.components:
             if told.only is None or seen.component == told.only:
                 self._seen(told.host, seen)
@@ -130,7 +124,7 @@ class Hearing:
             pass
         elif (move := entry.move) is not None and seen.incarnation == move.incarnation:
             self.mover.told_target(entry, move, runs=seen.running, stands_by=seen.standby)
-        elif seen.incarnation == entry.incarnation:
+        elif seen.incarnation == entry.incarnation and not entry.past:
             self._seen_alive(entry, host, seen)
         elif not seen.standby:
             self._other(entry, seen.incarnation, host, token=False)
@@ -143,7 +137,6 @@ class Hearing:
         entry = ground.new_entry(seen.component, seen.spec)
         if entry is None:
             return
-        self._forget_stranger(seen.component)
         entry.incarnation, entry.host, entry.state = seen.incarnation, host, "starting"
         entry.movable, entry.told, entry.why = seen.movable, seen.running, f"found running on {host}"
         if seen.running:
@@ -180,7 +173,7 @@ class Hearing:
         elif (move := entry.move) is not None and incarnation == move.incarnation:
             entry.over.append(incarnation)
             self.mover.target_ended(entry, move, f"what stood by there has ended: {fate.reason or fate.how}")
-        elif incarnation != entry.incarnation or entry.state in ("ended", "given_up"):
+        elif incarnation != entry.incarnation or entry.past or entry.state in ("ended", "given_up"):
             pass
         elif move is not None:
             self.mover.source_ended(entry, move, fate)
@@ -221,6 +214,7 @@ class Hearing:
         ground.alive.add(host)
         ground.rested[host] = ground.now
         ground.drain_soon(host)
+        self.inquiries.seen(host)
         for entry in ground.entries.values():
             if entry.state == "waiting":
                 ground.wake(entry, max(ground.now, entry.retry_at))
@@ -231,17 +225,18 @@ class Hearing:
                 ground.wake(entry, ground.now + GRACE)
 
     def lost(self, host: HostName) -> None:
+        """What it had is gone with it. If its node was only silent it is there still, and no token need tell:
+        the host is asked of all that when it is back."""
         ground = self.ground
         ground.alive.discard(host)
         ground.rested.pop(host, None)
         ground.departed.pop(host, None)
         for component in self.strays.lost(host):
+            self.inquiries.add(host, component)
             self.keeper.stray_over(component)
-        for component, (where, _) in list(self._strangers.items()):
-            if where == host:
-                self._forget_stranger(component)
         for entry in self._there(host):
             ground.touch(entry.component)
+            self.inquiries.add(host, entry.component)
             move = entry.move
             if move is not None and move.to == host:
                 self.mover.target_host_lost(entry, move)
@@ -284,23 +279,3 @@ class Hearing:
             ground.ended(entry)
         else:
             ground.wake(entry, entry.retry_at)
-
-    # Strangers
-
-    def _stranger(self, component: ComponentId, host: HostName) -> None:
-        if len(self._strangers) < MAX_STRANGERS:
-            self._strangers[component] = (host, 0)
-            self.stranger_woke(component)
-
-    def stranger_woke(self, component: ComponentId) -> None:
-        host, asked = self._strangers.get(component, ("", LOOKS))
-        if asked >= LOOKS:
-            self._forget_stranger(component)
-            return
-        self._strangers[component] = (host, asked + 1)
-        self.ground.look(component, host)
-        self.ground.timers.set(("stranger", component), self.ground.now + ANSWER)
-
-    def _forget_stranger(self, component: ComponentId) -> None:
-        self._strangers.pop(component, None)
-        self.ground.timers.set(("stranger", component), None)

@@ -42,6 +42,7 @@ class Keeper:
         elif entry.state in ("ended", "given_up"):
             ground.revived(entry)
             self._anew(entry, spec)
+            entry.past = True
             self.again(entry)
         elif not entry.wanted:
             # It is being stopped; what is asked for now comes after that.
@@ -125,7 +126,7 @@ class Keeper:
     def _start(self, entry: Entry, ranked: Ranked) -> None:
         ground = self.ground
         entry.incarnation = ground.fresh(entry.component)
-        entry.host, entry.state = ranked.host, "starting"
+        entry.host, entry.state, entry.past = ranked.host, "starting", False
         entry.since, entry.token, entry.told, entry.looked, entry.asks = None, False, False, False, 0
         entry.why = f"{entry.cause}; here: {ranked.reason}" if entry.cause else ranked.reason
         entry.reason = entry.why
@@ -296,6 +297,7 @@ class Keeper:
         if entry.host is not None or self.strays.any(entry.component):
             return
         if entry.wanted:
+            entry.past = True
             self.again(entry)
         else:
             self._finish(entry, "ended", "stopped")

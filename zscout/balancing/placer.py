@@ -24,6 +24,7 @@ from zscout.balancing.balancer import Balancer
 from zscout.balancing.draining import Drain
 from zscout.balancing.ground import DRAIN, Ground
 from zscout.balancing.hearing import Hearing
+from zscout.balancing.inquiries import KIND as INQUIRY
 from zscout.balancing.keeping import Keeper
 from zscout.balancing.model import ComponentId, Ns
 from zscout.balancing.moving import Mover
@@ -182,8 +183,8 @@ class Placer:
             self._rebalance.run()
         elif kind == "strays":
             self._strays.woke(name)
-        elif kind == "stranger":
-            self._hearing.stranger_woke(name)
+        elif kind == INQUIRY:
+            self._hearing.inquiries.woke(name)
         elif (entry := self._ground.entry(name)) is not None:
             if kind == "move" and entry.move is not None:
                 self._mover.woke(entry, entry.move)

@@ -45,7 +45,9 @@ class Life:
         self._restored = asyncio.Event()
         self._activated = asyncio.Event()
         self._left = asyncio.Event()
-        """It is over here without an end of its own: handed over, or superseded and still not done."""
+        """It is over here, whatever run() does: another one goes on."""
+        self._away: Ends | None = None
+        """How, once that is so."""
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def run(self) -> Ends:
@@ -57,9 +59,10 @@ class Life:
         await asyncio.wait({story, left}, return_when=asyncio.FIRST_COMPLETED)
         if left.done():
             # run() stays where it is: to unwind it would give up what another one holds now.
+            ends = self._away or Ends("moved")
             if self._client is not None:
                 await self._client.leave()
-            return self._wanted or Ends("moved")
+            return ends
         left.cancel()
         try:
             ends = story.result()
@@ -240,7 +243,7 @@ class Life:
                     traceback.print_exc()
                 await self._decline(order.number, refused.code, str(refused))
                 return
-            self._wanted = None
+            self._away = Ends("moved")
             await self._tell(channel.Gone(order.number, dead))
             self._left.set()
 
@@ -283,7 +286,9 @@ class Life:
             self._superseded(incarnation, token.host)
 
     def _superseded(self, incarnation: int, host: str) -> None:
-        self.end(Ends("superseded", f"incarnation {incarnation} runs on {host}"))
+        ends = Ends("superseded", f"incarnation {incarnation} runs on {host}")
+        self._away = self._away or ends
+        self.end(ends)
         asyncio.get_running_loop().call_later(SUPERSEDED, self._left.set)
 
     def _spawn(self, coroutine: Coroutine[Any, Any, None]) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections import OrderedDict
 from collections.abc import Coroutine
+from contextlib import suppress
 from typing import Any, Final
 
 import msgspec
@@ -46,6 +47,8 @@ MAX_UNDERWAY: Final = 512
 """Operations at one time."""
 MAX_KINDS: Final = 256
 """That are told of."""
+MAKE_WAY: Final = 5.0
+"""Seconds that an incarnation on its way out has until the next one is refused."""
 GRACE: Final = 2.0
 """Seconds that components have to end when their node does."""
 
@@ -143,12 +146,22 @@ class ComponentHost:
                 return process.view()
 
     async def _start(self, start: StartComponent) -> msgspec.Struct:
+        before = self._living.get(start.component)
+        if before is not None and before.leaving and start.incarnation > before.start.incarnation:
+            # It went elsewhere, or is being stopped: what comes back may be here before it has ended.
+            with suppress(TimeoutError):
+                async with asyncio.timeout(MAKE_WAY):
+                    await before.over.wait()
         process = self._same(start) or await self._launch(start)
         await process.settled.wait()
         return process.view()
 
     async def _launch(self, start: StartComponent) -> ComponentProcess:
         self._check(start)
+        before = self._living.get(start.component)
+        if before is not None:
+            # It may have moved away, or failed, and not be quite gone.
+            await before.over.wait()
         kinds = await asyncio.to_thread(installed)
         # Another one may have asked meanwhile.
         process = self._same(start)
@@ -171,10 +184,9 @@ class ComponentHost:
         while len(self._known) > MAX_PLACED:
             self._known.popitem(last=False)
         self._ended.pop(name, None)
-        process = ComponentProcess(self.mesh.me.host, self._fleet, self._limits, start, where)
+        process = ComponentProcess(self.mesh.me.host, self._fleet, self._limits, start, where, self._see_off)
         self._living[name] = process
         process.begin()
-        self._spawn(self._see_off(process))
         log.info("starts %s.%d (%s)", name, start.incarnation, start.spec.kind)
         return process
 
@@ -187,7 +199,7 @@ class ComponentHost:
         known = self._known.get(name, 0)
         if start.incarnation <= known:
             raise Refused("old_incarnation", f"{name} was started here as incarnation {known} already")
-        if name in self._living:
+        if process is not None and name in self._living and not process.leaving:
             raise Refused("runs_already", f"incarnation {known} of {name} lives here; stop it first")
         return None
 
@@ -231,8 +243,7 @@ class ComponentHost:
             raise Refused(code, f"{component} is here as incarnation {own}, not {incarnation}")
         return process
 
-    async def _see_off(self, process: ComponentProcess) -> None:
-        await process.over.wait()
+    def _see_off(self, process: ComponentProcess) -> None:
         name = process.start.component
         del self._living[name]
         self._ended[name] = process

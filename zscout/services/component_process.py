@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
@@ -45,11 +46,20 @@ SLACK: Final = 5.0
 
 
 class ComponentProcess:
-    """One incarnation of a component. `where` is the kind's `module:class`; `fleet` how a child joins."""
+    """One incarnation of a component. `where` is the kind's `module:class`; `fleet` how a child joins;
+    `on_over` is called once, when it has ended."""
 
-    def __init__(self, host: str, fleet: Fleet, limits: Limits, start: StartComponent, where: str) -> None:
+    def __init__(
+        self,
+        host: str,
+        fleet: Fleet,
+        limits: Limits,
+        start: StartComponent,
+        where: str,
+        on_over: Callable[[ComponentProcess], None],
+    ) -> None:
         self._host, self._fleet, self._limits = host, fleet, limits
-        self.start, self._where = start, where
+        self.start, self._where, self._on_over = start, where, on_over
         self.phase: Phase = "starting"
         self.ended: HowEnded | None = None
         self.reason = ""
@@ -70,6 +80,8 @@ class ComponentProcess:
         self._verdict: Ends | None = None
         """How it ends if it is this node that ends it."""
         self._last_word: Ends | None = None
+        self._gone = False
+        """Its process is no more, but not everything of it is cleared up."""
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
         self._number = 0
         self._moving: tuple[MoveComponent, asyncio.Task[Moved]] | None = None
@@ -79,6 +91,11 @@ class ComponentProcess:
     def pid(self) -> int | None:
         """Of its process, until that was waited for."""
         return self._child.pid if self._child is not None and self._child.returncode is None else None
+
+    @property
+    def leaving(self) -> bool:
+        """Whether it will have ended before long, of itself or because it was told to."""
+        return self.phase == "stopping" or self.moved is not None or self._gone or self._last_word is not None
 
     def begin(self) -> None:
         self._task = asyncio.get_running_loop().create_task(self._live())
@@ -101,6 +118,11 @@ class ComponentProcess:
         )
 
     # Orders. Each raises Refused.
+
+    @property
+    def leaving(self) -> bool:
+        """Whether it will end, and soon."""
+        return self.phase == "stopping" or self.moved is not None
 
     async def stop(self, grace: float) -> None:
         """Returns when it has ended: by itself within `grace` seconds, or killed."""
@@ -237,6 +259,7 @@ class ComponentProcess:
         hearing = loop.create_task(self._hear(stream))
         try:
             await gone.wait()
+            self._gone = True
             # What it said last is on its way.
             with suppress(TimeoutError):
                 async with asyncio.timeout(LINGER):
@@ -325,6 +348,7 @@ class ComponentProcess:
         for waiting in self._waiting.values():
             if not waiting.done():
                 waiting.set_exception(Refused("move_failed", f"it has ended, {words}"))
+        self._on_over(self)
         for event in (self.settled, self.running, self.over):
             event.set()
 
