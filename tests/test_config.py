@@ -146,11 +146,20 @@ BAD_FLEETS = {
 ROBOT = '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
 RADIO = '[[rc]]\nname = "radio/r"\ndriver = "capacity"\n'
 
+BAD_PLACEMENTS = {
+    "[placement]\nback_off = 0": "placement.back_off: is 0 s; write 0.05 to 3600 seconds",
+    "[placement]\ngain = 0": "placement.gain: is 0; write a number from 0.05 to 100",
+    '[placement]\nrebalance = "yes"': 'placement.rebalance: is the text "yes"; write true or false',
+}
+BAD_FLEETS |= BAD_PLACEMENTS
 BAD_NODES = {
     '[node]\nhots = "a"': "node.hots: unknown key; did you mean host?",
     '[node]\nhost = "a/b"': f'node.host: "a/b" is not a name; {NAME_RULE}',
     '[node]\nhost = ""': f'node.host: "" is not a name; {NAME_RULE}',
-    '[node]\nload = "yes"': 'node.load: is the text "yes"; write true or false',
+    '[node]\nload = "yes"': 'node.load: is the text "yes"; write true, false or "tree"',
+    "[node]\nload = 1": 'node.load: is 1; write true, false or "tree"',
+    '[components]\nkinds = ["a b"]': f'components.kinds[0]: "a b" is not a name; {NAME_RULE}',
+    "[components]\nmax = 0": "components.max: is 0; write a whole number from 1 to 256",
     "[node]\nfleet = 1": "node.fleet: is 1; write a text in quotes",
     '[node]\nlabels = "gpu"': 'node.labels: is the text "gpu"; write a list',
     '[node]\nlabels = ["gpu", "a b"]': f'node.labels[1]: "a b" is not a name; {NAME_RULE}',

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from dataclasses import replace
 from decimal import Decimal
@@ -11,9 +12,11 @@ import msgspec
 import pytest
 
 from zscout.behaviors.arc import Held, Revoked
+from zscout.behaviors.book import Book
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import OpenArc
-from zscout.messages import Amounts, Notice
+from zscout.keyexpr import BadName
+from zscout.messages import Amounts, Notice, OpenRequest
 from zscout.scheduling.model import SECOND, Grant, Place, Term
 
 OLD, TERM = Term(1, "zz"), Term(2, "aa")
@@ -139,3 +142,72 @@ def test_what_was_refused_before_any_hold_is_told_as_well() -> None:
     known.take(notice(1, "ended", outcome="cancelled", reason="cancelled by an operator"), NOW)
     revoked = Revoked(replace(known))
     assert (revoked.outcome, str(revoked)) == ("cancelled", "cancelled by an operator")
+
+
+EXPECTED = OpenRequest("id", "survey", {"robot/x": {}}, 3, Decimal(5), True, Place(TERM, 1), 2.0, FIRST)
+
+
+def test_what_is_expected_is_nobodys_until_there_is_word_of_it() -> None:
+    known = OpenArc.expected(EXPECTED, NOW)
+    assert (known.state, known.open, known.grant, known.place) == ("expected", False, None, Place(TERM, 1))
+    assert known.told(NOW).waited == 2.0
+    # The old client's end of it is not the new one's.
+    assert not known.come(notice(9, "ended", outcome="handed_over"), NOW)
+    # Nor is what was said of it when it was here before.
+    known.last = (TERM, 1)
+    assert not known.come(notice(1, "running", grant=FIRST, remaining=5.0), NOW)
+    assert (known.state, known.open) == ("expected", False)
+    assert known.come(RUNS, NOW)
+    assert (known.state, known.grant, known.rcs) == ("running", FIRST, ["robot/x"])
+    queued = OpenArc.expected(EXPECTED, NOW)
+    assert queued.come(WAITS, NOW)
+    assert (queued.state, queued.told(NOW + SECOND).waited) == ("queued", 3.0)
+
+
+@pytest.mark.parametrize("bad", [{"id": "a/b"}, {"arc": ""}, {"needs": {"robot": {}}}])
+def test_nobody_is_handed_what_has_no_name(bad: dict[str, Any]) -> None:
+    with pytest.raises(BadName):
+        OpenArc.expected(msgspec.structs.replace(EXPECTED, **bad), NOW)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_what_moved_and_is_taken_back_keeps_its_place_and_its_wait(held: bool) -> None:
+    known = arc()
+    for word in (WAITS, RUNS, AGAIN) if held else (RUNS, TAKEN):
+        known.take(word, NOW)
+    known.place = Place(TERM, 1)
+    known.move(NOW + SECOND)
+    assert (known.state, known.open, known.grant) == ("moved", False, None)
+    assert not known.take(notice(99), NOW + SECOND)
+    known.take_back("new", "the new client is gone", NOW + 2 * SECOND)
+    asked = known.ask(NOW + 3 * SECOND)
+    assert (known.state, known.open) == ("asking", True)
+    assert (asked.id, asked.place, asked.waited) == ("new", Place(TERM, 1), 2.0 if held else 3.0)
+    revoked = Revoked(known)
+    # A hold that moved is a hold that was lost; how an earlier one ended stays as it was.
+    assert revoked.outcome == ("lost" if held else "preempted")
+    assert known.take(notice(1, "running", grant=FIRST, remaining=5.0, term=OLD), NOW + 3 * SECOND)
+
+
+def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
+    async def story() -> None:
+        book = Book()
+        known = arc()
+        book.enter(known)
+        book.take(known, RUNS)
+        book.resumed.clear()
+        gone = notice(9, "ended", outcome="handed_over", grant=FIRST)
+        book.take(known, gone)
+        assert (known.state, book.standing) == ("running", [known])
+        book.move(known, notice(10, "running", client="h/new", grant=SECOND_GRANT))
+        assert (book.open, book.moved, known.last) == ([], {"id": known}, (TERM, 10))
+        # What is expected is told of without a place: the RCs decide whose it is.
+        book.expected["other"] = OpenArc.expected(msgspec.structs.replace(EXPECTED, id="other"), NOW)
+        assert [(told.id, told.place, told.grant) for told in book.told()] == [("other", None, None)]
+        book.resumed.set()
+        book.take_back(known, "new", "gone")
+        assert (list(book.arcs), book.moved) == (["new"], {})
+        book.take(known, notice(1, "ended", outcome="handed_over"))
+        assert book.arcs == {}
+
+    asyncio.run(story())

@@ -220,7 +220,11 @@ def _decimal(text: str) -> Decimal:
 def _check(kind: inspect.Type, value: object, where: Where) -> None:
     """Raises BadInput where `value`, as TOML gave it, is not of this kind."""
     match kind:
-        case inspect.UnionType(types=kinds):  # only X | None: absent in TOML, or X
+        case inspect.UnionType(types=(inspect.BoolType(), inspect.LiteralType(values=values))):
+            if not isinstance(value, bool) and value not in values:
+                words = ["true", "false", *(quoted(str(one)) for one in values)]
+                raise where.bad(f"is {_shown(value)}", f"write {_either(words)}")
+        case inspect.UnionType(types=kinds):  # else only X | None: absent in TOML, or X
             _check(next(kind for kind in kinds if not isinstance(kind, inspect.NoneType)), value, where)
         case inspect.StructType():
             in_list = bool(where.path) and isinstance(where.path[-1], int)

@@ -95,7 +95,8 @@ def test_a_component_takes_its_hold_along_and_a_rival_gets_nothing(tmp_path: Pat
             # Each hand-over was one publication, and there was no other word about who holds it.
             told = [[(one.arc, one.client) for one in grants.rcs["robot/x"]] for grants in said if grants.rcs]
             assert told == [[("c", f"{host}/c.{number}")] for number, host in enumerate("bab", 2)]
-            assert [grants.revoked for grants in said if grants.revoked] == []
+            ends = [(one.outcome, one.client) for grants in said for one in grants.revoked]
+            assert ends == [("handed_over", f"{host}/c.{number}") for number, host in enumerate("aba", 1)]
             assert rival.state == "queued"
             print("dead for", *(f"{1000 * seconds:.1f}" for seconds in dead), "ms")
             await hosts.stop("b", "c")

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from zscout.balancing.entry import Entry, Fate
 from zscout.balancing.ground import Ground
-from zscout.balancing.inquiries import Inquiries
 from zscout.balancing.keeping import GRACE, Keeper
 from zscout.balancing.model import ComponentId, HostName
 from zscout.balancing.moving import Mover
@@ -16,7 +15,7 @@ from zscout.balancing.placing import HostTold, Incarnation, Record, Seen
 class Hearing:
     def __init__(self, ground: Ground, keeper: Keeper, mover: Mover) -> None:
         self.ground, self.strays, self.keeper, self.mover = ground, keeper.strays, keeper, mover
-        self.inquiries = Inquiries(ground)
+        self.inquiries = keeper.inquiries
 
     # Tokens
 
@@ -29,7 +28,8 @@ class Hearing:
         if entry is None:
             self.inquiries.add(host, component)
         elif incarnation in entry.over:
-            pass
+            # Late news, or it started after it was told to stop.
+            self.strays.add(component, incarnation, host)
         elif (move := entry.move) is not None and incarnation == move.incarnation:
             self.mover.target_appeared(entry, move)
         elif incarnation != entry.incarnation or entry.past:
@@ -121,7 +121,7 @@ class Hearing:
         elif seen.ended is not None:
             self._seen_ended(entry, host, seen)
         elif seen.incarnation in entry.over:
-            pass
+            self.strays.add(seen.component, seen.incarnation, host)
         elif (move := entry.move) is not None and seen.incarnation == move.incarnation:
             self.mover.told_target(entry, move, runs=seen.running, stands_by=seen.standby)
         elif seen.incarnation == entry.incarnation and not entry.past:

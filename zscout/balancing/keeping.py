@@ -7,6 +7,7 @@ from typing import Final
 
 from zscout.balancing.entry import Entry, Fate
 from zscout.balancing.ground import ANSWER, Ground
+from zscout.balancing.inquiries import Inquiries
 from zscout.balancing.model import SECOND, ComponentId, HostName, Ns, Ranked
 from zscout.balancing.placing import Spec, StartAnswered, StopAnswered
 from zscout.balancing.strays import Strays
@@ -25,8 +26,8 @@ SHORTLY: Final[Ns] = SECOND // 100
 class Keeper:
     """Places, restarts and stops. A component that is being moved is `moving.Mover`'s."""
 
-    def __init__(self, ground: Ground, strays: Strays) -> None:
-        self.ground, self.strays = ground, strays
+    def __init__(self, ground: Ground, strays: Strays, inquiries: Inquiries) -> None:
+        self.ground, self.strays, self.inquiries = ground, strays, inquiries
 
     # What is asked for
 
@@ -224,8 +225,10 @@ class Keeper:
             return
         host, ran = entry.host or "its host", ground.now - entry.since if entry.since is not None else 0
         if fate.how != "lost":
-            # What is lost may come back with its host.
             entry.over.append(entry.incarnation)
+        elif entry.host is not None and fate.with_host:
+            # It may come back with its host.
+            self.inquiries.add(entry.host, entry.component)
         entry.start_until, entry.tail, entry.stays, entry.asks = None, fate.tail, "", 0
         ground.left(entry)
         if fate.how in ("moved", "superseded") and not entry.missing:
@@ -288,6 +291,8 @@ class Keeper:
         """What was stopped has ended, or its host is gone."""
         if sure:
             entry.over.append(entry.incarnation)
+        elif entry.host is not None:
+            self.inquiries.add(entry.host, entry.component)
         entry.start_until = None
         self.ground.left(entry)
         self.ground.wake(entry, None)
@@ -316,6 +321,7 @@ class Keeper:
             case "waiting":
                 self.again(entry, entry.cause)
             case "backing_off" if entry.missing:
+                entry.missing = False
                 self.ended(entry, Fate("lost", "it went on elsewhere and was not heard of again"))
             case "backing_off":
                 self.again(entry, entry.cause)

@@ -25,6 +25,7 @@ from zscout.balancing.draining import Drain
 from zscout.balancing.ground import DRAIN, Ground
 from zscout.balancing.hearing import Hearing
 from zscout.balancing.inquiries import KIND as INQUIRY
+from zscout.balancing.inquiries import Inquiries
 from zscout.balancing.keeping import Keeper
 from zscout.balancing.model import ComponentId, Ns
 from zscout.balancing.moving import Mover
@@ -63,7 +64,8 @@ class Placer:
         self.balancer, self.rules = balancer, rules
         self._ground = Ground(balancer, counter, rules)
         self._strays = Strays(self._ground)
-        self._keeper = Keeper(self._ground, self._strays)
+        self._inquiries = Inquiries(self._ground)
+        self._keeper = Keeper(self._ground, self._strays, self._inquiries)
         self._mover = Mover(self._ground, self._keeper)
         self._hearing = Hearing(self._ground, self._keeper, self._mover)
         self._drain = Drain(self._ground, self._mover)
@@ -184,7 +186,7 @@ class Placer:
         elif kind == "strays":
             self._strays.woke(name)
         elif kind == INQUIRY:
-            self._hearing.inquiries.woke(name)
+            self._inquiries.woke(name)
         elif (entry := self._ground.entry(name)) is not None:
             if kind == "move" and entry.move is not None:
                 self._mover.woke(entry, entry.move)

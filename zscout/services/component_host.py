@@ -148,7 +148,7 @@ class ComponentHost:
     async def _start(self, start: StartComponent) -> msgspec.Struct:
         before = self._living.get(start.component)
         if before is not None and before.leaving and start.incarnation > before.start.incarnation:
-            # It went elsewhere, or is being stopped: what comes back may be here before it has ended.
+            # It moved away, failed or is being stopped: what comes next may be here before it is quite gone.
             with suppress(TimeoutError):
                 async with asyncio.timeout(MAKE_WAY):
                     await before.over.wait()
@@ -158,10 +158,6 @@ class ComponentHost:
 
     async def _launch(self, start: StartComponent) -> ComponentProcess:
         self._check(start)
-        before = self._living.get(start.component)
-        if before is not None:
-            # It may have moved away, or failed, and not be quite gone.
-            await before.over.wait()
         kinds = await asyncio.to_thread(installed)
         # Another one may have asked meanwhile.
         process = self._same(start)
@@ -199,7 +195,7 @@ class ComponentHost:
         known = self._known.get(name, 0)
         if start.incarnation <= known:
             raise Refused("old_incarnation", f"{name} was started here as incarnation {known} already")
-        if process is not None and name in self._living and not process.leaving:
+        if name in self._living:
             raise Refused("runs_already", f"incarnation {known} of {name} lives here; stop it first")
         return None
 

@@ -119,11 +119,6 @@ class ComponentProcess:
 
     # Orders. Each raises Refused.
 
-    @property
-    def leaving(self) -> bool:
-        """Whether it will end, and soon."""
-        return self.phase == "stopping" or self.moved is not None
-
     async def stop(self, grace: float) -> None:
         """Returns when it has ended: by itself within `grace` seconds, or killed."""
         if self.phase != "ended":

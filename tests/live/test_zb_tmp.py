@@ -1,0 +1,149 @@
+"""A component that has handed over, and whose successor does not go on: the test plays that one's host."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.components.kit import ComponentLab, Hosts, counts, counts_on
+from zscout.behaviors.client import Client
+from zscout.config import Fleet
+from zscout.keyexpr import Role, Token
+from zscout.mesh import Request
+from zscout.messages import (
+    ActivateComponent,
+    ComponentOperation,
+    ComponentSpec,
+    ComponentView,
+    HowEnded,
+    MoveComponent,
+    Moved,
+    Phase,
+    Problem,
+    RestoreComponent,
+    StopComponent,
+)
+
+QUICK = {"period": 0.02, "rc": "robot/x"}
+
+
+class Target:
+    """Host "b", its node and its component "c", which stands by."""
+
+    def __init__(self, node: Client, component: Client | None, incarnation: int) -> None:
+        self.node, self.component, self.incarnation = node, component, incarnation
+        self.activated = asyncio.Event()
+        self.answer: Callable[[Request[ComponentOperation]], None] = lambda _: None
+        """To an activation."""
+        mesh = node.mesh
+        self.token = mesh.alive(Token("b", Role.NODE, "node", "x"))
+        mesh.serve(mesh.keys.component("b"), ComponentOperation, self._asked)
+
+    @classmethod
+    async def there(cls, fleet: Fleet, incarnation: int, *, component: bool = True) -> Target:
+        node = await Client.connect("node", fleet=fleet, host="b")
+        client = await Client.connect(f"c.{incarnation}", fleet=fleet, host="b") if component else None
+        return cls(node, client, incarnation)
+
+    def _asked(self, request: Request[ComponentOperation]) -> None:
+        match request.message:
+            case RestoreComponent(requests=requests):
+                if self.component is not None:
+                    self.component.expect(requests)
+                request.answer(self.view("standby"))
+            case ActivateComponent():
+                self.activated.set()
+                self.answer(request)
+            case StopComponent():
+                request.answer(self.view("ended", "stopped"))
+
+    def view(self, phase: Phase, ended: HowEnded | None = None) -> ComponentView:
+        return ComponentView("c", self.incarnation, "b", ComponentSpec("counter"), phase, ended=ended)
+
+    async def leave(self) -> None:
+        for client in (self.node, self.component):
+            if client is not None:
+                await client.leave()
+
+
+def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a", "robot/x")
+            client = await lab.client()
+            hosts = Hosts(client)
+            await lab.ready(client, "robot/x")
+            await hosts.start("a", "c", "counter", QUICK)
+            await counts_on(hosts, "a")
+
+            async def fails(target: Target) -> str:
+                import time; t0=time.perf_counter()
+                problem = await hosts.ask("a", MoveComponent("c", 1, "b", target.incarnation), Moved)
+                assert isinstance(problem, Problem), problem
+                assert problem.code == "move_failed"; print(problem.message, round(time.perf_counter()-t0,2))
+                await counts_on(hosts, "a")
+                numbers = await counts(hosts, "a")
+                assert numbers == list(range(numbers[0], numbers[-1] + 1))
+                (holder,) = (await lab.rc(client, "robot/x")).holders
+                assert (holder.arc, holder.client) == ("c", "a/c.1")
+                print("after", round(time.perf_counter()-t0,2)); grants.append(holder.grant)
+                await target.leave()
+                return problem.message
+
+            grants = [(await lab.rc(client, "robot/x")).holders[0].grant]
+            # Refused at the commit: nothing has changed.
+            target = await Target.there(lab.fleet, 2, component=False)
+            assert "refused the hand-over" in await fails(target)
+            assert not target.activated.is_set()
+            assert grants[1] == grants[0]
+
+            failed = await Target.there(lab.fleet, 3)
+            failed.answer = lambda request: request.answer(failed.view("ended", "failed"))
+            assert "asked anew here" in await fails(failed)
+            unknown = await Target.there(lab.fleet, 4)
+            unknown.answer = lambda request: request.refuse(Problem("unknown_component", "what?"))
+            assert "asked anew here" in await fails(unknown)
+            silent = await Target.there(lab.fleet, 5)
+            silent.answer = lambda _: silent.token.close()
+            assert "asked anew here" in await fails(silent)
+            assert sorted(set(grants)) == grants[1:]
+
+    asyncio.run(story())
+
+
+def test_who_handed_over_does_nothing_until_it_is_known_that_the_new_one_runs(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a", "robot/x")
+            client = await lab.client()
+            hosts = Hosts(client)
+            await lab.ready(client, "robot/x")
+            await hosts.start("a", "c", "counter", QUICK)
+            await counts_on(hosts, "a")
+            target = await Target.there(lab.fleet, 2)
+            answers: list[ComponentView | None] = [target.view("running"), target.view("standby"), None]
+            moving = asyncio.create_task(hosts.get("a", MoveComponent("c", 1, "b", 2), Moved))
+
+            def answer(request: Request[ComponentOperation]) -> None:
+                # At first none, then one that says: not yet.
+                view = answers.pop()
+                if view is not None:
+                    request.answer(view)
+
+            target.answer = answer
+            await target.activated.wait()
+            held = await counts(hosts, "a")
+            (holder,) = (await lab.rc(client, "robot/x")).holders
+            assert (holder.arc, holder.client) == ("c", "b/c.2")
+            moved = await moving
+            assert answers == []
+            assert await counts(hosts, "a") == held
+            assert (await hosts.ended("a", "c")).ended == "moved"
+            assert moved.dead > 0
+            # It gave up nothing when it left.
+            (holder,) = (await lab.rc(client, "robot/x")).holders
+            assert holder.client == "b/c.2"
+            await target.leave()
+
+    asyncio.run(story())
