@@ -205,9 +205,15 @@ def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_lat
         book.expected["other"] = OpenArc.expected(msgspec.structs.replace(EXPECTED, id="other"), NOW)
         assert [(told.id, told.place, told.grant) for told in book.told()] == [("other", None, None)]
         book.resumed.set()
-        book.take_back(known, "new", "gone")
-        assert (list(book.arcs), book.moved) == (["new"], {})
+        book.reclaim(known)
+        assert (list(book.arcs), book.moved, known.state) == ([known.id], {}, "asking")
+        assert known.id != "id"
+        # Of what may have been handed over it is told so afterwards: once more it is its own, elsewhere over.
+        book.reclaimed = {second := known.id}
         book.take(known, notice(1, "ended", outcome="handed_over"))
-        assert book.arcs == {}
+        assert (list(book.arcs), known.state) == ([known.id], "asking")
+        assert known.id != second
+        book.take(known, notice(2, "ended", outcome="handed_over"))
+        assert (book.arcs, known.state) == ({}, "ended")
 
     asyncio.run(story())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from tests.components.kit import ComponentLab, Hosts, counts, counts_on
@@ -36,6 +36,8 @@ class Target:
         self.activated = asyncio.Event()
         self.answer: Callable[[Request[ComponentOperation]], None] = lambda _: None
         """To an activation."""
+        self.at_last: Callable[[], Awaitable[None]] = self._nothing
+        """What becomes of it then."""
         mesh = node.mesh
         self.token = mesh.alive(Token("b", Role.NODE, "node", "x"))
         mesh.serve(mesh.keys.component("b"), ComponentOperation, self._asked)
@@ -55,11 +57,19 @@ class Target:
             case ActivateComponent():
                 self.activated.set()
                 self.answer(request)
+                self._ends = asyncio.ensure_future(self.at_last())
             case StopComponent():
                 request.answer(self.view("ended", "stopped"))
 
     def view(self, phase: Phase, ended: HowEnded | None = None) -> ComponentView:
         return ComponentView("c", self.incarnation, "b", ComponentSpec("counter"), phase, ended=ended)
+
+    async def _nothing(self) -> None:
+        pass
+
+    async def gives_back(self) -> None:
+        assert self.component is not None
+        await self.component.close()
 
     async def leave(self) -> None:
         for client in (self.node, self.component):
@@ -99,12 +109,16 @@ def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(tmp_path: 
 
             failed = await Target.there(lab.fleet, 3)
             failed.answer = lambda request: request.answer(failed.view("ended", "failed"))
+            failed.at_last = failed.gives_back
             assert "asked anew here" in await fails(failed)
             unknown = await Target.there(lab.fleet, 4)
             unknown.answer = lambda request: request.refuse(Problem("unknown_component", "what?"))
+            unknown.at_last = unknown.gives_back
             assert "asked anew here" in await fails(unknown)
+            # This one dies with all that it holds, and says nothing.
             silent = await Target.there(lab.fleet, 5)
             silent.answer = lambda _: silent.token.close()
+            silent.at_last = silent.leave
             assert "asked anew here" in await fails(silent)
             assert sorted(set(grants)) == grants[1:]
 

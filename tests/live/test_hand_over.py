@@ -306,6 +306,42 @@ def test_what_was_handed_to_one_who_died_is_taken_back(tmp_path: Path) -> None:
     asyncio.run(story())
 
 
+@pytest.mark.parametrize("done", [False, True])
+def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: bool
+) -> None:
+    monkeypatch.setattr(moving, "HAND_OVER", 0.0)
+
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/x", "radio/f:rate=5")
+            old, new = await lab.client("old"), await lab.client("new")
+            await lab.ready(old, "robot/x", "radio/f")
+            arcs = await claimed(old, list(NEEDS))
+            places, ids = [arc.place for arc in arcs.values()], [arc.id for arc in arcs.values()]
+            grant = arcs["drive"].grant
+            old.pause()
+            new.expect(old.open_requests())
+            if done:
+                for arc in arcs.values():
+                    await old.hand_over(arc, me(new))
+            with pytest.raises(RequestRefused) as refused:
+                await old.hand_over_all(me(new))
+            assert refused.value.code == "unknown"
+            await new.leave()
+            await lab.living(old, "client", lambda hosts: len(hosts) == 1)
+            old.take_back()
+            old.resume()
+            await until(lambda: not done or not {arc.id for arc in arcs.values()} & set(ids))
+            await until(lambda: [arc.state for arc in arcs.values()] == ["running", "running", "queued"])
+            assert [arc.place for arc in arcs.values()] == places
+            assert (arcs["drive"].grant == grant) is not done
+            state = await lab.state(old, lambda state: len(state.holds) == 2 and len(state.queue) == 1)
+            assert {view.id for view in state.holds} == {arcs["drive"].id, arcs["talk"].id}
+
+    asyncio.run(story())
+
+
 def test_what_comes_and_nobody_wants_or_does_not_come(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ import msgspec
 
 from zscout import clock
 from zscout.behaviors.request import OpenArc
+from zscout.keyexpr import new_instance
 from zscout.messages import Notice, OpenRequest
 
 
@@ -21,6 +22,10 @@ class Book:
         """What was handed over while this client was paused, and may be taken back."""
         self.expected: dict[str, OpenArc] = {}
         """What is to be handed to this client, and of which it has heard nothing yet."""
+        self.undecided: set[str] = set()
+        """Ids of what was to be handed over, where nobody could tell whether it was."""
+        self.reclaimed: set[str] = set()
+        """Those of them that are this client's in any case: under a new id if they were handed over."""
         self.resumed = asyncio.Event()
         """Not set while the client is paused."""
         self.resumed.set()
@@ -73,7 +78,11 @@ class Book:
         if notice.outcome == "handed_over" and not self.resumed.is_set():
             # Not before the hand-over is answered: an RCM that dies first may not have told the new client.
             return
-        if arc.take(notice, clock.now()):
+        if notice.outcome == "handed_over" and arc.id in self.reclaimed:
+            self.move(arc, notice)
+            self.reclaim(arc)
+        elif arc.take(notice, clock.now()):
+            self.reclaimed.discard(arc.id)
             self.wake(arc)
             if not arc.open:
                 self.forget(arc)
@@ -93,11 +102,13 @@ class Book:
         self.moved[arc.id] = arc
         self.wake(arc)
 
-    def take_back(self, arc: OpenArc, new_id: str, reason: str) -> None:
-        """A moved one is this client's again, under a new id."""
+    def reclaim(self, arc: OpenArc) -> None:
+        """A moved one is this client's again, under a new id; it is to be asked for."""
         del self.moved[arc.id]
+        self.reclaimed.discard(arc.id)
         news = self._news.pop(arc.id, None)
-        arc.take_back(new_id, reason, clock.now())
-        self.arcs[new_id] = arc
+        arc.take_back(new_instance(), "it was handed over, and its new client is gone", clock.now())
+        self.arcs[arc.id] = arc
         # Who waits for news goes on waiting for those of the same ARC.
-        self._news[new_id] = news or asyncio.Event()
+        self._news[arc.id] = news or asyncio.Event()
+        self.wake(arc)

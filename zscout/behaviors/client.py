@@ -244,7 +244,7 @@ class Client:
     def pause(self) -> None:
         """From now on nothing is asked again or ended and no body is entered or interrupted; the RCM is heard
         as before. Until `resume`, `take_back`, `close` or `leave`."""
-        self._book.resumed.clear()
+        self._moving.pause()
         self._may_end.clear()
 
     @property
@@ -283,13 +283,14 @@ class Client:
         return that is done, and they go on there.
 
         Raises RequestRefused where nothing was handed over; with code `unknown` where no RCM could tell
-        within 10 s: call it again, or resume and see what is left."""
+        within 10 s: call it again; or see to it that the other client is gone, and `take_back`."""
         await self._moving.hand_over_all(to)
 
     def take_back(self) -> None:
         """The client to which all was handed is gone: this one goes on, and asks anew for each, at its place.
 
-        Bodies are interrupted as by any other lost hold."""
+        Bodies are interrupted as by any other lost hold. What was not handed over after all, where that was
+        unknown, simply stands."""
         self._may_end.set()
         self._moving.take_back()
 

@@ -17,7 +17,7 @@ from zscout.behaviors.book import Book
 from zscout.behaviors.hearing import Hearing
 from zscout.behaviors.refusals import RequestRefused
 from zscout.behaviors.request import OpenArc
-from zscout.keyexpr import Sender, new_instance
+from zscout.keyexpr import Sender
 from zscout.mesh import Mesh
 from zscout.messages import Amounts, HandOver, Notice, OpenRequest, Problem
 from zscout.messages.scheduling import MAX_OTHERS
@@ -120,9 +120,26 @@ class Moving:
 
     # The old client
 
+    def pause(self) -> None:
+        self.book.resumed.clear()
+        self.book.undecided.clear()
+        self.book.reclaimed.clear()
+
     def resume(self) -> None:
         self.book.resumed.set()
-        self._spawn(self.asking.ask_all())
+        for arc in self.book.open:
+            self._spawn(self._ask_again(arc))
+
+    async def _ask_again(self, arc: OpenArc) -> None:
+        """What stands is asked once; what was lost or taken back until there is an answer."""
+        try:
+            if arc.state != "asking":
+                await self.asking.ask(arc)
+            await self.asking.submit(arc)
+        except RequestRefused as refused:
+            log.warning("%s is not taken back: %s", arc.name, refused)
+            self.book.wake(arc)
+            self.book.forget(arc)
 
     async def hand_over_all(self, to: Sender) -> None:
         """Hands over all that is queued or running, in one step. Raises RequestRefused: nothing has moved,
@@ -138,6 +155,7 @@ class Moving:
             async with asyncio.timeout(HAND_OVER):
                 await self._hand_over(arcs, to)
         except TimeoutError:
+            self.book.undecided = {arc.id for arc in arcs if arc.open}
             unknown = f"no RCM told within {HAND_OVER:g} s whether {to} has taken over; ask again"
             raise RequestRefused(Problem("unknown", unknown)) from None
 
@@ -170,18 +188,7 @@ class Moving:
 
     def take_back(self) -> None:
         """Asks anew for all that was handed over, at its old place: its new client is gone."""
-        arcs = list(self.book.moved.values())
-        for arc in arcs:
-            self.book.take_back(arc, new_instance(), "it was handed over, and its new client is gone")
+        for arc in list(self.book.moved.values()):
+            self.book.reclaim(arc)
+        self.book.reclaimed, self.book.undecided = self.book.undecided, set()
         self.resume()
-        for arc in arcs:
-            self.book.wake(arc)
-            self._spawn(self._ask_anew(arc))
-
-    async def _ask_anew(self, arc: OpenArc) -> None:
-        try:
-            await self.asking.submit(arc)
-        except RequestRefused as refused:
-            log.warning("%s is not taken back: %s", arc.name, refused)
-            self.book.wake(arc)
-            self.book.forget(arc)
