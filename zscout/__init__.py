@@ -4,7 +4,8 @@
     with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}, min_runtime=60) as held:
         ...
 
-For asyncio see `zscout.Client`, `zscout.hold` and `zscout.holds`. Everything is imported when it is used.
+For asyncio see `zscout.Client`, `zscout.hold` and `zscout.holds`; for what nodes can start and move,
+`zscout.Component`. Everything is imported when it is used.
 """
 
 from __future__ import annotations
@@ -17,14 +18,17 @@ if TYPE_CHECKING:
     from zscout.behaviors.arc import Held, Revoked, hold, holds
     from zscout.behaviors.blocking import Lab, connect
     from zscout.behaviors.client import Client, CommandRefused, RequestRefused
+    from zscout.components.component import Component, Stage
 
 _HOME = {
     "Client": "zscout.behaviors.client",
     "CommandRefused": "zscout.behaviors.client",
+    "Component": "zscout.components.component",
     "Held": "zscout.behaviors.arc",
     "Lab": "zscout.behaviors.blocking",
     "RequestRefused": "zscout.behaviors.client",
     "Revoked": "zscout.behaviors.arc",
+    "Stage": "zscout.components.component",
     "connect": "zscout.behaviors.blocking",
     "hold": "zscout.behaviors.arc",
     "holds": "zscout.behaviors.arc",
@@ -33,10 +37,12 @@ _HOME = {
 __all__ = [
     "Client",
     "CommandRefused",
+    "Component",
     "Held",
     "Lab",
     "RequestRefused",
     "Revoked",
+    "Stage",
     "__version__",
     "connect",
     "hold",
