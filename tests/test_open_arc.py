@@ -210,10 +210,13 @@ def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_lat
         assert known.id != "id"
         # Of what may have been handed over it is told so afterwards: once more it is its own, elsewhere over.
         book.reclaimed = {second := known.id}
-        book.take(known, notice(1, "ended", outcome="handed_over"))
+        book.take(known, notice(1, "ended", id=second, outcome="handed_over"))
         assert (list(book.arcs), known.state) == ([known.id], "asking")
         assert known.id != second
-        book.take(known, notice(2, "ended", outcome="handed_over"))
+        # A second answer about the old id says nothing of the new one.
+        book.take(known, notice(2, "ended", id=second, outcome="handed_over"))
+        assert known.state == "asking"
+        book.take(known, notice(2, "ended", id=known.id, outcome="handed_over"))
         assert (book.arcs, known.state) == ({}, "ended")
 
     asyncio.run(story())

@@ -49,7 +49,7 @@ QUERY: Ns = 4 * SECOND
 """A question without an answer by then is `unknown`."""
 LEASE: Ns = 3 * SECOND
 """Until the mesh sees that a host is gone, at most."""
-STANDS_BY: Ns = 30 * SECOND
+STANDS_BY: Ns = 10 * SECOND
 REPORT: Ns = 3 * SECOND
 Phase = Literal["starting", "standby", "running", "ended"]
 

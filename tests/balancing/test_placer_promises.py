@@ -33,9 +33,9 @@ OPS = (
     "leader",
     *["time"] * 6,
 )
-SETTLING = 90 * SECOND
+SETTLING = 60 * SECOND
 """Longer than any back-off, grace, look or time to stand by."""
-SEEDS = 3_000
+SEEDS = 2_000
 TRIES = 1_000
 """Starts in a row, in runs that are to give nothing up."""
 FINAL = {"running", "waiting", "ended", "given_up"}

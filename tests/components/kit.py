@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,6 +35,7 @@ ODD = {
     "parent": "Parent",
     "never": "Never",
     "restless": "Restless",
+    "garbler": "Garbler",
     "no-component": "NO_COMPONENT",
 }
 
@@ -52,8 +53,9 @@ def register_odd_kinds(folder: Path) -> None:
 class ComponentLab(Lab):
     """Nodes that can start the odd kinds."""
 
-    def __init__(self, folder: Path, *, start_timeout: float = 15, extra: str = "") -> None:
-        super().__init__(folder, extra=f"[placement]\nstart_timeout = {start_timeout}\n{extra}")
+    def __init__(self, folder: Path, *, start_timeout: float = 15, candidates: Sequence[str] = ()) -> None:
+        extra = f"[placement]\nstart_timeout = {start_timeout}\n"
+        super().__init__(folder, candidates=candidates, extra=extra)
         register_odd_kinds(folder / "site")
         self.env["PYTHONPATH"] = f"{folder / 'site'}:{ROOT}"
 

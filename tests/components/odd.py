@@ -129,5 +129,13 @@ class Restless(Component):
             raise ValueError("this state is rotten")
 
 
+class Garbler(Component):
+    """Says to its node what is no message."""
+
+    async def run(self, stage: Stage) -> None:
+        os.write(int(sys.argv[1]), b"GET / HTTP/1.1\r\n\r\n")
+        await asyncio.Event().wait()
+
+
 TOO_LARGE = MAX_CHECKPOINT + 1
 NO_COMPONENT = 7

@@ -77,6 +77,7 @@ def test_a_process_gets_the_share_of_a_core_that_it_may_have() -> None:
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     try:
         group.enter(process.pid)
+        group.settle()
         used, _ = process.communicate(timeout=30)
     finally:
         process.kill()
@@ -130,12 +131,14 @@ def unified(root: Path, *, enabled: str, residents: str = "") -> Path:
 
 def test_limits_of_v2_are_written_as_the_kernel_takes_them(tmp_path: Path) -> None:
     base = unified(tmp_path, enabled="cpu memory\n")
-    group = Limits(tmp_path, tmp_path / "own").group("a.1", memory=5 * MEGABYTE, cpu=1.5)
+    group = Limits(tmp_path, tmp_path / "own").group("a.1", memory=5 * MEGABYTE, cpu=0.5)
     assert group.missing == ""
     (folder,) = group.folders
     assert folder.parent == base
     files = ("memory.max", "memory.swap.max", "memory.oom.group", "cpu.max")
-    assert [(folder / name).read_text() for name in files] == ["5000000", "0", "1", "150000 100000"]
+    assert [(folder / name).read_text() for name in files] == ["5000000", "0", "1", "100000 100000"]
+    group.settle()
+    assert (folder / "cpu.max").read_text() == "50000 100000"
     (folder / "memory.events").write_text("low 0\noom 2\noom_kill 1\n")
     assert group.overdrawn()
     group.enter(4711)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from random import Random
 from typing import Final, TypeAlias
@@ -59,8 +59,6 @@ SHOWN: Final = 8 * LOAD_TIME
 MAX_HOSTS: Final = 10_000
 MAX_KINDS: Final = 10_000
 MAX_PLACED: Final = 100_000
-NEVER: Final[tuple[Ns, Report | None]] = 0, None
-"""In the place of a report where there is none."""
 
 _Found: TypeAlias = tuple[float, HostName]
 """A host with its score, negated: so the best comes first, and of equals the first by name."""
@@ -85,6 +83,7 @@ class Balancer:
     def __init__(self, rng: Random) -> None:
         self._rng = rng
         self.reports: dict[HostName, tuple[Ns, Report]] = {}
+        """The oldest first."""
         self._outlooks: dict[HostName, Outlook] = {}
         """What the reports alone tell."""
         self.profiles: dict[Kind, Profile] = {}
@@ -106,6 +105,7 @@ class Balancer:
             return
         if last is None and not self._room(now):
             return
+        self.reports.pop(report.host, None)
         self.reports[report.host] = (now, report)
         self._outlooks[report.host] = Outlook(report, report.load_average[0], report.memory_available)
         for use in report.uses:
@@ -251,22 +251,30 @@ class Balancer:
     def _fit(self, now: Ns, question: Question) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
         """Hosts that can be named, and why the others can't."""
         needs, pending = question.requirements, question.policy in COUNTING
-        # With thousands of hosts, what is asked of each one counts.
-        look_closely = bool(self.cordoned or needs.labels or needs.memory)
-        fit: dict[HostName, Outlook] = {}
+        asked: Iterable[HostName]
+        if question.hosts is not None or self.cordoned or needs.labels or needs.memory:
+            fit: dict[HostName, Outlook] = {}
+            asked = self.reports if question.hosts is None else question.hosts
+        else:
+            # Of thousands, only those are looked at that may differ from what their reports tell.
+            fit = self._outlooks.copy()
+            asked = [*self._overdue(now), *(self._pending.keys() & fit.keys() if pending else ())]
         left_out: dict[HostName, str] = {}
-        for host in self.reports if question.hosts is None else question.hosts:
-            at, report = self.reports.get(host, NEVER)
-            if report is None or now - at > STALE or look_closely:
-                reason = self._unfit(now, host, question)
-                if reason:
-                    left_out[host] = reason
-                    continue
-            if report is None or (pending and host in self._pending):
-                fit[host] = self.outlook(now, host, pending=pending)
+        for host in asked:
+            reason = self._unfit(now, host, question)
+            if reason:
+                left_out[host] = reason
+                fit.pop(host, None)
             else:
-                fit[host] = self._outlooks[host]
+                fit[host] = self.outlook(now, host, pending=pending)
         return fit, dict(sorted(left_out.items()))
+
+    def _overdue(self, now: Ns) -> Iterator[HostName]:
+        """Hosts whose last report is too old."""
+        for host, (at, _) in self.reports.items():
+            if now - at <= STALE:
+                return
+            yield host
 
     def _unfit(self, now: Ns, host: HostName, question: Question) -> str:
         """Why a host can't be named; nothing if it can."""

@@ -34,6 +34,8 @@ FAR_AHEAD: Final = 1_000_000
 """An incarnation that is so far above what this term gives is nobody's: it would leave no room above it."""
 ANSWER: Final[Ns] = 2 * SECOND
 """A host that is asked to look has as long, and so has one that starts something beyond its time for it."""
+STOP_ANSWER: Final[Ns] = 15 * SECOND
+"""A host that is told to stop something has as long: more than it may take to end."""
 MAX_COMPONENTS: Final = 10_000
 MAX_ENDED: Final = 1_000
 """Ended and given-up components that are remembered."""

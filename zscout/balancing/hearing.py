@@ -5,7 +5,7 @@ truth. Of two that live the higher is; the lower is told to stop.
 from __future__ import annotations
 
 from zscout.balancing.entry import Entry, Fate
-from zscout.balancing.ground import Ground
+from zscout.balancing.ground import ANSWER, Ground
 from zscout.balancing.keeping import GRACE, Keeper
 from zscout.balancing.model import ComponentId, HostName
 from zscout.balancing.moving import Mover
@@ -89,7 +89,7 @@ class Hearing:
 
     def told(self, told: HostTold) -> None:
         """A host's list, or of one component what it knows."""
-        self.inquiries.answered(told.host, told.only)
+        answered = self.inquiries.answered(told.host, told.only)
         for seen in told.components:
             if told.only is None or seen.component == told.only:
                 self._seen(told.host, seen)
@@ -101,6 +101,10 @@ class Hearing:
             concerned = self._there(told.host)
         for entry in concerned:
             self._not_listed(entry, told, listed)
+        for name in answered:
+            entry = self.ground.entries.get(name)
+            if entry is not None and entry.state == "waiting":
+                self.ground.wake(entry, self.ground.now)
 
     def _there(self, host: HostName) -> list[Entry]:
         """What is on a host, or on its way there."""
@@ -217,6 +221,9 @@ class Hearing:
         self.inquiries.seen(host)
         for entry in ground.entries.values():
             if entry.state == "waiting":
+                if self.inquiries.open(host, entry.component):
+                    # Perhaps it is there still: better than to start it anew.
+                    entry.retry_at = ground.now + ANSWER
                 ground.wake(entry, max(ground.now, entry.retry_at))
             elif entry.state == "stopping" and entry.host == host:
                 ground.wake(entry, ground.now)

@@ -4,6 +4,7 @@ gone, of all that it had.
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import Final
 
 from zscout.balancing.ground import ANSWER, MAX_COMPONENTS, Ground
@@ -11,6 +12,8 @@ from zscout.balancing.model import ComponentId, HostName
 
 KIND: Final = "inquiry"
 """Of their timers."""
+AT_ONCE: Final = 200
+"""Questions to one host; the next follow when these are answered, or time is up."""
 
 
 class Inquiries:
@@ -34,28 +37,31 @@ class Inquiries:
                 self._tries.setdefault(host, 0)
                 self._ground.timers.set((KIND, host), self._ground.now + ANSWER)
 
-    def answered(self, host: HostName, component: ComponentId | None) -> None:
-        """A host has told of this component, or of all."""
-        found = self._open.get(host)
-        if found is None:
-            return
-        if component in found:
-            del found[component]
-            self._count -= 1
-        if component is None or not found:
+    def open(self, host: HostName, component: ComponentId) -> bool:
+        return component in self._open.get(host, {})
+
+    def answered(self, host: HostName, component: ComponentId | None) -> list[ComponentId]:
+        """A host has told of this component, or of all. Returns those of which it was to tell."""
+        found = self._open.get(host, {})
+        told = list(found) if component is None else [component] if component in found else []
+        for one in told:
+            del found[one]
+        self._count -= len(told)
+        if not found:
             self._drop(host)
+        return told
 
     def seen(self, host: HostName) -> None:
-        """It is there; its list is awaited for a moment."""
+        """It is there: it is asked at once."""
         if host in self._open:
             self._tries[host] = 0
-            self._ground.timers.set((KIND, host), self._ground.now + ANSWER)
+            self.woke(host)
 
     def woke(self, host: HostName) -> None:
         ground = self._ground
         if host not in ground.alive:
             return
-        for component in self._open.get(host, {}):
+        for component in islice(self._open.get(host, {}), AT_ONCE):
             ground.look(component, host)
         self._tries[host] = tries = self._tries.get(host, 0) + 1
         ground.timers.set((KIND, host), ground.now + max(ANSWER, ground.pause(tries)))

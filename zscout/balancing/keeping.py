@@ -6,7 +6,7 @@ import re
 from typing import Final
 
 from zscout.balancing.entry import Entry, Fate
-from zscout.balancing.ground import ANSWER, Ground
+from zscout.balancing.ground import ANSWER, STOP_ANSWER, Ground
 from zscout.balancing.inquiries import Inquiries
 from zscout.balancing.model import SECOND, ComponentId, HostName, Ns, Ranked
 from zscout.balancing.placing import Spec, StartAnswered, StopAnswered
@@ -276,7 +276,7 @@ class Keeper:
                 self.ground.wake(entry, entry.retry_at)
             return
         self.ground.stop(entry.component, entry.incarnation, entry.host)
-        self.ground.wake(entry, self.ground.now + self.ground.pause(20))
+        self.ground.wake(entry, self.ground.now + STOP_ANSWER)
 
     def stop_answered(self, entry: Entry, answer: StopAnswered) -> None:
         if not answer.done:

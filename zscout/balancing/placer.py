@@ -149,7 +149,7 @@ class Placer:
         if self._strays.start_answered(component, incarnation):
             return
         entry = ground.entry(component)
-        if entry is None or incarnation in entry.over:
+        if entry is None:
             return
         move = entry.move
         if move is not None and (incarnation, answer.host) == (move.incarnation, move.to):

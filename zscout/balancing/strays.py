@@ -7,12 +7,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from zscout.balancing.ground import Ground
+from zscout.balancing.ground import STOP_ANSWER, Ground
 from zscout.balancing.model import SECOND, ComponentId, HostName, Ns
 from zscout.balancing.placing import Incarnation
 
-STOP_ANSWER: Final[Ns] = 15 * SECOND
-"""A host that is told to stop something has as long: more than it may take to end."""
 MAX_STRAYS: Final = 100
 """Of one component."""
 

@@ -75,6 +75,9 @@ class Book:
 
     def take(self, arc: OpenArc, notice: Notice) -> None:
         """Takes a word of the RCM about one of `arcs`."""
+        if notice.id != arc.id:
+            # An answer that was on its way when the ARC was taken back under another id.
+            return
         if notice.outcome == "handed_over" and not self.resumed.is_set():
             # Not before the hand-over is answered: an RCM that dies first may not have told the new client.
             return

@@ -82,7 +82,7 @@ class Moving:
                 self.book.enter(arc)
                 self.book.wake(arc)
                 self.came.set()
-                asyncio.get_running_loop().call_later(CLAIM, self._unwanted, arc)
+                self._spawn(self._give_back_unwanted(arc))
             return True
         arc = self.book.moved.get(notice.id)
         if arc is not None and notice.state == "ended" and notice.outcome != "handed_over":
@@ -111,12 +111,13 @@ class Moving:
                 self.book.forget(arc)
         return arc if arc.open else None
 
-    def _unwanted(self, arc: OpenArc) -> None:
+    async def _give_back_unwanted(self, arc: OpenArc) -> None:
+        await asyncio.sleep(CLAIM)
         if self._unclaimed.get(arc.id) is arc:
             del self._unclaimed[arc.id]
             if arc.open:
                 log.warning("%s was handed over and nobody asked for it: it is given back", arc.name)
-                self._spawn(self.asking.end(arc))
+                await self.asking.end(arc)
 
     # The old client
 

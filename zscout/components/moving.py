@@ -168,9 +168,17 @@ class Move:
         return True
 
     async def _lives(self) -> bool:
+        """Whether the other process may still be there. Its node's end is its own, but some moments later: its
+        client's token tells that it is over, and that nothing of it will be heard any more."""
         mesh = self._client.mesh
-        nodes = await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_TIMEOUT)
-        return any(node.host == self.to for node in nodes)
+        nodes, clients = await asyncio.gather(
+            mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_TIMEOUT),
+            mesh.living(mesh.keys.alive_any(Role.CLIENT), timeout=LOOK_TIMEOUT),
+        )
+        its = f"{self._name}.{self.incarnation}"
+        return any(node.host == self.to for node in nodes) or any(
+            (client.host, client.name) == (self.to, its) for client in clients
+        )
 
     async def _ask(self, operation: Operation, kind: type[R], timeout: float) -> R | Problem | None:
         mesh = self._client.mesh

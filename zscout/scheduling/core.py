@@ -12,7 +12,6 @@ follows from them: votes, and a `Tick` at the latest when `WakeAt` says.
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import replace
 
 from zscout.keyexpr import is_pattern
@@ -27,6 +26,7 @@ from zscout.scheduling.effects import (
     Revoked,
     WakeAt,
 )
+from zscout.scheduling.ends import Ends
 from zscout.scheduling.events import (
     Asked,
     Cancelled,
@@ -76,8 +76,7 @@ class Core:
         self._now: Ns = 0
         self._cause = 0
         self._effects: list[Effect] = []
-        self._ends: list[tuple[Ns, ArcId, int]] = []
-        """When holds are over, soonest first; entries of holds that ended otherwise are skipped."""
+        self._ends = Ends(self.floor.running)
         self._wake: Ns | None = None
         self._again = False
         """Whether the strategy asked for another pass at once."""
@@ -223,7 +222,7 @@ class Core:
         if arc.hold is not None:
             arc.hold = replace(arc.hold, grant=self._next_grant())
             if arc.hold.end > self._now:
-                self._note_end(arc, arc.hold)
+                self._ends.note(arc, arc.hold)
             self._effects.append(self._granted(arc, arc.hold))
         elif arc.reason:
             self._effects.append(Queued(self._cause, arc.id, to, arc.reason))
@@ -256,11 +255,7 @@ class Core:
             self._ask(*one)
 
     def _expire(self) -> None:
-        while self._ends and self._ends[0][0] <= self._now:
-            _, arc_id, _ = heapq.heappop(self._ends)
-            arc = self.floor.running.get(arc_id)
-            if arc is None or arc.hold is None or arc.hold.end > self._now:
-                continue
+        for arc in self._ends.over(self._now):
             if arc.request.keep:
                 self.floor.overstayed(arc)
             else:
@@ -305,10 +300,7 @@ class Core:
 
     def _take(self, arc: Arc, hold: Hold) -> None:
         self.floor.start(arc, hold, self._now)
-        self._note_end(arc, hold)
-
-    def _note_end(self, arc: Arc, hold: Hold) -> None:
-        heapq.heappush(self._ends, (hold.end, arc.id, hold.grant.seq))
+        self._ends.note(arc, hold)
 
     def _end(
         self, arc: Arc, outcome: Outcome, reason: str, *, by: ArcId | None = None, requeue: bool = True
@@ -350,9 +342,7 @@ class Core:
         return Revoked(self._cause, arc.id, client, hold.grant, rcs, outcome, reason, requeued, by)
 
     def _set_wake(self) -> None:
-        while self._ends and not self._in_force(self._ends[0]):
-            heapq.heappop(self._ends)
-        at = self._ends[0][0] if self._ends else None
+        at = self._ends.next()
         if self.floor.queued:
             at = min(self._now + QUANTUM, at) if at is not None else self._now + QUANTUM
         if self._again:
@@ -360,11 +350,6 @@ class Core:
         if at != self._wake or self._again:
             self._wake = at
             self._effects.append(WakeAt(self._cause, at))
-
-    def _in_force(self, end: tuple[Ns, ArcId, int]) -> bool:
-        at, arc_id, _ = end
-        arc = self.floor.running.get(arc_id)
-        return arc is not None and arc.hold is not None and arc.hold.end == at
 
     def validate(self) -> None:
         """Checks all invariants; for tests and simulators, after every event."""

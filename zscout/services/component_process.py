@@ -155,6 +155,8 @@ class ComponentProcess:
             channel.MoveAway(self._next(), order.to, order.to_incarnation, order.patience), None
         )
         assert isinstance(answer, Gone)  # noqa: S101
+        if self.phase == "running":
+            self.phase = "stopping"
         self.moved = Moved(order.component, order.to, order.to_incarnation, answer.dead)
         return self.moved
 
@@ -307,6 +309,8 @@ class ComponentProcess:
                 self.movable = movable
                 if self.phase != "stopping":
                     self.phase = phase
+                if not self.settled.is_set():
+                    asyncio.get_running_loop().run_in_executor(None, self._group.settle)
                 self.settled.set()
                 if phase == "running":
                     self.running.set()

@@ -18,6 +18,7 @@ log = logging.getLogger("zscout.components")
 PERIOD_US: Final = 100_000
 LEAST_US: Final = 1_000
 """Of each period: the kernel takes no less."""
+START_CORES: Final = 1.0
 PREFIX: Final = "zscout."
 LEAF: Final = "zscout-node"
 """The group (v2) that the node moves itself into: one with processes can't limit groups within it."""
@@ -37,6 +38,8 @@ class Group:
         self.cpu = cpu
         """Cores; 0: no limit."""
         self.memory_set = self.cpu_set = False
+        self._throttle: tuple[Path, str] | None = None
+        """The file, and what it is to say once the component is ready."""
 
     @property
     def each(self) -> int:
@@ -53,10 +56,27 @@ class Group:
             parts.append("cpu_limit can't be set")
         return f"{' and '.join(parts)}: this host lets its node make no control groups" if parts else ""
 
+    @property
+    def start_cpu(self) -> float:
+        """Cores that it may use until it is ready."""
+        return max(self.cpu, START_CORES)
+
+    def throttle_by(self, file: Path, text: str) -> None:
+        """What `settle` is to write."""
+        self._throttle = file, text
+
     def enter(self, pid: int) -> None:
         """Puts a process in, and all that it starts from now on. Raises OSError."""
         for folder in self.folders:
             _write(folder / "cgroup.procs", str(pid))
+
+    def settle(self) -> None:
+        """The component is ready: from now on its limit of processor time holds. Before, START_CORES do, so
+        that one that may use little later is ready in time."""
+        if self._throttle is not None:
+            file, text = self._throttle
+            with suppress(OSError):  # it has ended meanwhile
+                _write(file, text)
 
     def overdrawn(self) -> bool:
         """Whether the kernel killed something of it because it used more memory than its limit."""
@@ -127,8 +147,9 @@ class Limits:
             wanted = {"memory.limit_in_bytes": str(group.memory)}
             also = {"memory.memsw.limit_in_bytes": str(group.memory)}
         else:
-            wanted = {"cpu.cfs_period_us": str(PERIOD_US), "cpu.cfs_quota_us": str(_quota(group.cpu))}
+            wanted = {"cpu.cfs_period_us": str(PERIOD_US), "cpu.cfs_quota_us": str(_quota(group.start_cpu))}
             also = {}
+            group.throttle_by(folder / "cpu.cfs_quota_us", str(_quota(group.cpu)))
         return _make(group, folder, wanted, also)
 
     def _unified(self, group: Group, controller: str, name: str) -> bool:
@@ -139,7 +160,8 @@ class Limits:
             wanted = {"memory.max": str(group.memory)}
             also = {"memory.swap.max": "0", "memory.oom.group": "1"}
         else:
-            wanted, also = {"cpu.max": f"{_quota(group.cpu)} {PERIOD_US}"}, {}
+            wanted, also = {"cpu.max": f"{_quota(group.start_cpu)} {PERIOD_US}"}, {}
+            group.throttle_by(base / name / "cpu.max", f"{_quota(group.cpu)} {PERIOD_US}")
         return _make(group, base / name, wanted, also)
 
     def _base(self) -> Path:
@@ -244,7 +266,7 @@ def _folders(parent: Path) -> list[Path]:
 
 def _write(file: Path, text: str) -> None:
     # Without O_CREAT: in a folder that is no control group nothing is to appear.
-    handle = os.open(file, os.O_WRONLY | os.O_CLOEXEC)
+    handle = os.open(file, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC)
     try:
         os.write(handle, text.encode())
     finally:
