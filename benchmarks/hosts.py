@@ -218,11 +218,7 @@ def table(all_found: list[Figures]) -> str:
     )
     last = all_found[-1]
     if last.ended:
-        what = (
-            f"{last.missed:,} reports missed"
-            if last.missed
-            else f"answers take {last.ratio:.1f} bare queries"
-        )
+        what = f"answers take {last.ratio:.1f} bare queries, {last.missed:,} reports are missed"
         lines.append(f"It ends at {last.hosts:,} hosts: {what}.")
     return "\n".join(lines)
 
@@ -241,10 +237,16 @@ def main() -> None:
     while True:
         print(f"{hosts:,} hosts", file=sys.stderr, flush=True)
         with tempfile.TemporaryDirectory(prefix="zscout-bench-") as name:
-            found.append(run(measure(Path(name), hosts)))
+            try:
+                found.append(run(measure(Path(name), hosts)))
+            except TimeoutError:
+                print(f"{hosts:,} hosts were not all ranked within {START:.0f} s", file=sys.stderr)
+                break
         if args.hosts is not None or found[-1].ended or hosts == MAX_HOSTS:
             break
         hosts = min(2 * hosts, MAX_HOSTS)
+    if not found:
+        sys.exit(1)
     if args.json:
         machine = {"cores": os.cpu_count(), "python": platform.python_version()}
         points = [asdict(one) | {"ratio": one.ratio, "ended": one.ended} for one in found]

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+import tomllib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.cli.fleet import CliFleet, fleet_of
+from tests.cli.fleet import CliFleet
 from tests.cli.tools import end, out_of, read_until
+from tests.components.kit import ROOT
 from tests.live.lab import START
 
 pytestmark = pytest.mark.live
@@ -20,10 +23,31 @@ OTHER = {"anvil": "bellows", "bellows": "anvil"}
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
-    with fleet_of(tmp_path_factory.mktemp("moves"), "robot/a") as fleet:
+    """Two nodes, which also know the kind that docs/components.md shows how to write."""
+    fleet = CliFleet(tmp_path_factory.mktemp("moves"))
+    try:
+        install_example(fleet.folder / "site")
+        fleet.lab.env["PYTHONPATH"] = f"{fleet.folder / 'site'}:{ROOT}"
+        fleet.lab.node("anvil", "robot/a")
         fleet.lab.node("bellows", "robot/b")
         fleet.state(lambda state: {view.rc for view in state.rcs if view.present} == {"robot/a", "robot/b"})
         yield fleet
+    finally:
+        fleet.close()
+
+
+def install_example(folder: Path) -> None:
+    """The package of docs/components.md, as if it were installed in `folder`."""
+    text = (ROOT / "docs" / "components.md").read_text()
+    code, project = (re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)[0] for kind in ("python", "toml"))
+    kinds = tomllib.loads(project)["project"]["entry-points"]["zscout.components"]
+    (folder / "survey").mkdir(parents=True)
+    (folder / "survey" / "__init__.py").write_text(code)
+    info = folder / "survey-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: survey\nVersion: 1.0\n")
+    lines = "".join(f"{name} = {where}\n" for name, where in kinds.items())
+    (info / "entry_points.txt").write_text(f"[zscout.components]\n{lines}")
 
 
 def start(fleet: CliFleet, name: str, *args: str) -> str:
@@ -71,6 +95,21 @@ def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFlee
     assert counts == list(range(counts[0], counts[-1] + 1))
 
 
+def test_the_example_of_the_docs_moves_with_its_hold(fleet: CliFleet) -> None:
+    done = fleet.zscout("start", "survey", "--set", "robot=robot/a", "--json")
+    assert done.returncode == 0, done.stderr
+    here = json.loads(done.stdout)["host"]
+    (before,) = fleet.state(lambda state: len(state.holds) == 1).holds
+    moved = fleet.zscout("migrate", "survey")
+    assert moved.returncode == 0, moved.stderr
+    (after,) = fleet.state(lambda state: len(state.holds) == 1).holds
+    assert (before.arc, before.client) == ("survey", f"{here}/{before.client.split('/')[1]}")
+    assert (after.id, after.client.split("/")[0]) == (before.id, OTHER[here])
+    assert after.held > before.held, "it is the same hold"
+    stop(fleet, "survey")
+    assert fleet.idle("robot/a")
+
+
 def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
     here = start(fleet, "stayer")
     assert fleet.zscout("migrate", "stayer", "--to", here).stdout == f"stayer is on {here} already\n"
@@ -94,7 +133,8 @@ def test_drain_empties_a_host_and_names_what_stays(fleet: CliFleet) -> None:
 
     late = fleet.zscout("drain", here, "--timeout", "3")
     assert late.returncode == 1
-    assert f"zscout: {here} is not empty after 3.0 s: pinned " in late.stderr
+    assert late.stderr.startswith(f"zscout: {here} is not empty after 3.0 s: ")
+    assert f"pinned stays ({here} is drained, and no other host will do: " in late.stderr
     assert late.stderr.endswith(f"; {here} stays cordoned; to use it again: zscout uncordon {here}\n")
     stop(fleet, "pinned")
     drained = told(fleet.zscout("drain", here, "--json"))

@@ -30,12 +30,14 @@ class Drain:
                 ground.refuse(host, "too_many", f"{len(cordoned)} hosts are drained already")
                 return
         cordoned.add(host)
+        ground.ranks.begin(ground.now)
         ground.drain_soon(host)
 
     def uncordon(self, host: HostName) -> None:
         """What waits may go there again; what stayed there stays in peace."""
         ground = self.ground
         ground.balancer.cordoned.discard(host)
+        ground.ranks.begin(ground.now)
         for entry in ground.entries.values():
             if entry.state == "waiting":
                 ground.wake(entry, max(ground.now, entry.retry_at))

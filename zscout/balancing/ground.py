@@ -25,6 +25,7 @@ from zscout.balancing.placing import (
     Start,
     Stop,
 )
+from zscout.balancing.ranks import Ranks
 from zscout.balancing.rules import Rules
 from zscout.balancing.timers import Key, Timers
 
@@ -87,7 +88,7 @@ class Ground:
         self._ended: dict[ComponentId, None] = {}
         self._touched: dict[ComponentId, bool] = {}
         self._effects: list[Effect] = []
-        self._nowhere: dict[Question, Fit] = {}
+        self.ranks = Ranks(balancer)
 
     # One instant
 
@@ -96,7 +97,8 @@ class Ground:
         if now < self.now:
             raise ValueError(f"time went backwards: {now} after {self.now}")
         self.now = now
-        self._touched, self._effects, self._nowhere = {}, [], {}
+        self._touched, self._effects = {}, []
+        self.ranks.begin(now)
 
     def finish(self) -> list[Effect]:
         """What is to be done. What has changed comes first: it is published before it is acted upon, so that
@@ -169,9 +171,7 @@ class Ground:
         """Where it can run; `but`: somewhere else; `only`: there or nowhere."""
         hosts = spec.hosts if only is None else frozenset({only})
         question = Question(spec.kind, spec.metric, spec.policy, spec.requirements, hosts)
-        if only is None and but is None and question in self._nowhere:
-            return self._nowhere[question]
-        ranking = self.balancer.rank(self.now, question)
+        ranking = self.ranks.of(question)
         found = tuple(one for one in ranking.hosts if one.host in self.alive and one.host != but)
         left_out = dict(ranking.left_out)
         if only is not None and spec.hosts is not None and only not in spec.hosts:
@@ -182,19 +182,18 @@ class Ground:
             left_out |= dict.fromkeys(asked - self.balancer.reports.keys(), "no report of it")
             if but is not None:
                 left_out.pop(but, None)
-        fit = Fit(found, left_out, but is not None)
-        if not found and only is None and but is None:
-            self._nowhere[question] = fit
-        return fit
+        return Fit(found, left_out, but is not None)
 
     def came(self, component: ComponentId, kind: Kind, host: HostName) -> None:
         """A component is on its way to a host."""
         self.balancer.placed(self.now, component, kind, host)
+        self.ranks.changed(host)
         self.rested[host] = self.now
 
     def left(self, entry: Entry) -> None:
         """A component is not on its host any more."""
         self.balancer.gone(entry.component)
+        self.ranks.changed(entry.host)
         if entry.host is not None and entry.host in self.alive:
             self.rested[entry.host] = self.now
             if entry.since is not None and self.rules.rebalance:

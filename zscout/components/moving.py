@@ -168,8 +168,8 @@ class Move:
         return True
 
     async def _lives(self) -> bool:
-        """Whether the other process may still be there. Its node's end is its own, but some moments later: its
-        client's token tells that it is over, and that nothing of it will be heard any more."""
+        """Whether the other process may still be there. It outlives its node by some moments: once its client's
+        token has gone, nothing of it will be heard any more."""
         mesh = self._client.mesh
         nodes, clients = await asyncio.gather(
             mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_TIMEOUT),

@@ -327,7 +327,6 @@ class ResourceController:
 
 
 def _handed_over(change: Change) -> bool:
-    """Whether all who stopped go on in another client: the same ARC has the same place."""
+    """Whether somebody who stopped goes on in another client: the same ARC has the same place."""
     before = {holder.place: holder.client for holder in change.stopped}
-    after = {holder.place: holder.client for holder in change.began}
-    return before.keys() == after.keys() and all(after[place] != client for place, client in before.items())
+    return any(before.get(holder.place, holder.client) != holder.client for holder in change.began)

@@ -119,14 +119,16 @@ class Visit:
         return Admitted(sorted(victims, key=lambda arc: arc.rank))
 
     def refusal(self) -> str:
-        """The veto that keeps the ARC out beside those who would stay; empty if none is known."""
+        """The veto that keeps the ARC out beside those who would stay, before the silence of an RC that does
+        not answer; empty if there is neither."""
+        silent = ""
         for rc in self._sharables:
             answer = self.votes.known(rc.name, self._firm_holders(rc))
             if answer is None and self.votes.silent(rc.name):
-                return f"{rc.name} does not answer"
+                silent = silent or f"{rc.name} does not answer"
             if answer is not None and not answer.accept:
                 return _veto(rc, answer.reason)
-        return ""
+        return silent
 
     def _veto(self, rc: Rc) -> Refused | None:
         """The veto of `rc` against the ARC beside those who would stay."""
