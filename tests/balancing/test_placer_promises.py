@@ -7,7 +7,8 @@ from random import Random
 
 import pytest
 
-from tests.balancing.placer_world import RULES, STANDS_BY, World
+from tests.balancing.placer_hosts import STANDS_BY
+from tests.balancing.placer_world import RULES, World
 from zscout.balancing.model import SECOND, HostName
 from zscout.balancing.placing import (
     DrainAsked,

@@ -18,6 +18,7 @@ from zscout.messages import (
     ComponentList,
     ComponentSpec,
     Grants,
+    HostRanking,
     ListComponents,
     MigrateComponent,
     MoveComponent,
@@ -26,6 +27,7 @@ from zscout.messages import (
     PlaceComponent,
     Placement,
     Problem,
+    RankAsk,
     ReadOutput,
 )
 
@@ -200,33 +202,47 @@ def test_a_target_that_is_killed_while_it_is_moved_to_leaves_one_that_counts(tmp
             client = await lab.client()
             hosts = Hosts(client)
             await lab.ready(client, "robot/x")
+            await ranked(client, "a", "b")
             spec = ComponentSpec("counter", QUICK | {"rc": "robot/x"}, hosts=["a", "b"])
-            placed = await placement(client, PlaceComponent("c", spec))
-            while placed.state != "running":
-                placed = await placement(client, PlaceComponent("c", spec))
+            placed = await placer(client, PlaceComponent("c", spec))
+            async with asyncio.timeout(START):
+                # It may be seen to run before its node has told what it can.
+                while not (isinstance(placed, Placement) and placed.state == "running" and placed.movable):
+                    await asyncio.sleep(0.05)
+                    placed = await placer(client, PlaceComponent("c", spec))
             source = placed.host
             assert source is not None
             target = "b" if source == "a" else "a"
             await counts_on(hosts, source)
             # Wherever in the move the other node dies: it goes on where it was, or is started there again.
-            moving = asyncio.create_task(placement(client, MigrateComponent("c", target)))
+            moving = asyncio.create_task(placer(client, MigrateComponent("c", target)))
             await lab.state(
                 client,
                 lambda state: moving.done() or any(hold.client.startswith(target) for hold in state.holds),
             )
             lab.signal(target, signal.SIGKILL)
-            await moving
+            answer = await moving
+            assert isinstance(answer, Placement) or answer.code == "move_failed"
             await lab.state(client, lambda state: any(hold.client.startswith(source) for hold in state.holds))
             await counts_on(hosts, source)
 
     asyncio.run(story())
 
 
-async def placement(client: Client, operation: PlaceComponent | MigrateComponent) -> Placement:
-    """What the placer answers."""
-    async with asyncio.timeout(2 * START):
+async def ranked(client: Client, *hosts: str) -> None:
+    """Waits until the balancer ranks these hosts: something can be placed there."""
+    async with asyncio.timeout(START):
         while True:
-            reply = await client.mesh.ask_one(client.mesh.keys.placer, operation, Placement, timeout=START)
-            if reply is not None and reply.message is not None:
-                return reply.message
+            ask = RankAsk(hosts=list(hosts))
+            reply = await client.mesh.ask_one(client.mesh.keys.rank, ask, HostRanking, timeout=1)
+            if reply is not None and reply.message is not None and len(reply.message.hosts) == len(hosts):
+                return
             await asyncio.sleep(0.05)
+
+
+async def placer(client: Client, operation: PlaceComponent | MigrateComponent) -> Placement | Problem:
+    reply = await client.mesh.ask_one(client.mesh.keys.placer, operation, Placement, timeout=2 * START)
+    assert reply is not None
+    answer = reply.message or reply.problem
+    assert answer is not None
+    return answer

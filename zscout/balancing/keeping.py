@@ -1,26 +1,23 @@
-"""Starting components and keeping them running: which host is next, when again, and when no more."""
+"""Keeping components running: what is asked for, what came of a start, when it is tried again, and when no
+more.
+"""
 
 from __future__ import annotations
 
-import re
 from typing import Final
 
+from zscout.balancing.choosing import Chooser, in_words
 from zscout.balancing.entry import Entry, Fate
 from zscout.balancing.ground import ANSWER, STOP_ANSWER, Ground
 from zscout.balancing.inquiries import Inquiries
-from zscout.balancing.model import SECOND, ComponentId, HostName, Ns, Ranked
+from zscout.balancing.model import SECOND, ComponentId, HostName, Ns
 from zscout.balancing.placing import Spec, StartAnswered, StopAnswered
 from zscout.balancing.strays import Strays
 
-TRY_AGAIN: Final[Ns] = SECOND
-"""A component for which there is no host looks for one as often."""
 GRACE: Final[Ns] = 2 * SECOND
 """What is inherited, or went on elsewhere, has as long to be heard of."""
 LOOKS: Final = 3
 """A component whose token is missing and of which its host tells nothing so often is lost."""
-AT_ONCE: Final = 200
-"""Components that are placed in one instant; the next follow in the next."""
-SHORTLY: Final[Ns] = SECOND // 100
 
 
 class Keeper:
@@ -28,6 +25,7 @@ class Keeper:
 
     def __init__(self, ground: Ground, strays: Strays, inquiries: Inquiries) -> None:
         self.ground, self.strays, self.inquiries = ground, strays, inquiries
+        self.chooser = Chooser(ground)
 
     # What is asked for
 
@@ -39,12 +37,12 @@ class Keeper:
             if entry is None:
                 ground.refuse(component, "too_many", f"{len(ground.entries)} components are placed already")
                 return
-            self.again(entry)
+            self.chooser.again(entry)
         elif entry.state in ("ended", "given_up"):
             ground.revived(entry)
             self._anew(entry, spec)
             entry.past = True
-            self.again(entry)
+            self.chooser.again(entry)
         elif not entry.wanted:
             # It is being stopped; what is asked for now comes after that.
             self._anew(entry, spec)
@@ -56,7 +54,8 @@ class Keeper:
 
     def _anew(self, entry: Entry, spec: Spec) -> None:
         entry.spec, entry.wanted, entry.movable = spec, True, False
-        entry.restarts = entry.rounds = 0
+        entry.restarts = entry.rounds = entry.moves = 0
+        entry.dead = None
         entry.reason = entry.cause = entry.tail = ""
         entry.tried.clear()
 
@@ -68,80 +67,13 @@ class Keeper:
             case "ended" | "stopping":
                 pass
             case "given_up":
-                self._finish(entry, "ended", "stopped")
+                self.chooser.finish(entry, "ended", "stopped")
             case "waiting" | "backing_off":
                 entry.state, entry.reason = "stopping", "asked to stop"
                 self._check_stopped(entry)
             case _:
                 entry.state, entry.reason, entry.asks = "stopping", "asked to stop", 0
                 self._stop_now(entry)
-
-    # Placing
-
-    def again(self, entry: Entry, cause: str = "") -> None:
-        """Has it placed at the end of this instant."""
-        entry.state, entry.cause, entry.missing = "waiting", cause, False
-        self.ground.wake(entry, None)
-        self.ground.to_place[entry.component] = None
-
-    def place_all(self) -> None:
-        """Places what is to be placed, the heaviest first."""
-        ground = self.ground
-        entries = [ground.entries[name] for name in ground.to_place if name in ground.entries]
-        ground.to_place = {}
-        waiting = [(one.component, one.spec.kind) for one in entries if one.state == "waiting"]
-        order = ground.balancer.heaviest_first(waiting) if len(waiting) > 1 else [name for name, _ in waiting]
-        for number, component in enumerate(order):
-            entry = ground.entries[component]
-            ground.touch(component)
-            if number < AT_ONCE:
-                self._put(entry)
-            else:
-                entry.reason = entry.reason or "others are placed first"
-                ground.wake(entry, ground.now + SHORTLY)
-
-    def _put(self, entry: Entry) -> None:
-        fit = self.ground.fit(entry.spec)
-        untried = [one for one in fit.hosts if one.host not in entry.tried]
-        if untried:
-            self._start(entry, untried[0])
-        elif not fit.hosts:
-            entry.tried.clear()
-            self._wait(entry, fit.why_none())
-        elif not any(entry.tried[one.host] for one in fit.hosts):
-            self._finish(entry, "given_up", f"no host can start it: {entry.cause}")
-        else:
-            entry.tried.clear()
-            pause = self.ground.pause(entry.rounds)
-            entry.rounds += 1
-            self._back_off(
-                entry, f"no host started it; tried again after {_seconds(pause)}: {entry.cause}", pause
-            )
-
-    def _wait(self, entry: Entry, why: str) -> None:
-        # Ages and amounts in the reason change all the time: that is no news.
-        if _words(entry.reason) != _words(reason := f"no host will do: {why}"):
-            entry.reason = reason
-        self.ground.wake(entry, self.ground.now + TRY_AGAIN)
-
-    def _start(self, entry: Entry, ranked: Ranked) -> None:
-        ground = self.ground
-        entry.incarnation = ground.fresh(entry.component)
-        entry.host, entry.state, entry.past = ranked.host, "starting", False
-        entry.since, entry.token, entry.told, entry.looked, entry.asks = None, False, False, False, 0
-        entry.why = f"{entry.cause}; here: {ranked.reason}" if entry.cause else ranked.reason
-        entry.reason = entry.why
-        ground.came(entry.component, entry.spec.kind, ranked.host)
-        ground.start(entry)
-
-    def _back_off(self, entry: Entry, reason: str, pause: Ns) -> None:
-        entry.state, entry.reason = "backing_off", reason
-        self.ground.wake(entry, self.ground.now + pause)
-
-    def _finish(self, entry: Entry, state: str, reason: str) -> None:
-        entry.state = "ended" if state == "ended" else "given_up"
-        entry.reason, entry.stays, entry.cause, entry.missing = reason, "", "", False
-        self.ground.ended(entry)
 
     # What came of a start
 
@@ -177,7 +109,7 @@ class Keeper:
                 # It may know what the placer does not: another incarnation that lives there.
                 ground.look(entry.component, host)
             entry.tried[host] = answer.again
-            self.again(entry, f"{host} refused it: {answer.reason}")
+            self.chooser.again(entry, f"{host} refused it: {answer.reason}")
             return
         self.start_failed(entry, Fate("failed", answer.reason, answer.tail), again=answer.again)
 
@@ -191,7 +123,7 @@ class Keeper:
         entry.restarts += 1
         cause = f"it did not start on {host}: {fate.reason or fate.how}"
         if not self._exhausted(entry, cause):
-            self.again(entry, cause)
+            self.chooser.again(entry, cause)
 
     def runs(self, entry: Entry) -> None:
         """It is known to run where it is; also what was believed gone."""
@@ -233,32 +165,32 @@ class Keeper:
         ground.left(entry)
         if fate.how in ("moved", "superseded") and not entry.missing:
             entry.missing = True
-            self._back_off(entry, f"it went on elsewhere ({fate.how}), it is not known where", GRACE)
+            self.chooser.back_off(entry, f"it went on elsewhere ({fate.how}), it is not known where", GRACE)
             return
         cause = _cause(fate, host)
         if fate.how == "completed" and entry.spec.restart != "always":
-            self._finish(entry, "ended", cause)
+            self.chooser.finish(entry, "ended", cause)
         elif entry.spec.restart == "never":
-            self._finish(entry, "given_up" if fate.how == "failed" else "ended", cause)
+            self.chooser.finish(entry, "given_up" if fate.how == "failed" else "ended", cause)
         elif fate.with_host:
             entry.tried.clear()
-            self.again(entry, cause)
+            self.chooser.again(entry, cause)
         elif ran >= rules.settled:
             entry.restarts = 0
-            self.again(entry, cause)
+            self.chooser.again(entry, cause)
         else:
             pause = ground.pause(entry.restarts)
             entry.restarts += 1
             if fate.how == "completed" or not self._exhausted(entry, cause):
-                self._back_off(entry, f"{cause}; started again after {_seconds(pause)}", pause)
+                self.chooser.back_off(entry, f"{cause}; started again after {in_words(pause)}", pause)
                 entry.cause = cause
 
     def _exhausted(self, entry: Entry, cause: str) -> bool:
         """Whether that was the last try; if so it is given up."""
         if entry.spec.restart == "never":
-            self._finish(entry, "given_up", cause)
+            self.chooser.finish(entry, "given_up", cause)
         elif entry.restarts >= self.ground.rules.restarts:
-            self._finish(entry, "given_up", f"{cause}; {entry.restarts} starts in a row failed")
+            self.chooser.finish(entry, "given_up", f"{cause}; {entry.restarts} starts in a row failed")
         return entry.state == "given_up"
 
     def host_lost(self, entry: Entry, host: HostName) -> None:
@@ -303,9 +235,9 @@ class Keeper:
             return
         if entry.wanted:
             entry.past = True
-            self.again(entry)
+            self.chooser.again(entry)
         else:
-            self._finish(entry, "ended", "stopped")
+            self.chooser.finish(entry, "ended", "stopped")
 
     def stray_over(self, component: ComponentId) -> None:
         """One of its strays has ended: perhaps that was what a stop waited for."""
@@ -319,12 +251,12 @@ class Keeper:
         ground = self.ground
         match entry.state:
             case "waiting":
-                self.again(entry, entry.cause)
+                self.chooser.again(entry, entry.cause)
             case "backing_off" if entry.missing:
                 entry.missing = False
                 self.ended(entry, Fate("lost", "it went on elsewhere and was not heard of again"))
             case "backing_off":
-                self.again(entry, entry.cause)
+                self.chooser.again(entry, entry.cause)
             case "starting":
                 self._start_again(entry)
             case "running":
@@ -378,12 +310,3 @@ def _cause(fate: Fate, host: HostName) -> str:
             return f"it was stopped on {host}, and not by the placer"
         case _:
             return fate.reason
-
-
-def _seconds(pause: Ns) -> str:
-    return f"{pause / SECOND:g} s"
-
-
-def _words(reason: str) -> str:
-    """A reason without its figures."""
-    return re.sub(r"[\d.,]+", "#", reason)

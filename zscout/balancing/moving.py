@@ -289,10 +289,13 @@ class Mover:
             self.keeper.strays.add(entry.component, move.incarnation, move.to, move.start_until)
 
     def _close(self, entry: Entry) -> None:
+        ground = self.ground
+        if entry.move is not None:
+            ground.balancer.gone(_shadow(entry))
+            ground.ranks.changed(entry.move.to)
         entry.move = None
-        entry.retry_at = self.ground.now + RETRY
-        self.ground.balancer.gone(_shadow(entry))
-        self.ground.wake_move(entry, None)
+        entry.retry_at = ground.now + RETRY
+        ground.wake_move(entry, None)
 
 
 def _shadow(entry: Entry) -> ComponentId:

@@ -1,8 +1,9 @@
 """The pure core of the component placer: events in, effects out, time given.
 
 Every decision about where components run is made here and in the files beside it; there is no clock, socket
-or log inside. `ground` is what is known and done; `keeping` starts, restarts and stops; `moving`, `draining`
-and `rebalance` move; `hearing` believes tokens and hosts. The service drives this one class:
+or log inside. `ground` is what is known and done; `choosing` finds hosts; `keeping` starts, restarts and
+stops; `moving`, `draining` and `rebalance` move; `hearing` believes tokens and hosts. The service drives this
+one class:
 
     effects = placer.handle(now, PlaceAsked("counter", spec), ...)
 
@@ -91,7 +92,7 @@ class Placer:
         while (due := ground.timers.due(now)) or ground.to_place:
             for key in due:
                 self._woke(key)
-            self._keeper.place_all()
+            self._keeper.chooser.place_all()
         effects = ground.finish()
         at = ground.timers.next()
         if at != self._wake:

@@ -1,5 +1,5 @@
-"""Rankings of one instant. To rank a thousand hosts takes milliseconds, and of many components that are placed
-in one instant each changes one host: that one is ranked anew, and the others are as they were.
+"""Rankings of one instant. To rank a thousand hosts takes milliseconds, and of many components that are
+placed in one instant each changes one host: that one is ranked anew, and the others are as they were.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ class Rebalance:
         return ground.now - ground.rested.get(host, ground.now) >= ground.rules.rest
 
     def _targets(self, question: Question) -> list[HostName]:
-        ranking = self.ground.balancer.rank(self.ground.now, question)
+        ranking = self.ground.ranks.of(question)
         return [one.host for one in ranking.hosts if self._at_rest(one.host)][:TARGETS]
 
     def _outlook(self, host: HostName) -> Outlook:

@@ -168,7 +168,7 @@ class Move:
         return True
 
     async def _lives(self) -> bool:
-        """Whether the other process may still be there. It outlives its node by some moments: once its client's
+        """Whether the other process may still be there. It outlives its node by moments: once its client's
         token has gone, nothing of it will be heard any more."""
         mesh = self._client.mesh
         nodes, clients = await asyncio.gather(
