@@ -17,7 +17,7 @@ from zscout import messages
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import Needs, OpenArc
 from zscout.messages import Ask, HostRanking, Notice, RankAsk, StateAsk
-from zscout.scheduling.strategies import StrategyName
+from zscout.scheduling.policy import StrategyName
 
 EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
 SHARABLE = ["radio/rf0", "video/ch1"]

@@ -22,8 +22,9 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Propose, WakeAt
 from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
 from zscout.scheduling.model import SECOND, Params, Request
+from zscout.scheduling.policy import StrategyName
 from zscout.scheduling.priority import run_full_pass
-from zscout.scheduling.strategies import STRATEGIES, StrategyName
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import excess
 
 QUEUES = (10, 100, 1_000, 10_000)

@@ -134,6 +134,9 @@ class Hosts(ABC):
             if any(one.lives for one in others):
                 say(StartAnswered(component, incarnation, host.name, "refused", "runs_already"))
                 return
+            if self.rng.random() < self.failing / 2:
+                say(StartAnswered(component, incarnation, host.name, "refused", "too_many"))
+                return
             proc = host.procs[component, incarnation] = Proc(component, incarnation, start.spec)
             life = host.procs
             ready, well = self.delay() + SECOND // 5, self.rng.random() >= self.failing

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from random import Random
@@ -55,6 +56,8 @@ class World(Hosts):
         self.refusals: list[Refused] = []
         self.alive: set[HostName] = set()
         """As the leading placer was told."""
+        self.heard: Counter[str] = Counter()
+        """How often the placer heard of what, by the event's name and what it says."""
         self.counter = 0
         self._reports = itertools.count(1)
         self._wake: Ns | None = None
@@ -125,6 +128,7 @@ class World(Hosts):
 
     def send(self, *events: Event) -> None:
         for event in events:
+            self.heard[" ".join([type(event).__name__, getattr(event, "result", "")]).strip()] += 1
             if isinstance(event, HostSeen):
                 self.alive.add(event.host)
             elif isinstance(event, HostLost):

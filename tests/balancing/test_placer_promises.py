@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from random import Random
 
@@ -22,17 +23,17 @@ from zscout.balancing.placing import (
 
 NAMES = ("a", "b", "c", "d")
 OPS = (
-    *["place"] * 4,
-    *["move"] * 4,
-    *["crash"] * 3,
+    *["time"] * 10,
+    *["move"] * 6,
+    *["place"] * 2,
+    *["crash"] * 2,
     "stop",
     "complete",
     "drain",
-    "uncordon",
+    *["uncordon"] * 3,
     *["dies", "is cut off", "freezes"],
     *["is back"] * 3,
     "leader",
-    *["time"] * 6,
 )
 SETTLING = 60 * SECOND
 """Longer than any back-off, grace, look or time to stand by."""
@@ -49,9 +50,9 @@ class Chaos:
         self.rng = Random(seed)  # noqa: S311
         self.patient = seed % 2 == 0
         rules = replace(RULES, restarts=TRIES) if self.patient else RULES
-        self.world = World(seed, self.rng.randint(1, 4), rules)
-        self.world.slow = self.rng.choice([SECOND // 10, SECOND, 3 * SECOND])
-        self.world.loss = self.rng.choice([0, 0.05, 0.3])
+        self.world = World(seed, self.rng.choice([1, 2, 3, 3, 4]), rules)
+        self.world.slow = self.rng.choice([SECOND // 20, SECOND // 4, SECOND, 3 * SECOND])
+        self.world.loss = self.rng.choice([0, 0, 0.05, 0.3])
         self.asked: dict[str, bool] = {}
         """Whether each component is to run, by what was asked for last and not refused."""
 
@@ -60,6 +61,8 @@ class Chaos:
         name = rng.choice(NAMES)
         host = world.hosts[rng.choice(list(world.hosts))]
         running = [(there, one) for each in NAMES for there, one in world.live(each) if one.token]
+        if op == "move" and running:
+            name = rng.choice(running)[1].component
         match op:
             case "place":
                 self.place(name)
@@ -67,7 +70,7 @@ class Chaos:
                 world.send(StopAsked(name))
                 self.asked[name] = False
             case "move":
-                world.send(MoveAsked(name, rng.choice([None, host.name])))
+                world.send(MoveAsked(name, rng.choice([None, None, host.name])))
             case "drain":
                 world.send(DrainAsked(host.name))
             case "uncordon":
@@ -85,9 +88,9 @@ class Chaos:
                 world.run(world.now + rng.randrange(4 * SECOND))
 
     def place(self, name: str) -> None:
-        policy: Restart = self.rng.choice(["never", "on_failure", "on_failure", "always", "always"])
+        policy: Restart = self.rng.choice(["never", *["on_failure"] * 3, *["always"] * 3])
         some = frozenset(self.rng.sample(list(self.world.hosts), 1))
-        hosts: frozenset[HostName] | None = self.rng.choice([None, None, None, some])
+        hosts: frozenset[HostName] | None = self.rng.choice([*[None] * 6, some])
         refused = len(self.world.refusals)
         self.world.send(PlaceAsked(name, Spec("job", policy, hosts=hosts)))
         if len(self.world.refusals) == refused:
@@ -142,12 +145,16 @@ class Chaos:
                 assert not (usable & (record.spec.hosts or usable)), record
 
 
-def run(seed: int) -> None:
+def run(seed: int) -> World:
     chaos = Chaos(seed)
-    for _ in range(chaos.rng.randint(5, 60)):
+    for name in NAMES:
+        chaos.place(name)
+    chaos.do("time")
+    for _ in range(chaos.rng.randint(5, 50)):
         chaos.do(chaos.rng.choice(OPS))
     chaos.settle()
     chaos.check()
+    return chaos.world
 
 
 @pytest.mark.parametrize("part", range(10))
@@ -157,3 +164,15 @@ def test_whatever_happens_one_incarnation_of_each_component_runs_in_the_end(part
             run(seed)
         except Exception as error:
             raise AssertionError(f"seed {seed}: {error}") from error
+
+
+def test_in_these_runs_everything_does_happen() -> None:
+    heard: Counter[str] = Counter()
+    for seed in range(100):
+        heard += run(seed).heard
+    for result in ("ok", "refused", "failed", "unknown"):
+        assert heard[f"StartAnswered {result}"] > 100, heard
+    for result in ("moved", "refused", "unknown"):
+        assert heard[f"MoveAnswered {result}"] > 30, heard
+    for event in ("Vanished", "HostLost", "HostTold", "Inherited", "DrainAsked"):
+        assert heard[event] > 100, heard

@@ -53,8 +53,10 @@ def register_odd_kinds(folder: Path) -> None:
 class ComponentLab(Lab):
     """Nodes that can start the odd kinds."""
 
-    def __init__(self, folder: Path, *, start_timeout: float = 15, candidates: Sequence[str] = ()) -> None:
-        extra = f"[placement]\nstart_timeout = {start_timeout}\n"
+    def __init__(
+        self, folder: Path, *, start_timeout: float = 15, candidates: Sequence[str] = (), rules: str = ""
+    ) -> None:
+        extra = f"[placement]\nstart_timeout = {start_timeout}\n{rules}"
         super().__init__(folder, candidates=candidates, extra=extra)
         register_odd_kinds(folder / "site")
         self.env["PYTHONPATH"] = f"{folder / 'site'}:{ROOT}"

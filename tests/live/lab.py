@@ -20,7 +20,7 @@ from zscout.config import Fleet, load_fleet
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.messages import RcAsk, RcmState, RcState
 from zscout.scheduling.model import Ns
-from zscout.scheduling.strategies import StrategyName
+from zscout.scheduling.policy import StrategyName
 
 START = 20.0
 """Seconds within which anything that is waited for must have come true, on a busy machine."""

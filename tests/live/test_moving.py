@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 import statistics
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import psutil
@@ -215,7 +215,7 @@ async def at_running(lab: Lab, placing: Placing, folder: Path, target: str) -> N
     await placing.until(ARC, lambda one: one.state == "running" and one.host == target)
 
 
-MOVE_TO: dict[str, Callable[..., object]] = {
+MOVE_TO: dict[str, Callable[[Lab, Placing, Path, str], Awaitable[None]]] = {
     "starting": at_starting,
     "standing by": at_standing_by,
     "restoring": at_restoring,

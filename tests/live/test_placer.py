@@ -87,7 +87,7 @@ def test_what_does_not_start_there_starts_elsewhere_or_is_given_up(tmp_path: Pat
 
 
 async def _elsewhere(tmp_path: Path) -> None:
-    async with ComponentLab(tmp_path, extra="restarts = 2\nback_off = 0.05\n") as lab:
+    async with ComponentLab(tmp_path, rules="restarts = 2\nback_off = 0.05\n") as lab:
         lab.node("h0", extra="[components]\nallow = false")
         lab.node("h1", extra='[components]\nkinds = ["counter"]')
         lab.node("h2", extra='labels = ["gpu"]')
@@ -180,7 +180,7 @@ def test_a_component_that_is_killed_starts_again(tmp_path: Path) -> None:
 
 
 async def _restarts(tmp_path: Path) -> None:
-    async with ComponentLab(tmp_path, extra="back_off = 0.05\n") as lab:
+    async with ComponentLab(tmp_path, rules="back_off = 0.05\n") as lab:
         placing = await three(lab)
         first = await placing.place("one", "counter")
         assert first.host is not None

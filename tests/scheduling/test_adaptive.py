@@ -19,8 +19,9 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Propose, Queued, Revoked, WakeAt
 from zscout.scheduling.events import Asked, Cancelled, Event, RcJoined, Released, Tick, Vote, VoteOverdue
 from zscout.scheduling.model import SECOND, Ns, Request
+from zscout.scheduling.policy import StrategyName
 from zscout.scheduling.replay import replay
-from zscout.scheduling.strategies import STRATEGIES, StrategyName
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc, excess
 
 MANY_PASSES = 500

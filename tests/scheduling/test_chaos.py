@@ -31,7 +31,8 @@ from zscout.scheduling.events import (
     Waiting,
 )
 from zscout.scheduling.model import NO_TERM, SECOND, Arc, ArcId, ClientId, Ns, RcName, Term
-from zscout.scheduling.strategies import STRATEGIES, StrategyName
+from zscout.scheduling.policy import StrategyName
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import WorkloadRc, excess
 
 OPS = (

@@ -27,9 +27,9 @@ from zscout.scheduling.events import (
 )
 from zscout.scheduling.model import SECOND, Arc, Grant, Ns, Params, Place, Request, Term
 from zscout.scheduling.patterns import check_patterns
-from zscout.scheduling.policy import Policy
+from zscout.scheduling.policy import Policy, StrategyName
 from zscout.scheduling.replay import replay
-from zscout.scheduling.strategies import STRATEGIES, StrategyName
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")

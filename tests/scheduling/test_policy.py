@@ -13,9 +13,9 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Revoked
 from zscout.scheduling.events import Asked, LeadTaken, RcJoined, Released, Standing, Tick
 from zscout.scheduling.model import SECOND, Grant, Ns, Place, Request, Term
-from zscout.scheduling.policy import Policy, owner_of
+from zscout.scheduling.policy import Policy, StrategyName, owner_of
 from zscout.scheduling.replay import replay
-from zscout.scheduling.strategies import STRATEGIES, StrategyName
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")

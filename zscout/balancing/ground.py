@@ -34,7 +34,9 @@ PER_TERM: Final = 1_000
 FAR_AHEAD: Final = 1_000_000
 """An incarnation that is so far above what this term gives is nobody's: it would leave no room above it."""
 ANSWER: Final[Ns] = 2 * SECOND
-"""A host that is asked to look has as long, and so has one that starts something beyond its time for it."""
+"""A host that is asked to look has as long."""
+START_SLACK: Final[Ns] = 2 * ANSWER
+"""A start that nobody has told of by then, beyond its time, is asked for again."""
 STOP_ANSWER: Final[Ns] = 15 * SECOND
 """A host that is told to stop something has as long: more than it may take to end."""
 MAX_COMPONENTS: Final = 10_000
@@ -217,13 +219,13 @@ class Ground:
     def start(self, entry: Entry) -> None:
         """Has the entry's incarnation started, for the first time or again."""
         if entry.host is not None and entry.host in self.alive:
-            entry.start_until = self.now + self.rules.start_timeout + ANSWER
+            entry.start_until = self.now + self.rules.start_timeout + START_SLACK
             self.wake(entry, entry.start_until)
             self._effects.append(Start(entry.component, entry.incarnation, entry.host, entry.spec))
 
     def start_standby(self, entry: Entry, move: Moving) -> None:
         if move.to in self.alive:
-            move.start_until = self.now + self.rules.start_timeout + ANSWER
+            move.start_until = self.now + self.rules.start_timeout + START_SLACK
             self.wake_move(entry, move.start_until)
             self._effects.append(Start(entry.component, move.incarnation, move.to, entry.spec, standby=True))
 

@@ -251,7 +251,8 @@ class Forgotten:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """What was asked can't be: `code` as in docs/protocol.md, `message` one line."""
+    """What was asked can't be: `code` as in docs/protocol.md, `message` one line. Of a host that can't be
+    drained, `component` is its name."""
 
     component: ComponentId
     code: str

@@ -17,9 +17,10 @@ import click
 
 from zscout.scheduling.effects import Effect, Granted, Outcome, Queued, Revoked
 from zscout.scheduling.model import SECOND, ArcId, Ns, RcName
+from zscout.scheduling.policy import StrategyName
 from zscout.scheduling.replay import HoldRecord, Replay
 from zscout.scheduling.replay import replay as play
-from zscout.scheduling.strategies import STRATEGIES, StrategyName
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Workload
 from zscout.scheduling.workload_file import MAX_BYTES, parse_workload
 from zscout.strict import BadInput, read_text

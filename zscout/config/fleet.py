@@ -12,8 +12,7 @@ from msgspec import Meta, Struct
 from zscout.balancing.rules import DEFAULT_RULES, Rules
 from zscout.endpoints import check_links, check_multicast
 from zscout.scheduling.model import SECOND, Ns
-from zscout.scheduling.policy import OPERATOR_PRIORITY, PATIENCE, Policy, Preempt, Promise
-from zscout.scheduling.strategies import StrategyName
+from zscout.scheduling.policy import OPERATOR_PRIORITY, PATIENCE, Policy, Preempt, Promise, StrategyName
 from zscout.strict import BadInput, Where, check_name, check_unique, read_toml, seconds_to_ns
 
 FLEET_VARIABLE: Final = "ZSCOUT_FLEET"

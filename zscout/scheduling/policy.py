@@ -1,4 +1,4 @@
-"""What a fleet may choose about scheduling beside the strategy."""
+"""What a fleet may choose about scheduling."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ PATIENCE: Final[Ns] = 142 * SECOND
 """Default, in ns. Measured: docs/study.md."""
 OPERATOR_PRIORITY: Final = 10
 
+StrategyName: TypeAlias = Literal["priority", "optimal", "adaptive"]
 Preempt: TypeAlias = Literal["always", "after_min_runtime"]
 Promise: TypeAlias = Literal["equals", "all"]
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Final, Literal, TypeAlias
+from typing import Final
 
 from zscout.scheduling import optimal, priority
 from zscout.scheduling.adaptive import Adaptive
+from zscout.scheduling.policy import StrategyName
 from zscout.scheduling.priority import Strategy
-
-StrategyName: TypeAlias = Literal["priority", "optimal", "adaptive"]
 
 STRATEGIES: Final[Mapping[StrategyName, Callable[[], Strategy]]] = {
     "priority": lambda: priority.run_pass,
