@@ -35,6 +35,7 @@ OPS = (
     *["is back"] * 3,
     "leader",
 )
+POLICIES: tuple[Restart, ...] = ("never", *("on_failure", "always") * 3)
 SETTLING = 60 * SECOND
 """Longer than any back-off, grace, look or time to stand by."""
 SEEDS = 2_000
@@ -88,7 +89,7 @@ class Chaos:
                 world.run(world.now + rng.randrange(4 * SECOND))
 
     def place(self, name: str) -> None:
-        policy: Restart = self.rng.choice(["never", *["on_failure"] * 3, *["always"] * 3])
+        policy: Restart = self.rng.choice(POLICIES)
         some = frozenset(self.rng.sample(list(self.world.hosts), 1))
         hosts: frozenset[HostName] | None = self.rng.choice([*[None] * 6, some])
         refused = len(self.world.refusals)

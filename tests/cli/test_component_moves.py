@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+import threading
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.cli.fleet import CliFleet
-from tests.cli.tools import end, out_of, read_until
+from tests.cli.tools import PATIENCE, end, out_of, read_until
 from tests.components.kit import ROOT
 from tests.live.lab import START
 
@@ -63,6 +64,15 @@ def stop(fleet: CliFleet, *names: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def follow(fleet: CliFleet, name: str, *args: str) -> subprocess.Popen[str]:
+    """`logs --follow`, which does not outlast what these tests wait for: a reader of it is not for ever."""
+    process = fleet.start("logs", name, "--follow", *args)
+    limit = threading.Timer(4 * PATIENCE, process.kill)
+    limit.daemon = True
+    limit.start()
+    return process
+
+
 def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
@@ -72,7 +82,7 @@ def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
 def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFleet) -> None:
     here = start(fleet, "wanderer", "--set", "period=0.02", "--set", "rc=robot/a")
     there = OTHER[here]
-    follower = fleet.start("logs", "wanderer", "--follow")
+    follower = follow(fleet, "wanderer")
     read_until(follower, "20")
 
     went = fleet.zscout("migrate", "wanderer", "--to", there)
@@ -160,7 +170,7 @@ def test_drain_empties_a_host_and_names_what_stays(fleet: CliFleet) -> None:
 
 def test_logs_of_what_runs_and_of_what_has_ended(fleet: CliFleet) -> None:
     here = start(fleet, "speaker", "--set", "period=0.01")
-    follower = fleet.start("logs", "speaker", "-f", "--lines", "0")
+    follower = follow(fleet, "speaker", "--lines", "0")
     read_until(follower, "50")
     stop(fleet, "speaker")
     assert follower.wait(START) == 0
@@ -186,7 +196,7 @@ def test_followed_output_begins_when_the_component_does(fleet: CliFleet) -> None
     none = fleet.zscout("logs", "later")
     assert none.returncode == 1
     assert "no host knows any output of later: it waits for a host: " in none.stderr
-    follower = fleet.start("logs", "later", "--follow")
+    follower = follow(fleet, "later")
     clamp = fleet.lab.node("clamp")
     try:
         read_until(follower, "1")
@@ -206,7 +216,7 @@ def test_followed_output_goes_over_when_a_host_dies(fleet: CliFleet) -> None:
     hosts = ("--host", "clamp", "--host", "bellows")
     if start(fleet, "survivor", "--set", "period=0.02", *hosts) != "clamp":
         assert fleet.zscout("migrate", "survivor").returncode == 0
-    follower = fleet.start("logs", "survivor", "--follow")
+    follower = follow(fleet, "survivor")
     read_until(follower, "20")
     clamp.kill()
     lines = read_until(follower, "-- survivor goes on on bellows")

@@ -25,6 +25,9 @@ class Hearing:
         if not ground.believes(incarnation):
             return
         ground.heard(component, incarnation)
+        if host not in ground.alive:
+            # Its node's token is late; what can't be done now is, when that comes and it tells.
+            self.inquiries.add(host, component)
         if entry is None:
             self.inquiries.add(host, component)
         elif incarnation in entry.over:
@@ -34,7 +37,7 @@ class Hearing:
             self.mover.target_appeared(entry, move)
         elif incarnation != entry.incarnation or entry.past:
             self._other(entry, incarnation, host, token=True)
-        elif entry.state in ("ended", "given_up"):
+        elif self._is_over(entry):
             self.strays.add(component, incarnation, host)
         elif entry.state != "stopping" and self._is_at(entry, host):
             entry.token = True
@@ -57,6 +60,10 @@ class Hearing:
                 self.keeper.woke(entry)
         elif move is not None and incarnation == move.incarnation:
             move.token, move.target = False, "unknown"
+
+    def _is_over(self, entry: Entry) -> bool:
+        """Whether its incarnation must not live: it ended, or is to and its host was believed gone."""
+        return entry.state in ("ended", "given_up") or (entry.state == "stopping" and entry.host is None)
 
     def _is_at(self, entry: Entry, host: HostName) -> bool:
         """Whether this incarnation can be at that host; if it was nowhere, it is there from now on."""
@@ -89,7 +96,9 @@ class Hearing:
 
     def told(self, told: HostTold) -> None:
         """A host's list, or of one component what it knows."""
-        answered = self.inquiries.answered(told.host, told.only)
+        # What a host said before it was lost is no answer.
+        alive = told.host in self.ground.alive
+        answered = self.inquiries.answered(told.host, told.only) if alive else []
         for seen in told.components:
             if told.only is None or seen.component == told.only:
                 self._seen(told.host, seen)
@@ -152,7 +161,7 @@ class Hearing:
     def _seen_alive(self, entry: Entry, host: HostName, seen: Seen) -> None:
         """The incarnation that the entry names lives."""
         ground = self.ground
-        if entry.state in ("ended", "given_up"):
+        if self._is_over(entry):
             if not seen.standby:
                 self.strays.add(entry.component, seen.incarnation, host)
         elif entry.state != "stopping" and not seen.standby and self._is_at(entry, host):
@@ -172,7 +181,7 @@ class Hearing:
         if self.strays.has(entry.component, incarnation):
             self.strays.over(entry.component, incarnation)
             self.keeper.stray_over(entry.component)
-        elif incarnation in entry.over:
+        elif incarnation in entry.over and entry.host is None:
             pass
         elif (move := entry.move) is not None and incarnation == move.incarnation:
             entry.over.append(incarnation)

@@ -164,7 +164,14 @@ class ComponentPlacer:
         self._wake = None
         if at is not None:
             delay = max(0.0, (at - clock.now()) / SECOND)
-            self._wake = asyncio.get_running_loop().call_later(delay, self._feed, Tick())
+            self._wake = asyncio.get_running_loop().call_later(delay, self._woken, at)
+
+    def _woken(self, at: Ns) -> None:
+        # A timer may go off a little early, and the core says only once when it wants to be woken.
+        if clock.now() < at:
+            self._wake_at(at)
+        else:
+            self._feed(Tick())
 
     def _publish(self, changed: dict[str, Record | None]) -> None:
         """Tells everybody what has changed, and those who wait for it."""
