@@ -10,7 +10,18 @@ import pytest
 
 from tests.cli.tools import Terminal, zscout_soon
 from tests.live.lab import Lab
-from zscout.messages import RcAsk, RcmState, RcState, StateAsk
+from zscout.messages import (
+    ComponentList,
+    HostRanking,
+    ListComponents,
+    ListPlacements,
+    Placements,
+    RankAsk,
+    RcAsk,
+    RcmState,
+    RcState,
+    StateAsk,
+)
 
 pytestmark = pytest.mark.live
 
@@ -38,8 +49,13 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
             rcm = alive["anvil", "rcm", "node"]
             assert rcm["token"] == f"{base}/alive/anvil/rcm/node/{state.term.rcm}"
             queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
-            assert queries == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
+            assert queries[:2] == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
             assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=2) is not None
+            assert queries[2:] == [f"{base}/balancer/rank", f"{base}/placer/component"]
+            assert await client.mesh.ask_one(queries[2], RankAsk(), HostRanking, timeout=2) is not None
+            assert await client.mesh.ask_one(queries[3], ListPlacements(), Placements, timeout=2) is not None
+            (host,) = [key["key"] for key in alive["anvil", "node", "node"]["keys"]]
+            assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=2) is not None
             for rc in ("robot/a", "radio/rf0"):
                 served = {key["key"] for key in alive["anvil", "rc", rc]["keys"] if key["how"] == "query"}
                 assert (f"{base}/rc/{rc}/vote" in served) == (rc == "radio/rf0")

@@ -61,7 +61,12 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
                 ("query", own.rcm_state, "who holds, who waits and why"),
                 ("put", own.grants, "holders of each RC touched, revocations, heartbeat"),
                 ("put", own.notice_any, "what becomes of each ARC, to its client"),
+                ("query", own.rank, "the best hosts for a component"),
+                ("query", own.placer, "place, stop, migrate, drain, uncordon, list"),
+                ("put", own.placements, "how components stand, at each change"),
             ]
+        case Role.NODE:
+            found = [("query", own.component(token.host), "components here: start, stop, list, logs, move")]
         case Role.RC:
             found = [
                 ("query", own.command_any(token.name), "do this, under a grant"),
@@ -80,7 +85,10 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
                 ("hear", own.notice(sender), "what becomes of them"),
             ]
         case Role.CANDIDATE | Role.RECORDER:
-            found = [("hear", own.grants, "who holds what")]
+            found = [
+                ("hear", own.grants, "who holds what"),
+                ("hear", own.placements, "how components stand"),
+            ]
         case _:
             found = []
     return [{"how": how, "key": key, "what": what} for how, key, what in found]
