@@ -48,6 +48,9 @@ REPORT: Ns = 3 * SECOND
 class World(Hosts):
     """The placer that leads, and what it says and hears."""
 
+    balancer: Balancer
+    placer: Placer
+
     def __init__(self, seed: int, hosts: int, rules: Rules = RULES) -> None:
         super().__init__(seed, hosts)
         self.rules = rules

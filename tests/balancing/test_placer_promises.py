@@ -172,8 +172,8 @@ def test_in_these_runs_everything_does_happen() -> None:
     for seed in range(100):
         heard += run(seed).heard
     for result in ("ok", "refused", "failed", "unknown"):
-        assert heard[f"StartAnswered {result}"] > 100, heard
+        assert heard[f"StartAnswered {result}"] > 50, heard
     for result in ("moved", "refused", "unknown"):
-        assert heard[f"MoveAnswered {result}"] > 30, heard
+        assert heard[f"MoveAnswered {result}"] > 10, heard
     for event in ("Vanished", "HostLost", "HostTold", "Inherited", "DrainAsked"):
-        assert heard[event] > 100, heard
+        assert heard[event] > 50, heard

@@ -188,6 +188,13 @@ def test_who_computes_moves_to_the_faster_host_once_that_is_free() -> None:
     assert len(fleet.moves) == 2
 
 
+@pytest.mark.parametrize(("speed", "moves"), [(1.2, 0), (1.4, 1)])
+def test_a_small_gain_is_not_worth_a_move(speed: float, moves: int) -> None:
+    fleet = Fleet([Machine("h0"), Machine("h1", speed=speed)], {"h0": names("full", 1)})
+    fleet.run(300 * SECOND)
+    assert len(fleet.moves) == moves
+
+
 def test_nobody_moves_where_more_is_lost_than_won() -> None:
     # It would have a half of h1 instead of a third of h0, and ten light ones there would have half of theirs.
     running = {"h0": names("full", 3), "h1": names("light", 10)}

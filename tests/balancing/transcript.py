@@ -12,7 +12,8 @@ One line is one batch of events; several commands of one instant are joined by `
     place NAME [kind=K] [restart=R] [hosts=A,B] [labels=A,B] [memory=MB] [policy=P] [metric=M] [n=ANY]
     end NAME       move NAME [HOST]         drain HOST       uncordon HOST       tick
     start NAME INC HOST ok|refused|failed|unknown [movable] [final] [REASON]
-    stop NAME INC HOST done|unknown         moved NAME INC HOST moved|refused|unknown [dead=S] [REASON]
+    stop NAME INC HOST done|said|unknown    `done`: and its token is gone; `said`: that is all
+    moved NAME INC HOST moved|refused|unknown [dead=S] [REASON]
     appeared NAME INC HOST                  vanished NAME INC HOST
     told HOST [only=NAME] NAME:INC:PHASE[:movable][:WHY] ...   PHASE: starting standby running, or an end
     seen HOST      lost HOST                its node, without a report
@@ -104,6 +105,8 @@ class _Player:
                 words = words[2:]
             if words[:1] == ["until"]:
                 return self.wait(_seconds(words[1]))
+            if words[:1] == ["stop"] and words[-1] == "done":
+                events.append(Vanished(words[1], int(words[2]), words[3]))
             if words[:1] == ["lead"]:
                 events += self.lead(int(words[1]), rebalance="rebalance" in words)
             elif words and (event := self.event(words[0], words[1:])) is not None:
@@ -194,8 +197,8 @@ class _Player:
                 return UncordonAsked(host)
             case "start", name, incarnation, host, result, *rest:
                 return _start_answered(name, int(incarnation), host, result, rest)
-            case "stop", name, incarnation, host, "done" | "unknown" as result:
-                return StopAnswered(name, int(incarnation), host, done=result == "done")
+            case "stop", name, incarnation, host, "done" | "said" | "unknown" as result:
+                return StopAnswered(name, int(incarnation), host, done=result != "unknown")
             case "moved", name, incarnation, host, result, *rest:
                 return _move_answered(name, int(incarnation), host, result, rest)
             case "appeared", name, incarnation, host:

@@ -82,6 +82,8 @@ class Entry:
     """Its host said that it runs, and whether it can be moved."""
     looked: bool = False
     """Its host was asked how it stands, and has not answered."""
+    stopped: bool = False
+    """Its host says that it has ended, or was never there."""
     tried: dict[HostName, bool] = field(default_factory=dict)
     """Hosts that did not start it, in this round, and whether another try there could help."""
     missing: bool = False

@@ -46,6 +46,7 @@ REMEMBERED: Final[Ns] = 3_600 * SECOND
 """For how long."""
 NAMED: Final = 3
 """Hosts that a reason names."""
+_Act = Start | Stop | Move | Look | Refused
 DRAIN: Final[Key] = ("drain", "")
 
 
@@ -89,7 +90,7 @@ class Ground:
         self._known: dict[ComponentId, Incarnation] = {}
         self._ended: dict[ComponentId, None] = {}
         self._touched: dict[ComponentId, bool] = {}
-        self._effects: list[Effect] = []
+        self._effects: list[_Act] = []
         self.ranks = Ranks(balancer)
 
     # One instant
@@ -116,7 +117,10 @@ class Ground:
             if asked or self.records.get(component) != record:
                 self.records[component] = record
                 told.append(Changed(component))
-        return told + self._effects
+        # A host may have been lost in this very instant, after something was to be asked of it.
+        return told + [
+            effect for effect in self._effects if isinstance(effect, Refused) or effect.host in self.alive
+        ]
 
     def touch(self, component: ComponentId, *, asked: bool = False) -> None:
         """Its record may have changed; `asked`: somebody waits to hear of it in any case."""
@@ -233,18 +237,17 @@ class Ground:
         self.timers.set(("move", entry.component), at)
 
     def move(self, entry: Entry, move: Moving) -> None:
-        if entry.host is not None and entry.host in self.alive:
+        if entry.host is not None:
             self._effects.append(
                 Move(entry.component, entry.incarnation, entry.host, move.to, move.incarnation)
             )
 
     def look(self, component: ComponentId, host: HostName | None) -> None:
-        if host is not None and host in self.alive:
+        if host is not None:
             self._effects.append(Look(host, component))
 
     def stop(self, component: ComponentId, incarnation: Incarnation, host: HostName) -> None:
-        if host in self.alive:
-            self._effects.append(Stop(component, incarnation, host))
+        self._effects.append(Stop(component, incarnation, host))
 
     # Ends
 

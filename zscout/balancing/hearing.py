@@ -25,6 +25,7 @@ class Hearing:
         if not ground.believes(incarnation):
             return
         ground.heard(component, incarnation)
+        self.strays.token(component, incarnation, alive=True)
         if host not in ground.alive:
             # Its node's token is late; what can't be done now is, when that comes and it tells.
             self.inquiries.add(host, component)
@@ -32,22 +33,24 @@ class Hearing:
             self.inquiries.add(host, component)
         elif incarnation in entry.over:
             # Late news, or it started after it was told to stop.
-            self.strays.add(component, incarnation, host)
+            self.strays.add(component, incarnation, host, token=True)
         elif (move := entry.move) is not None and incarnation == move.incarnation:
             self.mover.target_appeared(entry, move)
         elif incarnation != entry.incarnation or entry.past:
             self._other(entry, incarnation, host, token=True)
         elif self._is_over(entry):
-            self.strays.add(component, incarnation, host)
-        elif entry.state != "stopping" and self._is_at(entry, host):
+            self.strays.add(component, incarnation, host, token=True)
+        elif self._is_at(entry, host):
             entry.token = True
-            if entry.move is None:
+            if entry.move is None and entry.state != "stopping":
                 self.keeper.runs(entry)
 
     def vanished(self, component: ComponentId, incarnation: Incarnation, host: HostName) -> None:
         """How it ended, its host tells; a token may also be gone for a while with the network."""
         ground = self.ground
         entry = ground.entry(component)
+        self.strays.token(component, incarnation, alive=False)
+        self.keeper.stray_over(component)
         if entry is None:
             return
         move = entry.move
@@ -58,6 +61,8 @@ class Hearing:
             elif entry.state == "running":
                 entry.asks = 0
                 self.keeper.woke(entry)
+            elif entry.state == "stopping" and entry.stopped:
+                self.keeper.over(entry)
         elif move is not None and incarnation == move.incarnation:
             move.token, move.target = False, "unknown"
 
@@ -79,12 +84,14 @@ class Hearing:
             return
         stopped = entry.state in ("stopping", "ended", "given_up")
         if stopped or incarnation < entry.incarnation + entry.past:
-            self.strays.add(entry.component, incarnation, host)
+            self.strays.add(entry.component, incarnation, host, token=token)
             return
         if host not in ground.alive:
             return
         if entry.host is not None:
-            self.strays.add(entry.component, entry.incarnation, entry.host, entry.start_until)
+            self.strays.add(
+                entry.component, entry.incarnation, entry.host, entry.start_until, token=entry.token
+            )
         self.mover.cancel(entry)
         ground.left(entry)
         entry.incarnation, entry.host, entry.token, entry.told = incarnation, host, token, False

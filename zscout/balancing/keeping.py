@@ -207,14 +207,17 @@ class Keeper:
                 # Inherited: its host may be there, and has not been seen yet.
                 self.ground.wake(entry, entry.retry_at)
             return
+        entry.stopped = False
         self.ground.stop(entry.component, entry.incarnation, entry.host)
         self.ground.wake(entry, self.ground.now + STOP_ANSWER)
 
     def stop_answered(self, entry: Entry, answer: StopAnswered) -> None:
+        entry.stopped = answer.done
         if not answer.done:
             entry.asks += 1
             self.ground.wake(entry, self.ground.now + self.ground.pause(entry.asks))
-        elif entry.start_until is not None:
+        elif entry.start_until is not None or entry.token:
+            # It began after that was said, or its token goes in a moment.
             self.ground.wake(entry, self.ground.now + SECOND)
         else:
             self.over(entry)

@@ -231,8 +231,6 @@ class Mover:
             self._target_silent(entry, move, "it does not answer")
         elif move.stage == "starting":
             ground.start_standby(entry, move)
-        elif move.token:
-            self._finish(entry, move)
         elif move.stage == "handing" or move.tries < looks:
             self._look(entry, move)
         elif move.source == "ended":
@@ -245,12 +243,13 @@ class Mover:
     def _finish(self, entry: Entry, move: Moving, dead: Ns | None = None) -> None:
         """The target runs, and is what the entry is from now on."""
         ground, old, source = self.ground, entry.incarnation, entry.host
+        token = entry.token
         self._close(entry)
         ground.left(entry)
         if move.source == "ended" or source is None:
             entry.over.append(old)
         else:
-            self.keeper.strays.add(entry.component, old, source)
+            self.keeper.strays.add(entry.component, old, source, token=token)
         entry.incarnation, entry.host, entry.token = move.incarnation, move.to, move.token
         entry.moves += 1
         entry.dead = dead
@@ -267,7 +266,9 @@ class Mover:
             return
         self._close(entry)
         if move.target != "ended":
-            self.keeper.strays.add(entry.component, move.incarnation, move.to, move.start_until)
+            self.keeper.strays.add(
+                entry.component, move.incarnation, move.to, move.start_until, token=move.token
+            )
         entry.state = "running"
         entry.reason = f"it did not move to {move.to}, {move.why}: {reason}"
         entry.asks = 0
@@ -286,7 +287,9 @@ class Mover:
         move = entry.move
         if move is not None:
             self._close(entry)
-            self.keeper.strays.add(entry.component, move.incarnation, move.to, move.start_until)
+            self.keeper.strays.add(
+                entry.component, move.incarnation, move.to, move.start_until, token=move.token
+            )
 
     def _close(self, entry: Entry) -> None:
         ground = self.ground

@@ -107,13 +107,12 @@ class Rebalance:
         return found
 
     def _may_leave(self, entry: Entry, host: HostName) -> bool:
+        # That it came lately its host tells: it is not at rest then.
         ground = self.ground
-        since = entry.since if entry.since is not None else ground.now
         return (
             entry.movable
             and entry.wanted
             and entry.token
-            and ground.now - since >= ground.rules.rest
             and entry.retry_at <= ground.now
             and host not in ground.balancer.cordoned
             and self._at_rest(host)

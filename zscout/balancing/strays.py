@@ -20,6 +20,9 @@ class Stray:
     host: HostName
     start_until: Ns | None
     """Until then its start may still be on the way, and a stop that came first has stopped nothing."""
+    token: bool = False
+    """It is alive: whoever says that it was stopped said so before it began."""
+    stopped: bool = False
     tries: int = 0
     due: Ns = 0
 
@@ -36,12 +39,18 @@ class Strays:
         return incarnation in self._of.get(component, {})
 
     def add(
-        self, component: ComponentId, incarnation: Incarnation, host: HostName, start_until: Ns | None = None
+        self,
+        component: ComponentId,
+        incarnation: Incarnation,
+        host: HostName,
+        start_until: Ns | None = None,
+        *,
+        token: bool = False,
     ) -> None:
         """This incarnation must end. Where its host is gone it has."""
         strays = self._of.setdefault(component, {})
         if host in self._ground.alive and incarnation not in strays and len(strays) < MAX_STRAYS:
-            strays[incarnation] = Stray(host, start_until)
+            strays[incarnation] = Stray(host, start_until, token)
             self._stop(component, incarnation, strays[incarnation])
         self._set(component)
 
@@ -60,7 +69,8 @@ class Strays:
         stray = self._of.get(component, {}).get(incarnation)
         if stray is None:
             return
-        if done and stray.start_until is None:
+        stray.stopped = done
+        if done and stray.start_until is None and not stray.token:
             self.over(component, incarnation)
         elif not done:
             stray.tries += 1
@@ -68,6 +78,16 @@ class Strays:
         else:
             stray.due = self._ground.now + SECOND
         self._set(component)
+
+    def token(self, component: ComponentId, incarnation: Incarnation, *, alive: bool) -> None:
+        """Its token came or went."""
+        stray = self._of.get(component, {}).get(incarnation)
+        if stray is not None:
+            stray.token = alive
+            if alive:
+                stray.start_until = None
+            elif stray.stopped:
+                self.over(component, incarnation)
 
     def over(self, component: ComponentId, incarnation: Incarnation) -> None:
         if self._of.get(component, {}).pop(incarnation, None) is not None:
