@@ -14,6 +14,8 @@ TRY_AGAIN: Final[Ns] = SECOND
 AT_ONCE: Final = 100
 """Components that are placed in one instant; the next follow in the next."""
 SHORTLY: Final[Ns] = SECOND // 100
+TOLD: Final = 4
+"""Hosts whose reasons are given when none can start a component."""
 
 
 class Chooser:
@@ -52,8 +54,10 @@ class Chooser:
         elif not fit.hosts:
             entry.tried.clear()
             self._wait(entry, fit.why_none())
-        elif not any(entry.tried[one.host] for one in fit.hosts):
-            self.finish(entry, "given_up", f"no host can start it: {entry.cause}")
+        elif all(entry.tried[one.host] for one in fit.hosts):
+            causes = list(dict.fromkeys(entry.tried[one.host] for one in fit.hosts))
+            more = f"; and {len(causes) - TOLD} more" if len(causes) > TOLD else ""
+            self.finish(entry, "given_up", f"no host can start it: {'; '.join(causes[:TOLD])}{more}")
         else:
             entry.tried.clear()
             pause = self.ground.pause(entry.rounds)

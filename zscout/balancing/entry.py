@@ -84,8 +84,8 @@ class Entry:
     """Its host was asked how it stands, and has not answered."""
     stopped: bool = False
     """Its host says that it has ended, or was never there."""
-    tried: dict[HostName, bool] = field(default_factory=dict)
-    """Hosts that did not start it, in this round, and whether another try there could help."""
+    tried: dict[HostName, str] = field(default_factory=dict)
+    """Hosts that did not start it, in this round; why, where another try would not help, else empty."""
     missing: bool = False
     """It says that it went on elsewhere, and nobody has told where."""
     move: Moving | None = None

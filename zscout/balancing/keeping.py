@@ -108,8 +108,9 @@ class Keeper:
             if answer.again:
                 # It may know what the placer does not: another incarnation that lives there.
                 ground.look(entry.component, host)
-            entry.tried[host] = answer.again
-            self.chooser.again(entry, f"{host} refused it: {answer.reason}")
+            cause = f"{host} refused it: {answer.reason}"
+            entry.tried[host] = "" if answer.again else cause
+            self.chooser.again(entry, cause)
             return
         self.start_failed(entry, Fate("failed", answer.reason, answer.tail), again=answer.again)
 
@@ -119,9 +120,9 @@ class Keeper:
         entry.over.append(entry.incarnation)
         entry.start_until, entry.tail = None, fate.tail
         self.ground.left(entry)
-        entry.tried[host] = again
-        entry.restarts += 1
         cause = f"it did not start on {host}: {fate.reason or fate.how}"
+        entry.tried[host] = "" if again else cause
+        entry.restarts += 1
         if not self._exhausted(entry, cause):
             self.chooser.again(entry, cause)
 
