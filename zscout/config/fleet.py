@@ -9,8 +9,8 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
-from zscout.balancing.rules import DEFAULT_RULES, Rules
 from zscout.endpoints import check_links, check_multicast
+from zscout.placing.rules import DEFAULT_RULES, Rules
 from zscout.scheduling.model import SECOND, Ns
 from zscout.scheduling.policy import OPERATOR_PRIORITY, PATIENCE, Policy, Preempt, Promise, StrategyName
 from zscout.strict import BadInput, Where, check_name, check_unique, read_toml, seconds_to_ns

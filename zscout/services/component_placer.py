@@ -12,8 +12,11 @@ import logging
 from typing import Final
 
 from zscout import clock
-from zscout.balancing.placer import Placer
-from zscout.balancing.placing import (
+from zscout.config import Fleet
+from zscout.keyexpr import Role, Token, incarnation_of
+from zscout.mesh import Declared, Mesh
+from zscout.messages import Placements, PlacerOperation
+from zscout.placing.events import (
     Appeared,
     Changed,
     Event,
@@ -26,11 +29,8 @@ from zscout.balancing.placing import (
     Vanished,
     WakeAt,
 )
-from zscout.balancing.placing import Refused as RefusedByCore
-from zscout.config import Fleet
-from zscout.keyexpr import Role, Token, incarnation_of
-from zscout.mesh import Declared, Mesh
-from zscout.messages import Placements, PlacerOperation
+from zscout.placing.events import Refused as RefusedByCore
+from zscout.placing.placer import Placer
 from zscout.scheduling.model import SECOND, Ns, Term
 from zscout.services.load_balancer import LoadBalancer
 from zscout.services.placements import placement_of

@@ -9,10 +9,10 @@ import asyncio
 import logging
 from typing import Final
 
-from zscout.balancing.placing import Inherited
 from zscout.keyexpr import Role, Token, check_name
 from zscout.mesh import Declared, Mesh
 from zscout.messages import MAX_PLACED, ListPlacements, Placement, Placements, absurd
+from zscout.placing.events import Inherited
 from zscout.scheduling.model import NO_TERM, Term
 from zscout.services.placements import record_of
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from zscout.balancing.model import Requirements
-from zscout.balancing.placing import Record, Seen, Spec
 from zscout.messages import ComponentSpec, ComponentView, Placement
+from zscout.placing.events import Record, Seen, Spec
 from zscout.scheduling.model import SECOND
 
 

@@ -10,18 +10,6 @@ from typing import Final, TypeAlias
 
 import msgspec
 
-from zscout.balancing.placer import Placer
-from zscout.balancing.placing import (
-    DrainAsked,
-    Event,
-    MoveAsked,
-    PlaceAsked,
-    Record,
-    State,
-    StopAsked,
-    UncordonAsked,
-)
-from zscout.balancing.placing import Refused as RefusedByCore
 from zscout.keyexpr import check_name
 from zscout.mesh import Refused, Request
 from zscout.messages import (
@@ -36,6 +24,18 @@ from zscout.messages import (
     PlacerOperation,
     UncordonHost,
 )
+from zscout.placing.events import (
+    DrainAsked,
+    Event,
+    MoveAsked,
+    PlaceAsked,
+    Record,
+    State,
+    StopAsked,
+    UncordonAsked,
+)
+from zscout.placing.events import Refused as RefusedByCore
+from zscout.placing.placer import Placer
 from zscout.scheduling.model import Term
 from zscout.services.placements import placement_of, spec_of
 

@@ -9,17 +9,6 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
-from zscout.balancing.placing import (
-    Event,
-    HostTold,
-    Look,
-    Move,
-    MoveAnswered,
-    Start,
-    StartAnswered,
-    Stop,
-    StopAnswered,
-)
 from zscout.config import Fleet
 from zscout.mesh import Mesh, Reply
 from zscout.messages import (
@@ -31,6 +20,17 @@ from zscout.messages import (
     Moved,
     StartComponent,
     StopComponent,
+)
+from zscout.placing.events import (
+    Event,
+    HostTold,
+    Look,
+    Move,
+    MoveAnswered,
+    Start,
+    StartAnswered,
+    Stop,
+    StopAnswered,
 )
 from zscout.scheduling.model import SECOND
 from zscout.services.placements import seen, spec_told

@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from zscout.balancing.entry import Entry, Fate, Moving
-from zscout.balancing.ground import ANSWER, Ground
-from zscout.balancing.keeping import Keeper
 from zscout.balancing.model import SECOND, ComponentId, HostName, Ns
-from zscout.balancing.placing import MoveAnswered, StartAnswered
+from zscout.placing.entry import Entry, Fate, Moving
+from zscout.placing.events import MoveAnswered, StartAnswered
+from zscout.placing.ground import ANSWER, Ground
+from zscout.placing.keeping import Keeper
 
 STARTS: Final = 3
 """The target is asked so often, if it does not answer."""

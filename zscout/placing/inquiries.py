@@ -7,8 +7,8 @@ from __future__ import annotations
 from itertools import islice
 from typing import Final
 
-from zscout.balancing.ground import ANSWER, MAX_COMPONENTS, Ground
 from zscout.balancing.model import ComponentId, HostName
+from zscout.placing.ground import ANSWER, MAX_COMPONENTS, Ground
 
 KIND: Final = "inquiry"
 """Of their timers."""

@@ -10,9 +10,9 @@ from itertools import islice
 from typing import Final
 
 from zscout.balancing.balancer import LOAD_TIME, Balancer
-from zscout.balancing.entry import Entry, Moving
 from zscout.balancing.model import SECOND, ComponentId, HostName, Kind, Ns, Question, Ranked
-from zscout.balancing.placing import (
+from zscout.placing.entry import Entry, Moving
+from zscout.placing.events import (
     Changed,
     Effect,
     Forgotten,
@@ -25,9 +25,9 @@ from zscout.balancing.placing import (
     Start,
     Stop,
 )
-from zscout.balancing.ranks import Ranks
-from zscout.balancing.rules import Rules
-from zscout.balancing.timers import Key, Timers
+from zscout.placing.ranks import Ranks
+from zscout.placing.rules import Rules
+from zscout.placing.timers import Key, Timers
 
 PER_TERM: Final = 1_000
 """Incarnations of a component begin, in each term, at its counter times this."""

@@ -12,8 +12,8 @@ import pytest
 
 from zscout.balancing.balancer import LOAD_TIME, Balancer
 from zscout.balancing.model import REPORT_EVERY, SECOND, ComponentId, HostName, Ns, Profile, Requirements
-from zscout.balancing.placer import Placer
-from zscout.balancing.placing import (
+from zscout.balancing.simulation import Job, Machine, _Host, _Running
+from zscout.placing.events import (
     Appeared,
     DrainAsked,
     Effect,
@@ -32,8 +32,8 @@ from zscout.balancing.placing import (
     Vanished,
     WakeAt,
 )
-from zscout.balancing.rules import Rules
-from zscout.balancing.simulation import Job, Machine, _Host, _Running
+from zscout.placing.placer import Placer
+from zscout.placing.rules import Rules
 
 RULES = Rules(rebalance=True)
 FULL = Profile(1.0, 64_000_000, 9)

@@ -6,13 +6,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from zscout.balancing.choosing import Chooser, in_words
-from zscout.balancing.entry import Entry, Fate
-from zscout.balancing.ground import ANSWER, STOP_ANSWER, Ground
-from zscout.balancing.inquiries import Inquiries
 from zscout.balancing.model import SECOND, ComponentId, HostName, Ns
-from zscout.balancing.placing import Spec, StartAnswered, StopAnswered
-from zscout.balancing.strays import Strays
+from zscout.placing.choosing import Chooser, in_words
+from zscout.placing.entry import Entry, Fate
+from zscout.placing.events import Spec, StartAnswered, StopAnswered
+from zscout.placing.ground import ANSWER, STOP_ANSWER, Ground
+from zscout.placing.inquiries import Inquiries
+from zscout.placing.strays import Strays
 
 GRACE: Final[Ns] = 2 * SECOND
 """What is inherited, or went on elsewhere, has as long to be heard of."""

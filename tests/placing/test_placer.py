@@ -12,15 +12,13 @@ from typing import Final
 
 import pytest
 
-from tests.balancing import transcript
 from tests.balancing.test_balancer import report
-from zscout.balancing import ground
+from tests.placing import transcript
 from zscout.balancing.balancer import Balancer
-from zscout.balancing.choosing import AT_ONCE
-from zscout.balancing.ground import REMEMBERED
 from zscout.balancing.model import SECOND, Policy, Question, Requirements
-from zscout.balancing.placer import Placer
-from zscout.balancing.placing import (
+from zscout.placing import ground
+from zscout.placing.choosing import AT_ONCE
+from zscout.placing.events import (
     Appeared,
     Changed,
     DrainAsked,
@@ -51,7 +49,9 @@ from zscout.balancing.placing import (
     Vanished,
     WakeAt,
 )
-from zscout.balancing.ranks import Ranks
+from zscout.placing.ground import REMEMBERED
+from zscout.placing.placer import Placer
+from zscout.placing.ranks import Ranks
 
 RESTARTS: Final[tuple[Restart, ...]] = ("never", "on_failure", "always")
 

@@ -4,12 +4,12 @@ truth. Of two that live the higher is; the lower is told to stop.
 
 from __future__ import annotations
 
-from zscout.balancing.entry import Entry, Fate
-from zscout.balancing.ground import ANSWER, Ground
-from zscout.balancing.keeping import GRACE, Keeper
 from zscout.balancing.model import ComponentId, HostName
-from zscout.balancing.moving import Mover
-from zscout.balancing.placing import HostTold, Incarnation, Record, Seen
+from zscout.placing.entry import Entry, Fate
+from zscout.placing.events import HostTold, Incarnation, Record, Seen
+from zscout.placing.ground import ANSWER, Ground
+from zscout.placing.keeping import GRACE, Keeper
+from zscout.placing.moving import Mover
 
 
 class Hearing:

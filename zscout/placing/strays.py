@@ -7,9 +7,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from zscout.balancing.ground import STOP_ANSWER, Ground
 from zscout.balancing.model import SECOND, ComponentId, HostName, Ns
-from zscout.balancing.placing import Incarnation
+from zscout.placing.events import Incarnation
+from zscout.placing.ground import STOP_ANSWER, Ground
 
 MAX_STRAYS: Final = 100
 """Of one component."""

@@ -29,8 +29,7 @@ from typing import Any
 
 from zscout.balancing.balancer import Balancer
 from zscout.balancing.model import REPORT_EVERY, SECOND, HostName, Ns, Profile, Report, Requirements
-from zscout.balancing.placer import Placer
-from zscout.balancing.placing import (
+from zscout.placing.events import (
     Appeared,
     Changed,
     DrainAsked,
@@ -60,7 +59,8 @@ from zscout.balancing.placing import (
     Vanished,
     WakeAt,
 )
-from zscout.balancing.rules import Rules
+from zscout.placing.placer import Placer
+from zscout.placing.rules import Rules
 
 INDENT = "    "
 MEGABYTE = 1_000_000

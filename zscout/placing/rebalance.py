@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from zscout.balancing.balancer import LOAD_TIME
-from zscout.balancing.entry import Entry
-from zscout.balancing.ground import Ground
 from zscout.balancing.metrics import Outlook, rate
 from zscout.balancing.model import SECOND, STALE, ComponentId, HostName, Kind, Ns, Profile, Question
-from zscout.balancing.moving import Mover
-from zscout.balancing.timers import Key
+from zscout.placing.entry import Entry
+from zscout.placing.ground import Ground
+from zscout.placing.moving import Mover
+from zscout.placing.timers import Key
 
 EVERY: Final[Ns] = SECOND
 TARGETS: Final = 8

@@ -13,7 +13,7 @@ from random import Random
 from typing import Literal
 
 from zscout.balancing.model import SECOND, ComponentId, HostName, Ns
-from zscout.balancing.placing import (
+from zscout.placing.events import (
     Appeared,
     Event,
     HostLost,

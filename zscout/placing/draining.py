@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 from zscout.balancing.balancer import MAX_HOSTS
-from zscout.balancing.entry import Entry
-from zscout.balancing.ground import DRAIN, Ground
 from zscout.balancing.model import HostName
-from zscout.balancing.moving import RETRY, Mover
+from zscout.placing.entry import Entry
+from zscout.placing.ground import DRAIN, Ground
+from zscout.placing.moving import RETRY, Mover
 
 SIDE_BY_SIDE: Final = 2
 """Components that leave one host at the same time."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from typing import Final, Literal
 
-from zscout.balancing.entry import Entry
-from zscout.balancing.ground import Ground
 from zscout.balancing.model import SECOND, Ns, Ranked
+from zscout.placing.entry import Entry
+from zscout.placing.ground import Ground
 
 TRY_AGAIN: Final[Ns] = SECOND
 """A component for which there is no host looks for one as often."""

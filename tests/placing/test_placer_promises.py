@@ -8,10 +8,10 @@ from random import Random
 
 import pytest
 
-from tests.balancing.placer_hosts import STANDS_BY
-from tests.balancing.placer_world import RULES, World
+from tests.placing.placer_hosts import STANDS_BY
+from tests.placing.placer_world import RULES, World
 from zscout.balancing.model import SECOND, HostName
-from zscout.balancing.placing import (
+from zscout.placing.events import (
     DrainAsked,
     MoveAsked,
     PlaceAsked,

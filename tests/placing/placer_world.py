@@ -11,11 +11,10 @@ from collections.abc import Callable
 from functools import partial
 from random import Random
 
-from tests.balancing.placer_hosts import Host, Hosts, Say, seen_of, told_of
+from tests.placing.placer_hosts import Host, Hosts, Say, seen_of, told_of
 from zscout.balancing.balancer import Balancer
 from zscout.balancing.model import SECOND, ComponentId, HostName, Ns, Report
-from zscout.balancing.placer import Placer
-from zscout.balancing.placing import (
+from zscout.placing.events import (
     Changed,
     Effect,
     Event,
@@ -37,7 +36,8 @@ from zscout.balancing.placing import (
     Tick,
     WakeAt,
 )
-from zscout.balancing.rules import Rules
+from zscout.placing.placer import Placer
+from zscout.placing.rules import Rules
 
 RULES = Rules(start_timeout=3 * SECOND, longest_back_off=4 * SECOND, settled=5 * SECOND)
 QUERY: Ns = 4 * SECOND

@@ -22,15 +22,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from zscout.balancing.balancer import Balancer
-from zscout.balancing.draining import Drain
-from zscout.balancing.ground import DRAIN, Ground
-from zscout.balancing.hearing import Hearing
-from zscout.balancing.inquiries import KIND as INQUIRY
-from zscout.balancing.inquiries import Inquiries
-from zscout.balancing.keeping import Keeper
 from zscout.balancing.model import ComponentId, Ns
-from zscout.balancing.moving import Mover
-from zscout.balancing.placing import (
+from zscout.placing.draining import Drain
+from zscout.placing.events import (
     Appeared,
     DrainAsked,
     Effect,
@@ -51,10 +45,16 @@ from zscout.balancing.placing import (
     Vanished,
     WakeAt,
 )
-from zscout.balancing.rebalance import REBALANCE, Rebalance
-from zscout.balancing.rules import DEFAULT_RULES, Rules
-from zscout.balancing.strays import Strays
-from zscout.balancing.timers import Key
+from zscout.placing.ground import DRAIN, Ground
+from zscout.placing.hearing import Hearing
+from zscout.placing.inquiries import KIND as INQUIRY
+from zscout.placing.inquiries import Inquiries
+from zscout.placing.keeping import Keeper
+from zscout.placing.moving import Mover
+from zscout.placing.rebalance import REBALANCE, Rebalance
+from zscout.placing.rules import DEFAULT_RULES, Rules
+from zscout.placing.strays import Strays
+from zscout.placing.timers import Key
 
 
 class Placer:

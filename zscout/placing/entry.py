@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from zscout.balancing.model import ComponentId, HostName, Ns
-from zscout.balancing.placing import HowEnded, Incarnation, Record, Spec, State
+from zscout.placing.events import HowEnded, Incarnation, Record, Spec, State
 
 OVER: Final = 16
 """Incarnations of a component of which the placer remembers that they ended."""
