@@ -101,7 +101,7 @@ def test_table_1_is_served_as_by_priority() -> None:
     assert adaptive.unserved == first.unserved == ()
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(workloads())
 def test_promises_hold_in_replay(workload: Workload) -> None:
     strategy = Adaptive()

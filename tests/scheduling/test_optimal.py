@@ -86,7 +86,7 @@ def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
     assert [len(one.holders) for one in proposed(effects)] == [8]
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(workloads())
 def test_promises_hold_in_replay(workload: Workload) -> None:
     ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])

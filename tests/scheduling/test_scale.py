@@ -175,8 +175,11 @@ def decisions(effects: list[Effect]) -> list[Effect]:
     return [effect for effect in effects if not isinstance(effect, Queued)]
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("size", SIZES.values(), ids=list(SIZES))
+@pytest.mark.parametrize(
+    ("size", "seed"),
+    # The largest takes ten times as long as the others.
+    [(size, seed) for name, size in SIZES.items() for seed in range(1 if name == "thousands" else 2)],
+)
 def test_an_indexed_pass_is_a_full_pass(size: Size, seed: int) -> None:
     twins = Twins(size, seed)
     for number in range(size.events):

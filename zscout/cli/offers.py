@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -59,6 +60,10 @@ async def _names(fleet: Fleet, *, hosts: bool) -> set[str]:
 
     async with common.connected("complete", fleet, need_rcm=False) as client:
         keys, mesh = client.mesh.keys, client.mesh
+        # Who has just joined sees nobody yet.
+        with suppress(common.NobodyThere, TimeoutError):
+            async with asyncio.timeout(LOOK):
+                await common.see_rcm(client)
         if hosts:
             return {token.host for token in await mesh.living(keys.alive_any(Role.NODE), timeout=LOOK)}
         told = await mesh.ask_one(keys.placer, ListPlacements(), Placements, timeout=LOOK)
