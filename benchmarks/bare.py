@@ -1,7 +1,8 @@
 """The bare cost: a plain Zenoh query, with nothing of zscout on the path.
 
 `python -m benchmarks.bare ADDRESS KEY --bytes N` is the other end, a child process (see child.py): a
-queryable whose direct callback sends N bytes. `--answer TEXT` sends TEXT instead.
+queryable whose direct callback sends N bytes. `--answer TEXT` sends TEXT instead, with the request's own id
+where it begins with one: a client takes no other answer.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from benchmarks.stats import Samples
 KEY = "bench/bare"
 START = 20.0
 WARM_UP = 200
+ID, ID_LENGTH = b'"id":"', 12
 
 
 def settings(address: str) -> zenoh.Config:
@@ -91,9 +93,15 @@ def main() -> None:
     args = parser.parse_args()
     reply = args.answer.encode() if args.answer is not None else b"x" * args.bytes
     concrete = "*" not in args.key
+    head, tail = reply[: len(ID) + 1], reply[len(ID) + 1 + ID_LENGTH :]
 
     def answer(query: zenoh.Query) -> None:
-        query.reply(args.key if concrete else query.key_expr, reply, express=True)
+        said = reply
+        if head.endswith(ID) and query.payload is not None:
+            asked = query.payload.to_bytes()
+            at = asked.find(ID) + len(ID)
+            said = head + asked[at : at + ID_LENGTH] + tail
+        query.reply(args.key if concrete else query.key_expr, said, express=True)
         query.drop()  # type: ignore[no-untyped-call]
 
     with zenoh.open(settings(args.address)) as session:
