@@ -126,7 +126,10 @@ class Profile(NamedTuple):
     threads: int = 1
 
     def wants(self, speed: float) -> float:
-        """Cores that it wants of a host of this speed."""
+        """Cores that it wants of a host of this speed. Of a kind that never ran nobody knows what speed does
+        to it: it counts the same everywhere."""
+        if not self.samples:
+            return min(self.cpu, float(self.threads))
         return min(self.cpu / speed, float(self.threads))
 
 
