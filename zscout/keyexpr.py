@@ -203,6 +203,10 @@ class Keys:
     def frame(self, rc: str) -> str:
         return f"{self.base}/rc/{check_rc(rc)}/frame"
 
+    @property
+    def frame_any(self) -> str:
+        return f"{self.base}/rc/*/*/frame"
+
     # Hosts
 
     def load(self, host: str) -> str:
@@ -247,6 +251,29 @@ class Keys:
     def requests_any(self) -> str:
         return f"{self.base}/client/*/*/requests"
 
+    def behavior(self, client: Sender) -> str:
+        return f"{self.base}/client/{_sender(client)}/behavior"
+
+    @property
+    def behavior_any(self) -> str:
+        return f"{self.base}/client/*/*/behavior"
+
+    # Simulated buildings
+
+    def building_plan(self, client: Sender) -> str:
+        return f"{self.base}/building/{_sender(client)}/plan"
+
+    @property
+    def building_plan_any(self) -> str:
+        return f"{self.base}/building/*/*/plan"
+
+    def building_poses(self, client: Sender) -> str:
+        return f"{self.base}/building/{_sender(client)}/poses"
+
+    @property
+    def building_poses_any(self) -> str:
+        return f"{self.base}/building/*/*/poses"
+
     # Liveliness
 
     def alive(self, token: Token) -> str:
@@ -263,12 +290,14 @@ class Keys:
     # Parsing: each raises BadName for a key of another form
 
     def sender_of(self, key: str) -> Sender:
-        """Who sent a request or command, or owns a client key: the last two chunks, or those of `client`."""
+        """Who sent a request or command, or owns the key of a client or a building."""
         chunks = self._chunks(key)
         match chunks:
             case ["rcm", "schedule", host, client] | ["rc", _, _, "command", host, client]:
                 pass
-            case ["client", host, client, "notice" | "requests"]:
+            case ["client", host, client, "notice" | "requests" | "behavior"]:
+                pass
+            case ["building", host, client, "plan" | "poses"]:
                 pass
             case _:
                 raise BadName(f"{key[:200]!r} does not name its sender")

@@ -22,6 +22,7 @@ from zscout.messages import (
     Command,
     Done,
     EndedHold,
+    Figures,
     Grants,
     Holder,
     Proposal,
@@ -43,6 +44,8 @@ REREAD_TIMEOUT = 0.5
 REREADS = 4
 """Readings in a row when publications overtake the answers."""
 COMMAND_QUEUE = 64
+FIGURES_PERIOD = 1.0
+"""Seconds from one look at a driver's figures to the next."""
 
 
 class Driver:
@@ -54,6 +57,13 @@ class Driver:
     sharable = False
     activation: float = 0.0
     """Seconds after a grant until the device has its full use, like a camera that warms up."""
+
+    async def open(self, rc: ResourceController) -> None:
+        """The RC is about to be offered: the time to take what is needed of `rc.mesh`. A device that is not
+        there is no error: call `rc.fail`, go on trying, and `rc.recover`."""
+
+    async def close(self) -> None:
+        """The RC has left the mesh, and `safe` has been called."""
 
     async def begin(self, holder: Holder) -> None:
         """Somebody begins to hold the device."""
@@ -72,6 +82,14 @@ class Driver:
     def capacity(self) -> Amounts:
         """Bounds that people may like to see, by bandwidth parameter."""
         return {}
+
+    def figures(self) -> Figures:
+        """Rates, drops, latency and the like, by name; told when they change, once a second at most."""
+        return {}
+
+    def usable_cold(self, do: Mapping[str, Any]) -> bool:
+        """Whether this command can be carried out while the device still warms up."""
+        return False
 
 
 class ResourceController:
@@ -105,7 +123,9 @@ class ResourceController:
         self._declared.append(mesh.watch(keys.alive_any(Role.RCM), self._on_leader))
         self._declared.append(mesh.subscribe(keys.grants, Grants, self._on_grants))
         await self._read_state()
+        await self.driver.open(self)
         self._spawn(self._worker())
+        self._spawn(self._tell_figures())
         self._declared.append(mesh.serve(keys.rc_state(self.name), RcAsk, self._on_state_asked))
         if self.driver.sharable:
             self._declared.append(mesh.serve(keys.vote(self.name), Proposal, self._on_proposal))
@@ -123,8 +143,9 @@ class ResourceController:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._state.close()
         await self._guard(self.driver.safe())
+        await self._guard(self.driver.close())
+        self._state.close()
 
     def rules_changed(self) -> None:
         """The driver votes by other rules from now on: earlier votes are void."""
@@ -180,6 +201,7 @@ class ResourceController:
             rules=self.rules,
             leader=self._sees_leader(),
             capacity=self.driver.capacity(),
+            figures=self.driver.figures(),
         )
 
     def _sees_leader(self) -> bool:
@@ -223,7 +245,7 @@ class ResourceController:
         if command.do.get("name") == "confirm":
             request.answer(Done(warming=warming))
             return
-        if warming:
+        if warming and not self.driver.usable_cold(command.do):
             raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
         result = await self.driver.command(self.holding.held[command.grant].holder, command.do)
         request.answer(Done(result=result))
@@ -256,6 +278,15 @@ class ResourceController:
             await self._guard(self.driver.safe())
         for holder in change.began:
             await self._guard(self.driver.begin(holder))
+
+    async def _tell_figures(self) -> None:
+        told = self.driver.figures()
+        while True:
+            await asyncio.sleep(FIGURES_PERIOD)
+            figures = self.driver.figures()
+            if figures != told:
+                told = figures
+                self.publish()
 
     async def _guard(self, action: Any) -> None:
         try:

@@ -20,11 +20,15 @@ os.environ.setdefault(
 
 from zscout.mesh.declared import Declared, Overheard, Publisher
 from zscout.mesh.exchange import Refused, Reply, Request
+from zscout.mesh.frames import Frame, FramePublisher, FrameWatch
 from zscout.mesh.session import Mesh, MeshError
 from zscout.mesh.settings import zenoh_config
 
 __all__ = [
     "Declared",
+    "Frame",
+    "FramePublisher",
+    "FrameWatch",
     "Mesh",
     "MeshError",
     "Overheard",

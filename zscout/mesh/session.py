@@ -16,6 +16,7 @@ from zscout.config import Mesh as MeshConfig
 from zscout.keyexpr import BadName, Keys, Sender, Token
 from zscout.mesh.declared import Declared, Overheard, Publisher, Shared
 from zscout.mesh.exchange import Refused, Reply, Request, drop, encoding_of, read_reply, reply_problem
+from zscout.mesh.frames import FramePublisher, FrameWatch
 from zscout.mesh.inbox import QUEUE_DEPTH, Backlog, Inbox
 from zscout.mesh.settings import zenoh_config
 from zscout.messages import Malformed, Problem
@@ -339,6 +340,16 @@ class Mesh:
         """Keeps the latest `depth` publications on `key` for whoever looks: with a `kind` of few fields, to
         know now and then who spoke costs next to nothing that way."""
         return Overheard(self._session.declare_subscriber(key, RingChannel(depth)), kind, depth)
+
+    # Frames
+
+    def frame_publisher(self, key: str) -> FramePublisher:
+        """A publisher of JPEG frames, which knows whether anybody looks."""
+        return FramePublisher(self._session, key, self._inbox)
+
+    def frames(self, key: str) -> FrameWatch:
+        """The newest frame on `key`, for whoever looks as often as it can. Close it."""
+        return FrameWatch(self._session, key, self._inbox)
 
     # Liveliness
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, TypeAlias
+
+from msgspec import Meta
 
 from zscout.messages.base import Amounts, Message, Seconds
 from zscout.messages.scheduling import Holder
 from zscout.scheduling.model import NO_TERM, Grant, Term
+
+MAX_FIGURES = 32
+MAX_FRAME = 2_000_000
+"""Bytes of one frame."""
+Figures: TypeAlias = Annotated[dict[str, float], Meta(max_length=MAX_FIGURES)]
 
 
 class ProposedHolder(Message, frozen=True):
@@ -80,3 +87,20 @@ class RcState(Message, frozen=True):
     leader: bool = False
     """Whether it sees a leading RCM."""
     capacity: Amounts = {}
+    figures: Figures = {}
+    """Rates, drops, latency and the like of the device, by name; they tell people, and decide nothing."""
+
+
+class FrameHead(Message, frozen=True):
+    """What is attached to a frame; the payload itself is the JPEG."""
+
+    number: int
+    """Of the picture since its source was opened first; a gap means that pictures were not published."""
+    time: Seconds
+    """When the picture was read, by a clock of the framegrabber's own: only differences mean anything."""
+    width: int
+    height: int
+    grant: Grant | None = None
+    """The hold under which it was taken; none while the framegrabber is free."""
+    source: str = ""
+    """The video RC to which the framegrabber is tuned, if it knows several."""
