@@ -1,0 +1,159 @@
+"""Trees of behaviors: paths, sayings, failures side by side, memories."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, cast
+
+import pytest
+
+from zscout.behaviors.client import Client
+from zscout.behaviors.sensor_net.alerts import QUIET, Alerts
+from zscout.behaviors.sensor_net.blindness import BAD_FOR, Blindness
+from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, Saying, Scene
+
+
+class Count(Behavior):
+    """Counts to `to`, and fails there if it is to."""
+
+    def __init__(self, name: str, to: int = 3, *, fails: bool = False) -> None:
+        super().__init__(name)
+        self.to, self.fails, self.count = to, fails, 0
+
+    async def run(self, scene: Scene) -> None:
+        while self.count < self.to:
+            self.count += 1
+            self.say("counting", str(self.count))
+            await scene.safe_point()
+        if self.fails:
+            raise RuntimeError(self.path)
+
+    def memory(self) -> dict[str, Any]:
+        return {"count": self.count}
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        self.count = int(memory["count"])
+
+
+class All(Behavior):
+    failures: list[BaseException]
+
+    async def run(self, scene: Scene) -> None:
+        self.failures = await self.side_by_side(scene, self.children)
+
+
+def played(root: Behavior) -> list[Saying]:
+    said: list[Saying] = []
+
+    async def safe_point() -> None:
+        await asyncio.sleep(0)
+
+    nobody = cast("Client", None)  # nothing here speaks to the mesh
+    asyncio.run(root.play(Scene(nobody, safe_point, said.append)))
+    return said
+
+
+def test_one_that_fails_leaves_the_others_at_work() -> None:
+    root = All("net")
+    for child in (Count("a", 5), Count("b", 2, fails=True), Count("c", 5)):
+        root.add(child)
+    said = played(root)
+    assert [str(failure) for failure in root.failures] == ["net/b"]
+    assert [s.detail for s in said if s.path == "net/c" and s.doing] == ["1", "2", "3", "4", "5"]
+    ended = [s.path for s in said if not s.doing]
+    assert sorted(ended) == ["net/a", "net/b", "net/c"]
+
+
+def test_the_same_said_again_is_told_once() -> None:
+    class Same(Behavior):
+        async def run(self, scene: Scene) -> None:
+            for _ in range(3):
+                self.say("watch")
+            self.say("watch", alert=True)
+            self.say("watch", camera="framegrabber/f1", boxes=[(1, 2, 3, 4)])
+
+    said = played(Same("one"))
+    assert [(s.doing, s.alert, len(s.boxes)) for s in said] == [
+        ("watch", False, 0),
+        ("watch", True, 0),
+        ("watch", False, 1),
+        ("", False, 0),
+    ]
+
+
+def test_a_tree_is_remembered_whole() -> None:
+    def tree() -> All:
+        root = All("net")
+        for name in "ab":
+            root.add(Count(name, 4))
+        return root
+
+    one, other = tree(), tree()
+    cast("Count", one.children[1]).count = 3
+    other.restore(one.checkpoint())
+    assert other.checkpoint() == one.checkpoint()
+    assert [s.detail for s in played(other) if s.path == "net/b" and s.doing] == ["4"]
+
+
+def test_trees_have_bounds() -> None:
+    root = All("net")
+    for number in range(MAX_CHILDREN):
+        root.add(Count(f"c{number}"))
+    with pytest.raises(ValueError, match="net may have"):
+        root.add(Count("more"))
+    twice = All("n")
+    twice.add(Count("a"))
+    with pytest.raises(ValueError, match="a already"):
+        twice.add(Count("a"))
+    with pytest.raises(ValueError, match="not valid"):
+        Count("a/b")
+    deep: Behavior = All("n")
+    for number in range(MAX_DEPTH - 1):
+        child = All(f"d{number}")
+        deep.add(child)
+        deep = child
+    with pytest.raises(ValueError, match="deep"):
+        deep.add(Count("too-deep"))
+
+
+# Whose fault it is that there is no picture
+
+
+def test_a_channel_without_a_picture_is_left_for_another() -> None:
+    blind, channels = Blindness(5.0), ["video/ch1", "video/ch2"]
+    blind.begin(0)
+    assert [blind.see(at, False, "video/ch1") for at in (1, 4.9, 5)] == [False, False, True]
+    assert not blind.dead
+    assert blind.choose(6, channels) == "video/ch2"
+    blind.begin(6)
+    assert not blind.see(8, True, "video/ch2")
+    assert blind.choose(9, channels) == "video/ch2"
+    assert blind.choose(5 + BAD_FOR, channels) is None
+
+
+def test_a_robot_that_no_channel_shows_is_dead() -> None:
+    blind = Blindness(5.0)
+    for start, channel in ((0, "video/ch1"), (10, "video/ch2")):
+        blind.begin(start)
+        assert blind.see(start + 5, False, channel)
+    assert blind.dead
+    assert blind.choose(16, ["video/ch1", "video/ch2"]) is None
+    other = Blindness(5.0)
+    other.recall(blind.memory())
+    assert other.dead
+
+
+def test_a_picture_that_comes_and_goes_is_no_fault() -> None:
+    blind = Blindness(5.0)
+    blind.begin(0)
+    assert not any(blind.see(at / 2, at % 8 == 0, "video/ch1") for at in range(200))
+
+
+def test_an_alert_for_each_event() -> None:
+    alerts = Alerts()
+    moves = {1.0, 1.1, 1.0 + QUIET, 8.0}
+    words = [alerts.see(at, at in moves) for at in (0.5, 1.0, 1.1, 2.0, 1.0 + QUIET, 5.5, 8.0)]
+    assert words == ["", "start", "", "", "", "end", "start"]
+    alerts.rest()
+    assert alerts.see(8.1, True) == "start"
+    assert alerts.count == 3

@@ -1,0 +1,86 @@
+"""A robot that is held together with its radio, a video channel and a framegrabber."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+from zscout import clock
+from zscout.behaviors.arc import Held
+from zscout.behaviors.client import CommandRefused
+from zscout.packets import MAX_PACKET
+from zscout.scheduling.model import SECOND, Ns
+
+GONE: Final = frozenset({"ended", "free", "not_holder", "wrong_client"})
+"""Refusals that mean: this hold is over, and the client will hear of it presently."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotNeeds:
+    """What a behavior with one robot needs at the same moment. All but `robot` may be patterns."""
+
+    robot: str
+    radio: str = "radio/*"
+    video: str = "video/*"
+    framegrabber: str = "framegrabber/*"
+    command_rate: float = 5.0
+    """Commands in a second that it will send at most."""
+
+    def needs(self, *, video: str | None = None) -> dict[str, dict[str, Any]]:
+        """As an ARC asks for them; `video` names another channel than usual."""
+        return {
+            self.robot: {},
+            self.radio: {"command_rate": self.command_rate, "packet_size": MAX_PACKET},
+            video or self.video: {"transmitters": 1},
+            self.framegrabber: {},
+        }
+
+
+class HeldRobot:
+    """Commands to the robot, at the rate that its ARC asked for."""
+
+    def __init__(self, held: Held, needs: RobotNeeds, *, video: str | None = None) -> None:
+        self.held = held
+        self.robot = held.rc(needs.robot)
+        self.radio = held.rc(needs.radio)
+        self.video = held.rc(video or needs.video)
+        self.framegrabber = held.rc(needs.framegrabber)
+        self._period: Ns = round(SECOND / needs.command_rate)
+        self._next: Ns = 0
+        self._still = False
+        """Whether the last that was sent is a stop."""
+        self.sent = self.refused = 0
+
+    async def camera(self, on: bool) -> None:
+        """Switches its transmitter on, to the channel that is held, or off."""
+        await self._command({"name": "camera", "on": on})
+
+    async def drive(self, left: float, right: float, lasts: float) -> bool:
+        """Turns the wheels (-1 to 1 of top speed) for `lasts` seconds at most, unless the next command comes
+        before. False: not sent, because it was too early for another one.
+
+        Wheels that are to stand are told to stop at once, and only once."""
+        if left == 0 and right == 0:
+            if self._still:
+                return True
+            self._still = await self._command({"name": "stop"})
+            return self._still
+        now = clock.now()
+        if now < self._next:
+            return False
+        # A command that comes late does not make the next one late as well.
+        self._next = max(self._next + self._period, now)
+        self._still = False
+        return await self._command({"name": "drive", "left": left, "right": right, "lasts": lasts})
+
+    async def _command(self, do: dict[str, Any]) -> bool:
+        try:
+            await self.held.command(self.robot, do)
+        except CommandRefused as refused:
+            self.refused += 1
+            if refused.code in GONE:
+                # What takes the hold away also interrupts the body that we are in.
+                await self.held.over()
+            return False
+        self.sent += 1
+        return True

@@ -1,0 +1,159 @@
+"""Which robots of a sensor net are at it, and who stands in for one that is lost. Pure; time is passed in.
+
+    events   told(robot, word)        what the robot's own behavior said of itself
+             there(robots)            which robots are on the mesh
+             failed(robot, why)       its behavior could not be started, or was given up
+    effects  Start(robot), Stop(robot)
+
+`wanted` robots are to be placed. They are started in the order in which they were named; one that is lost
+(its camera shows nothing, it is gone from the mesh for PATIENCE, or its behavior can't be had) is replaced by
+the next that is free. One that comes back is free again; whoever has replaced it stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal, TypeAlias
+
+PATIENCE: Final = 10.0
+"""Seconds that a robot may be away from the mesh before it counts as lost."""
+GONE: Final = "it is not on the mesh"
+RETRY: Final = 60.0
+"""Seconds after which one that failed may be tried again, where there is nobody else."""
+
+HIDDEN: Final = frozenset({"hidden", "watch", "alert", "blind"})
+"""Words of a robot that has found its place."""
+PAUSED: Final = frozenset({"wait", "lost", ""})
+"""Words that tell nothing of where it stands."""
+
+Standing: TypeAlias = Literal["free", "active", "lost"]
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    robot: str
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    robot: str
+    why: str
+
+
+Effect: TypeAlias = Start | Stop
+
+
+@dataclass(slots=True)
+class Member:
+    """A robot of the net."""
+
+    robot: str
+    standing: Standing = "free"
+    doing: str = ""
+    why: str = ""
+    alerts: int = 0
+    hidden: bool = False
+    there: bool = False
+    away_since: float | None = None
+    lost_at: float = 0.0
+
+
+class Net:
+    """The state of a sensor net."""
+
+    def __init__(self, robots: Sequence[str], wanted: int | None = None) -> None:
+        """Raises ValueError for no robots, one named twice, or more wanted than named."""
+        if not robots or len(set(robots)) != len(robots):
+            raise ValueError("robots must be named, each once")
+        self.wanted = len(robots) if wanted is None else wanted
+        if not 1 <= self.wanted <= len(robots):
+            raise ValueError(f"wanted is {wanted}; write 1 to {len(robots)}, the robots there are")
+        self.members = {robot: Member(robot) for robot in robots}
+
+    @property
+    def hidden(self) -> int:
+        return sum(member.hidden for member in self._active)
+
+    @property
+    def watching(self) -> int:
+        return sum(member.doing in ("watch", "alert") for member in self._active)
+
+    @property
+    def alerts(self) -> int:
+        return sum(member.alerts for member in self.members.values())
+
+    @property
+    def _active(self) -> list[Member]:
+        return [member for member in self.members.values() if member.standing == "active"]
+
+    def told(self, now: float, robot: str, doing: str, *, alert: bool = False) -> list[Effect]:
+        """A robot's behavior says what it does. Words of robots that are not at it are old: ignored."""
+        member = self.members.get(robot)
+        if member is None or member.standing != "active":
+            return []
+        member.doing = doing
+        member.alerts += alert
+        if doing in HIDDEN:
+            member.hidden = True
+        elif doing not in PAUSED:
+            member.hidden = False
+        if doing == "lost":
+            return self._lose(now, member, "its camera shows nothing")
+        return []
+
+    def failed(self, now: float, robot: str, why: str) -> list[Effect]:
+        """The robot's behavior can't be had."""
+        member = self.members[robot]
+        return self._lose(now, member, why) if member.standing == "active" else []
+
+    def there(self, now: float, robots: Iterable[str]) -> list[Effect]:
+        """Exactly these robots are on the mesh now. Call it now and then: it also sees to what is due."""
+        present = set(robots)
+        effects: list[Effect] = []
+        for member in self.members.values():
+            member.there = member.robot in present
+            if member.there:
+                member.away_since = None
+                if member.standing == "lost" and member.why == GONE:
+                    member.standing, member.why = "free", ""
+                continue
+            if member.away_since is None:
+                member.away_since = now
+            if member.standing == "active" and now - member.away_since >= PATIENCE:
+                effects += self._lose(now, member, GONE)
+        return effects + self._fill(now)
+
+    def _lose(self, now: float, member: Member, why: str) -> list[Effect]:
+        member.standing, member.why, member.lost_at = "lost", why, now
+        member.hidden, member.doing = False, ""
+        return [Stop(member.robot, why), *self._fill(now)]
+
+    def _fill(self, now: float) -> list[Effect]:
+        effects: list[Effect] = []
+        while len(self._active) < self.wanted:
+            member = self._next(now)
+            if member is None:
+                break
+            member.standing, member.why, member.doing = "active", "", ""
+            effects.append(Start(member.robot))
+        return effects
+
+    def _next(self, now: float) -> Member | None:
+        """Who begins next: of those on the mesh the first that is free, else the one lost for longest."""
+        here = [member for member in self.members.values() if member.there]
+        free = next((member for member in here if member.standing == "free"), None)
+        if free is not None:
+            return free
+        stale = [m for m in here if m.standing == "lost" and now - m.lost_at >= RETRY]
+        return min(stale, key=lambda member: member.lost_at, default=None)
+
+    # What outlives a move
+
+    def memory(self) -> dict[str, Any]:
+        return {"members": [asdict(member) for member in self.members.values()]}
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        for known in memory["members"]:
+            if known["robot"] in self.members:
+                self.members[known["robot"]] = Member(**known)
