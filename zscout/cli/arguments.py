@@ -8,6 +8,7 @@ from decimal import Decimal
 from typing import Any, Final
 
 import click
+from click.shell_completion import CompletionItem
 
 from zscout import amounts
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern
@@ -58,6 +59,34 @@ class Need(click.ParamType[tuple[str, dict[str, Decimal]]]):
             if "/" not in str(value) and ctx is not None and not ctx.meta.get("command"):
                 raise BadInput(f"{error}; a command goes after --") from None
             raise
+
+
+class RcName(click.ParamType[str]):
+    """An RC of one kind: `robot/scout33`, or `scout33` alone; with `pattern` also `robot/*`. Tab offers those
+    on the mesh."""
+
+    name = "rc"
+
+    def __init__(self, kind: str, *, pattern: bool = False) -> None:
+        self._kind, self._pattern = kind, pattern
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        text = str(value)
+        rc = text if "/" in text else f"{self._kind}/{text}"
+        try:
+            check_need(rc)
+        except BadName as error:
+            raise BadInput(str(error)) from None
+        if rc.partition("/")[0] != self._kind or (is_pattern(rc) and not self._pattern):
+            raise BadInput(f"{quoted(text)} is no {self._kind}; name one, as in {self._kind}/NAME")
+        return rc
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        from zscout.cli.offers import rcs
+
+        return [CompletionItem(rc) for rc in rcs(ctx, self._kind) if rc.startswith(incomplete)]
 
 
 def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:

@@ -31,6 +31,31 @@ def hosts(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[s
     return _offer(ctx, param, incomplete, hosts=True)
 
 
+def rcs(ctx: click.Context, kind: str) -> list[str]:
+    """The RCs of one kind that are on the mesh."""
+    from zscout.keyexpr import BadName
+    from zscout.mesh import MeshError
+    from zscout.strict import BadInput
+
+    try:
+        names = asyncio.run(_rcs(_fleet(ctx)))
+    except (BadInput, BadName, MeshError):
+        return []
+    return sorted(name for name in names if name.startswith(f"{kind}/"))
+
+
+async def _rcs(fleet: Fleet) -> set[str]:
+    from zscout.cli import common
+    from zscout.keyexpr import Role
+
+    async with common.connected("complete", fleet, need_rcm=False) as client:
+        with suppress(common.NobodyThere, TimeoutError):
+            async with asyncio.timeout(LOOK):
+                await common.see_rcm(client)
+        mesh = client.mesh
+        return {token.name for token in await mesh.living(mesh.keys.alive_any(Role.RC), timeout=LOOK)}
+
+
 def _offer(ctx: click.Context, param: click.Parameter, incomplete: str, *, hosts: bool) -> list[str]:
     from zscout.keyexpr import BadName
     from zscout.mesh import MeshError

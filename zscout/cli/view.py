@@ -5,38 +5,27 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import os
-import re
 import socket
 import sys
-from collections import deque
-from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
-from importlib.util import find_spec
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
 import click
-import msgspec
 
-from zscout.cli import common, launch
+from zscout.cli import common
+from zscout.cli.children import Child, child, first_to_end, viewer_binary
 from zscout.config import Recorder
 from zscout.keyexpr import valid_name
-from zscout.services.recorder_process import BAD_SETTINGS, Job, Recording, encode_job
+from zscout.services.recorder_process import Job, Recording, encode_job
 from zscout.strict import BadInput, quoted
 
 WEB_PORT: Final = 9090
 MAGIC: Final = b"RRF"
 """How every recording begins."""
-START: Final = 20.0
-"""Seconds within which a recorder or a viewer has come up, on a busy machine."""
-GRACE: Final = 15.0
-"""Seconds for a child to end by itself: the recorder finishes its file."""
-MAX_LINE: Final = 65_536
-KEPT: Final = 20
-"""Last lines of a child's log that are kept, to say why it failed."""
 HOSTING: Final = "Hosting a web-viewer at"
-_COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
 
 
 @click.command()
@@ -105,11 +94,11 @@ async def _view(
             command += ["--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen"]
             command += ["--connect", shown] if file is None else [shown]
         else:
-            page = _free_port(bind, port) if port is not None else _free_port(bind, WEB_PORT, 0)
-            stream = _free_port(bind, 0)
+            page = free_port(bind, port) if port is not None else free_port(bind, WEB_PORT, 0)
+            stream = free_port(bind, 0)
             command += ["--serve-web", "--bind", bind, "--web-viewer-port", str(page), "--port", str(stream)]
             command += [shown]
-        async with _child("the viewer", command, {"RUST_LOG": "info" if web else "error"}) as viewer:
+        async with child("the viewer", command, {"RUST_LOG": "info" if web else "error"}) as viewer:
             if web:
                 await viewer.says(HOSTING)
                 source = shown if file is None else f"rerun+http://{_host(bind)}:{stream}/proxy"
@@ -120,7 +109,7 @@ async def _view(
             elif web:
                 common.print_line(f"Open {address}")
                 common.print_line("Ctrl-C ends")
-            await _first_to_end([viewer, *children])
+            await first_to_end([viewer, *children])
 
 
 @asynccontextmanager
@@ -135,7 +124,7 @@ async def _source(
     host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
     job = Job(Recorder(out, bind, port or 0), fleet, host)
     command = [sys.executable, "-m", "zscout.services.recorder"]
-    async with _child("the recorder", command, {}, job=encode_job(job)) as recorder:
+    async with child("the recorder", command, {}, job=encode_job(job)) as recorder:
         told = await recorder.told()
         if told.url is None:
             raise common.Failed("the recorder serves no live stream; report this as a bug")
@@ -154,146 +143,6 @@ async def _say_if_alone() -> None:
             pass
     except common.NobodyThere as error:
         common.print_line(f"zscout: {error}", sys.stderr)
-
-
-class Child:
-    """A process that was started here, and what it logs."""
-
-    def __init__(self, what: str, process: asyncio.subprocess.Process) -> None:
-        self.what, self.process = what, process
-        self.lines: deque[str] = deque(maxlen=KEPT)
-        self._news = asyncio.Event()
-        self._log = asyncio.create_task(self._read_log())
-
-    async def says(self, words: str) -> None:
-        """Returns once these words stand in its log. Raises Failed if it ends first, or takes too long."""
-        try:
-            async with asyncio.timeout(START):
-                while not any(words in line for line in self.lines):
-                    if self._log.done():
-                        await self.process.wait()
-                        raise self.failed()
-                    self._news.clear()
-                    await self._news.wait()
-        except TimeoutError:
-            raise common.Failed(
-                f"{self.what} did not start within {START:g} s; is this host overloaded?"
-            ) from None
-
-    async def told(self) -> Recording:
-        """What a recorder says when it records. Raises BadInput and Failed where it can't."""
-        stdout = self.process.stdout
-        assert stdout is not None  # noqa: S101
-        try:
-            async with asyncio.timeout(START):
-                return msgspec.json.decode(await stdout.readline(), type=Recording)
-        except TimeoutError:
-            raise common.Failed(
-                f"{self.what} did not start within {START:g} s; is this host overloaded?"
-            ) from None
-        except ValueError:  # it ended before that
-            await self.process.wait()
-            await self._log
-            raise self.failed() from None
-
-    def failed(self) -> Exception:
-        """Why it ended, in its own last words."""
-        code = self.process.returncode
-        words = self.lines[-1] if self.lines else "without a word"
-        if self.process.stdout is not None and code == BAD_SETTINGS:
-            return BadInput(words.partition(" ERROR ")[2] or words)
-        return common.Failed(f"{self.what} ended (code {code}): {words}")
-
-    async def _read_log(self) -> None:
-        stderr = self.process.stderr
-        assert stderr is not None  # noqa: S101
-        while True:
-            try:
-                line = await stderr.readline()
-            except ValueError:  # longer than MAX_LINE: it is skipped
-                continue
-            if not line:
-                self._news.set()
-                return
-            text = common.clean(_COLOURS.sub("", line.decode(errors="replace"))).strip()
-            if text:
-                self.lines.append(text)
-                self._news.set()
-
-    async def end(self) -> None:
-        """Ends it, at first by asking; returns when it is gone."""
-        process = self.process
-        if process.returncode is None:
-            # A recorder ends with its input, a viewer by its signal.
-            if process.stdin is not None:
-                process.stdin.close()
-            else:
-                with suppress(ProcessLookupError):
-                    process.terminate()
-        try:
-            async with asyncio.timeout(GRACE):
-                await process.wait()
-        except (TimeoutError, asyncio.CancelledError) as error:
-            with suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
-            if isinstance(error, asyncio.CancelledError):  # a second Ctrl-C
-                raise
-        finally:
-            self._log.cancel()
-
-
-@asynccontextmanager
-async def _child(
-    what: str, command: Sequence[str], env: Mapping[str, str], *, job: bytes | None = None
-) -> AsyncIterator[Child]:
-    """Starts a child that ends with this context, and with this process however that ends.
-
-    It leads a session of its own: Ctrl-C reaches only us, and we end it in order."""
-    assert launch.__file__ is not None  # noqa: S101
-    pipe = asyncio.subprocess.PIPE
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-I", "-S", launch.__file__, str(os.getpid()), "-1"),
-        *command,
-        stdin=pipe if job is not None else asyncio.subprocess.DEVNULL,
-        stdout=pipe if job is not None else asyncio.subprocess.DEVNULL,
-        stderr=pipe,
-        env=os.environ | env,
-        limit=MAX_LINE,
-        start_new_session=True,
-    )
-    child = Child(what, process)
-    try:
-        if job is not None and process.stdin is not None:
-            process.stdin.write(job)
-        yield child
-    finally:
-        await child.end()
-
-
-async def _first_to_end(children: Sequence[Child]) -> None:
-    """Returns when the viewer, the first of them, was closed. Raises Failed when any fails."""
-    waits = {asyncio.create_task(child.process.wait()): child for child in children}
-    try:
-        done, _ = await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in waits:
-            task.cancel()
-    for task in done:
-        child = waits[task]
-        if child is not children[0] or child.process.returncode != 0:
-            raise child.failed()
-
-
-def viewer_binary() -> Path:
-    """The viewer itself: the `rerun` script only wraps it, and killing the script would orphan it."""
-    spec = find_spec("rerun_cli")
-    binary = Path(spec.origin).with_name("rerun") if spec is not None and spec.origin is not None else None
-    if binary is None or not os.access(binary, os.X_OK):
-        raise common.Failed(
-            "the Rerun viewer is not installed; install the package rerun-sdk for this platform"
-        )
-    return binary
 
 
 def _check(file: Path) -> None:
@@ -315,7 +164,7 @@ def _check(file: Path) -> None:
         raise BadInput(f"{file}: the viewer knows a recording by its name; rename it to end in .rrd")
 
 
-def _free_port(bind: str, *ports: int) -> int:
+def free_port(bind: str, *ports: int) -> int:
     """The first of these ports that is free, 0 for any. Raises BadInput where all are taken."""
     family = socket.AF_INET6 if ":" in bind else socket.AF_INET
     reason = ""

@@ -1,0 +1,123 @@
+"""What one robot of a sensor net does with what it sees. Pure: time and pictures in, wheels and words out.
+
+A scout has two tasks. It *hides* until it stands in the dark and faces the light, and then *watches* for
+motion. It does either only while it is held, and lives on in between; `PlaceRobot` puts it on the mesh, the
+studies and tests run it under virtual time.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from typing import Any, Final, Literal, TypeAlias
+
+from zscout.behaviors.sensor_net.alerts import Alerts
+from zscout.behaviors.sensor_net.blindness import Blindness
+from zscout.hiding.hider import Hider
+from zscout.vision.garble import garbled
+from zscout.vision.lens import Picture
+from zscout.vision.motion import Box, MotionDetector
+
+PATIENCE: Final = 10.0
+"""Seconds from the beginning of a hold, or from the last picture, until the robot counts as not seen."""
+
+Task: TypeAlias = Literal["hide", "watch"]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What follows from one look."""
+
+    left: float
+    """Wheels: -1 to 1 of top speed."""
+    right: float
+    lasts: float
+    """Seconds that they may turn without a newer command."""
+    doing: str
+    detail: str
+    boxes: tuple[Box, ...] = ()
+    """Of what moves, in pixels of the picture."""
+    alert: bool = False
+    """Something has begun to move."""
+    quiet: bool = False
+    """It has stopped moving: boxes shown before are old."""
+    over: bool = False
+    """The task of this hold is done: give it back, and ask for the other."""
+    blind: bool = False
+    """No picture for too long: give the hold back."""
+
+
+class Scout:
+    """One robot's part of the net."""
+
+    def __init__(self, *, seed: int = 0) -> None:
+        self.hider = Hider(seed=seed)
+        self.alerts = Alerts()
+        self.blindness = Blindness(PATIENCE)
+        self._detector = MotionDetector()
+        self._task: Task = "hide"
+        """Of the present hold."""
+        self._held = False
+
+    @property
+    def task(self) -> Task:
+        """What it would be held for now."""
+        return "watch" if self.hider.state == "hidden" else "hide"
+
+    def held(self, now: float) -> None:
+        """A hold begins, or goes on elsewhere after a move. `now` in seconds, by the clock of all calls."""
+        if self._held:
+            return
+        self._held = True
+        self._task = self.task
+        self._detector = MotionDetector()
+        self.hider.resumed(now)
+        self.blindness.begin(now)
+
+    def released(self, now: float) -> None:
+        """The hold is over, for whatever reason: the robot stands, and somebody else may move it."""
+        self._held = False
+        self.hider.interrupted(now)
+        self.alerts.rest()
+
+    def see(self, now: float, picture: Picture | None, channel: str) -> Step:
+        """Takes the newest picture, or None if none came, from the robot on this video channel."""
+        good = picture is not None and not garbled(picture)
+        blind = self.blindness.see(now, good, channel)
+        act = self.hider.see(now, picture)
+        step = Step(
+            act.left, act.right, act.lasts, act.doing, act.why, blind=blind, over=self.task != self._task
+        )
+        if self._task == "hide" or step.over or step.blind:
+            return step
+        if picture is None or not good:
+            return Step(0, 0, 0, "blind", "no good picture")
+        return self._watch(now, picture)
+
+    def _watch(self, now: float, picture: Picture) -> Step:
+        seen = self._detector.see(now, picture)
+        edge = self.alerts.see(now, seen.moving)
+        doing = "alert" if self.alerts.moving else "watch"
+        words = f"motion {self.alerts.count}" if self.alerts.moving else f"{self.alerts.count} alerts so far"
+        boxes = tuple(seen.boxes) if self.alerts.moving else ()
+        return Step(0, 0, 0, doing, words, boxes, alert=edge == "start", quiet=edge == "end")
+
+    # What outlives a move
+
+    def memory(self) -> dict[str, Any]:
+        """All but what the detector has learned: that begins anew."""
+        return {
+            "hider": base64.b64encode(self.hider.checkpoint()).decode(),
+            "alerts": self.alerts.memory(),
+            "blindness": self.blindness.memory(),
+            "task": self._task,
+            "held": self._held,
+        }
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        """Raises ValueError for what is no such memory."""
+        self.hider = Hider.restore(base64.b64decode(memory["hider"]))
+        self.alerts.recall(memory["alerts"])
+        self.blindness.recall(memory["blindness"])
+        self._task = "watch" if memory["task"] == "watch" else "hide"
+        self._held = bool(memory["held"])

@@ -1,0 +1,138 @@
+"""A robot in an operator's hands: taken at operator priority, driven as a `Pilot` says, given back.
+
+teleop = Teleop(client, RobotNeeds("robot/scout33"), Pilot(), priority=10)
+running = asyncio.create_task(teleop.run())
+teleop.take()                       # and give_back(); press keys at teleop.pilot, then teleop.wake()
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from typing import Any, Final, Literal, TypeAlias
+
+from zscout import clock
+from zscout.behaviors.arc import Held, Revoked, hold
+from zscout.behaviors.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.piloting import Pilot
+from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
+from zscout.scheduling.model import SECOND, Ns
+
+PERIOD: Final = 0.05
+"""Seconds between two looks at the pilot."""
+LONGEST: Final = 0.6
+"""Seconds that one command drives at most: a robot whose operator is cut off stops after that."""
+AGAIN: Final = 1.0
+"""Seconds before it is asked for again after a refusal."""
+
+State: TypeAlias = Literal["free", "waiting", "driving"]
+
+
+class Teleop:
+    """One operator's hold of one robot."""
+
+    def __init__(
+        self,
+        client: Client,
+        needs: RobotNeeds,
+        pilot: Pilot,
+        *,
+        priority: int,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`changed` is called at each new `state` or `why`."""
+        self.client, self.needs, self.pilot, self.priority = client, needs, pilot, priority
+        self.state: State = "free"
+        self.why = ""
+        """In words: for what it waits, or why it was lost."""
+        self.robot: HeldRobot | None = None
+        self.held: Held | None = None
+        self.takeover: float | None = None
+        """Seconds from the last `take` to the first drive that the robot's RC obeyed."""
+        self._changed = changed
+        self._wanted, self._unwanted = asyncio.Event(), asyncio.Event()
+        self._wake = asyncio.Event()
+        self._asked_at: Ns = 0
+
+    def take(self) -> None:
+        """The robot is wanted from now on."""
+        if not self._wanted.is_set():
+            self._asked_at, self.takeover = clock.now(), None
+            self._wanted.set()
+            self._unwanted.clear()
+        self.wake()
+
+    def give_back(self) -> None:
+        """It is not wanted any more: who was preempted goes on."""
+        self.pilot.stop()
+        self._wanted.clear()
+        self._unwanted.set()
+        self.wake()
+
+    def wake(self) -> None:
+        """The pilot has something new."""
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Takes, drives and gives back, until it is cancelled. Then the robot is given back, too."""
+        while True:
+            await self._wanted.wait()
+            self._be("waiting", "for the RCM")
+            try:
+                await self._while_wanted(self._drive())
+            except Revoked as revoked:
+                self._be("waiting", f"it was taken away: {revoked}")
+            except (CommandRefused, RequestRefused) as refused:
+                self._be("waiting", str(refused))
+                await asyncio.sleep(AGAIN)
+            finally:
+                self.robot = self.held = None
+            if not self._wanted.is_set():
+                self._be("free", "")
+
+    async def _while_wanted(self, work: Coroutine[Any, Any, None]) -> None:
+        """Does `work`, and ends it when the robot is not wanted any more."""
+        tasks = [asyncio.create_task(work), asyncio.create_task(self._unwanted.wait())]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        if isinstance(results[0], Exception):
+            raise results[0]
+
+    async def _drive(self) -> None:
+        async with hold(
+            self.client,
+            f"operator-{self.needs.robot.partition('/')[2]}",
+            self.needs.needs(),
+            priority=self.priority,
+            min_runtime=1.0,
+            keep=True,
+        ) as held:
+            robot = self.robot = HeldRobot(held, self.needs)
+            self.held = held
+            self._be("driving", "")
+            # The wheels go first: whoever takes over in a hurry does not wait for the camera.
+            await self._steer(robot)
+            await robot.camera(True)
+            while True:
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(PERIOD):
+                        await self._wake.wait()
+                await self._steer(robot)
+
+    async def _steer(self, robot: HeldRobot) -> None:
+        self._wake.clear()
+        wheels = self.pilot.wheels(clock.now() / SECOND)
+        obeyed = await robot.drive(wheels.left, wheels.right, min(wheels.lasts, LONGEST))
+        if self.takeover is None and obeyed and not wheels.still:
+            self.takeover = (clock.now() - self._asked_at) / SECOND
+            self._changed()
+
+    def _be(self, state: State, why: str) -> None:
+        if (state, why) != (self.state, self.why):
+            self.state, self.why = state, why
+            self._changed()
