@@ -39,23 +39,32 @@ class Processes:
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._tasks: list[asyncio.Task[None]] = []
         self._ending = False
+        self._ends: dict[str, str] = {}
+        """Where each host's node listens."""
+        self._live = 0
+        """The port of the recorder's live view."""
+
+    def write_fleet(self) -> None:
+        """Writes the fleet file, for those who begin before the nodes."""
+        *ports, self._live = free_ports(len(HOSTS) + 1)
+        self._ends = {host: f"tcp/127.0.0.1:{port}" for host, port in zip(HOSTS, ports, strict=True)}
+        self.fleet_file.write_text(
+            f'[fleet]\nname = "demo-{new_instance()}"\ncandidates = {_list(HOSTS)}\n'
+            '[mesh]\nmulticast = false\nlisten = ["tcp/127.0.0.1:0"]\n'
+            f"connect = {_list(list(self._ends.values()))}\n"
+        )
 
     async def start_nodes(self, extra: Mapping[str, str], node_table: str = "") -> None:
         """Starts a node on each of HOSTS, in a fleet of their own on this machine's loopback: `extra` is more
         text for the node file of a host, `node_table` more lines of its [node] table."""
-        ports = _free_ports(len(HOSTS) + 1)
-        ends = {host: f"tcp/127.0.0.1:{port}" for host, port in zip(HOSTS, ports, strict=False)}
-        self.fleet_file.write_text(
-            f'[fleet]\nname = "demo-{new_instance()}"\ncandidates = {_list(HOSTS)}\n'
-            '[mesh]\nmulticast = false\nlisten = ["tcp/127.0.0.1:0"]\n'
-            f"connect = {_list(list(ends.values()))}\n"
-        )
-        for host, end in ends.items():
-            others = [other for other in ends.values() if other != end]
+        if not self._ends:
+            self.write_fleet()
+        for host, end in self._ends.items():
+            others = [other for other in self._ends.values() if other != end]
             text = f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n{node_table}'
             text += f'[mesh]\nlisten = ["{end}"]\nconnect = {_list(others)}\n'
             if host == RECORDS:
-                text += f'[recorder]\npath = "{RECORDINGS}"\nport = {ports[-1]}\n'
+                text += f'[recorder]\npath = "{RECORDINGS}"\nport = {self._live}\n'
             file = self.folder / f"{host}.toml"
             file.write_text(text + extra.get(host, ""))
             # The launcher has the kernel end the node with this process, however that may end.
@@ -155,7 +164,7 @@ def _list(texts: Sequence[str]) -> str:
     return "[" + ", ".join(f'"{text}"' for text in texts) + "]"
 
 
-def _free_ports(count: int) -> list[int]:
+def free_ports(count: int) -> list[int]:
     """Ports that nobody has at this moment, all different."""
     with ExitStack() as stack:
         servers = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
