@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.thorough import times
 from zscout.balancing import balancer as core
 from zscout.balancing.balancer import SHOWN, Balancer
 from zscout.balancing.model import (
@@ -286,7 +287,7 @@ REPORTS = st.builds(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=times(80), deadline=None)
 @given(
     reports=st.lists(st.tuples(st.integers(0, 8), REPORTS), max_size=12),
     cordoned=st.sets(st.sampled_from("abcdef"), max_size=2),

@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import time
+from collections.abc import Iterator
 from contextlib import aclosing, suppress
 from pathlib import Path
 
@@ -19,11 +20,13 @@ import pytest
 from rerun.chunk import RrdReader
 
 from tests.cli.tools import COMMAND, PATIENCE, Terminal, zscout, zscout_here
+from tests.thorough import times
 from zscout.cli.common import Failed
 from zscout.cli.study import MAX_SEED, parse_seeds
 from zscout.cli.study_pool import spread
 from zscout.scheduling.study.families import FAMILIES
 from zscout.scheduling.study.trial import STRATEGIES, Job
+from zscout.services.study_plots import TIME
 from zscout.strict import BadInput
 
 LONG = ("study", "--family", "load65", "--seeds", "200", "--jobs", "2")
@@ -138,7 +141,7 @@ def session_is_empty(session: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(times(2)))
 def test_interrupted_at_any_time_it_ends_and_leaves_nothing(seed: int) -> None:
     """Its results are bigger than a pipe: a process may be killed in the middle of one."""
     chance = random.Random(seed)  # noqa: S311
@@ -203,6 +206,29 @@ def test_the_recording_has_curves_and_bars_of_every_strategy(tmp_path: Path) -> 
         for pane in ("used", "waiting", "in_use", "wait_longest_mean"):
             assert f"/paper/{pane}/{strategy}" in entities
     assert "/summary" in entities
+    # The plots show the whole run, whatever the viewer's cursor is near.
+    windows = view_ranges(path)
+    ends = [at for entity, at in changes(path) if entity.startswith("/paper/used/")]
+    assert len(windows) == 2
+    assert all(start <= 0 and end >= max(ends) > 0 for start, end in windows)
+    assert all(end - start <= 1.1 * max(ends) for start, end in windows)
+
+
+def view_ranges(path: Path) -> list[tuple[float, float]]:
+    """What the recording's own layout shows of time, in seconds: the window of each plot."""
+    reader = RrdReader(path)
+    (layout,) = reader.blueprints()
+    column = "TimeAxis:view_range"
+    batches = [chunk.to_record_batch() for chunk in reader.stream(store=layout)]
+    found = [batch.column(column).to_pylist() for batch in batches if column in batch.schema.names]
+    return [(one["start"] / 1e9, one["end"] / 1e9) for [[one]] in found]
+
+
+def changes(path: Path) -> Iterator[tuple[str, float]]:
+    """(entity, seconds) of every point of a curve."""
+    for chunk in RrdReader(path).stream().filter(is_static=False):
+        for at in chunk.to_record_batch().column(TIME).cast("int64").to_pylist():
+            yield str(chunk.entity_path), at / 1e9
 
 
 @pytest.mark.parametrize(

@@ -143,7 +143,8 @@ class Witness(ExclusiveDriver):
 
     def check(self) -> None:
         """Nothing was lost, and nothing doubled."""
-        assert self.counts == list(range(1, len(self.counts) + 1)), self.counts[-20:]
+        wrong = next((at for at, count in enumerate(self.counts) if count != at + 1), None)
+        assert wrong is None, f"told {self.counts[max(0, wrong - 5) : wrong + 5]} at {wrong}"
 
 
 class WitnessRc:

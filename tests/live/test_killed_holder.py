@@ -10,11 +10,12 @@ from statistics import median, quantiles
 import pytest
 
 from tests.live.lab import HolderProcess, Lab
+from tests.thorough import times
 from zscout.scheduling.model import SECOND
 
 pytestmark = pytest.mark.live
 
-BATCHES = 10
+BATCHES = times(3)
 ROUNDS = 10
 """Kills in one batch; all of its processes wait in the queue before the first one dies."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 import statistics
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 
 import psutil
@@ -13,15 +13,16 @@ import pytest
 
 from tests.live.lab import START, Lab
 from tests.live.placing import Placing, WitnessRc, register
+from tests.thorough import times
 from zscout.behaviors.client import Client
 from zscout.behaviors.request import OpenArc
-from zscout.messages import DrainHost, Grants, MigrateComponent, Placement, Placements, RcState
+from zscout.messages import DrainHost, EndComponent, Grants, MigrateComponent, Placement, Placements, RcState
 from zscout.scheduling.model import Grant
 
 pytestmark = pytest.mark.live
 
 RC = "robot/scout33"
-MOVES = 100
+MOVES = times(20)
 ARC = "tally"
 
 
@@ -95,11 +96,13 @@ STEPS = ("starting", "standing by", "restoring", "restored", "handed over", "run
 
 
 @pytest.mark.parametrize("step", STEPS)
-@pytest.mark.parametrize("victim", ["node", "component"])
-def test_the_target_dies_and_the_component_lives_in_exactly_one_place(
-    tmp_path: Path, step: str, victim: str
-) -> None:
-    asyncio.run(_target_dies(tmp_path, step, victim))
+def test_the_target_s_host_dies_and_it_lives_in_exactly_one_place(tmp_path: Path, step: str) -> None:
+    asyncio.run(_target_dies(tmp_path, "node", [step]))
+
+
+def test_the_target_dies_and_it_lives_in_exactly_one_place(tmp_path: Path) -> None:
+    """At every step of a move, one after the other in one fleet."""
+    asyncio.run(_target_dies(tmp_path, "component", STEPS))
 
 
 async def appears(path: Path) -> None:
@@ -120,7 +123,7 @@ def let_go(folder: Path) -> None:
         held.unlink()
 
 
-async def _target_dies(folder: Path, step: str, victim: str) -> None:
+async def _target_dies(folder: Path, victim: str, steps: Sequence[str]) -> None:
     async with Lab(folder, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
         register(lab)
         for host in ("h0", "h1", "h2"):
@@ -129,32 +132,47 @@ async def _target_dies(folder: Path, step: str, victim: str) -> None:
         placing = Placing(client)
         await lab.ready(client, RC)
         await placing.hosts(3)
-        params = {"rc": RC, "folder": str(folder)}
-        placed = await placing.place(ARC, "stepper", params, hosts=["h1", "h2"], restart="always")
-        source, target = placed.host, "h1" if placed.host == "h2" else "h2"
-        assert source is not None
-        await rc.witness.more()
-        (folder / "at-init").unlink()
-        moving = asyncio.create_task(placing.ask(MigrateComponent(ARC, target), Placement))
-        await MOVE_TO[step](lab, placing, folder, target)
-        await kill(placing, lab, target, victim)
-        let_go(folder)
-        await moving
-        # It goes on: where it was, or, where the target ran already, wherever the placer starts it again.
-        await rc.witness.more(5)
-        if step != "running":
-            rc.witness.check()
-        living = await placing.until(ARC, lambda one: one.state == "running")
-        alive = [host for host in ("h1", "h2") if lab.nodes[host].poll() is None]
-        running = [view for view in await placing.views(ARC, *alive) if view.phase == "running"]
-        assert [(view.host, view.incarnation) for view in running] == [(living.host, living.incarnation)]
-        if step not in ("handed over", "running"):
-            assert (living.host, living.incarnation) == (source, placed.incarnation)
-        if step in ("starting", "standing by", "restoring"):
-            assert rc.witness.released == 0
+        for step in steps:
+            made = folder / step.replace(" ", "-")
+            made.mkdir()
+            try:
+                await _dies_at(step, made, lab, placing, rc, victim)
+            except Exception as error:
+                raise AssertionError(f"{victim} killed, {step}: {error!r}") from error
+            await placing.get(EndComponent(ARC), Placement)
+            await lab.held_by(client, RC)
 
 
-async def kill(placing: Placing, lab: Lab, host: str, victim: str) -> None:
+async def _dies_at(step: str, folder: Path, lab: Lab, placing: Placing, rc: WitnessRc, victim: str) -> None:
+    """Kills the target of a move at this step."""
+    rc.witness.counts.clear()
+    params = {"rc": RC, "folder": str(folder)}
+    placed = await placing.place(ARC, "stepper", params, hosts=["h1", "h2"], restart="always")
+    source, target = placed.host, "h1" if placed.host == "h2" else "h2"
+    assert source is not None
+    await rc.witness.more()
+    released = rc.witness.released
+    (folder / "at-init").unlink()
+    moving = asyncio.create_task(placing.ask(MigrateComponent(ARC, target), Placement))
+    await MOVE_TO[step](lab, placing, folder, target)
+    await kill(lab, target, victim)
+    let_go(folder)
+    await moving
+    # It goes on: where it was, or, where the target ran already, wherever the placer starts it again.
+    await rc.witness.more(5)
+    if step != "running":
+        rc.witness.check()
+    living = await placing.until(ARC, lambda one: one.state == "running")
+    alive = [host for host in ("h1", "h2") if lab.nodes[host].poll() is None]
+    running = [view for view in await placing.views(ARC, *alive) if view.phase == "running"]
+    assert [(view.host, view.incarnation) for view in running] == [(living.host, living.incarnation)]
+    if step not in ("handed over", "running"):
+        assert (living.host, living.incarnation) == (source, placed.incarnation)
+    if step in ("starting", "standing by", "restoring"):
+        assert rc.witness.released == released
+
+
+async def kill(lab: Lab, host: str, victim: str) -> None:
     """Kills a node with all it started, as if its host had lost power, or only the component there."""
     children = psutil.Process(lab.nodes[host].pid).children(recursive=True)
     if victim == "node":
@@ -238,8 +256,13 @@ async def _drains(tmp_path: Path) -> None:
         placing = Placing(client)
         await lab.ready(client, *(f"robot/{name}" for name in names))
         await placing.hosts(2)
-        for name in names:
-            await placing.place(name, "counter", {"rc": f"robot/{name}", "period": 0.01}, hosts=["h0", "h1"])
+        both = ["h0", "h1"]
+        placed = await asyncio.gather(
+            *(
+                placing.place(name, "counter", {"rc": f"robot/{name}", "period": 0.01}, hosts=both)
+                for name in names
+            )
+        )
         revoked: list[str] = []
 
         def on_grants(_key: str, said: Grants) -> None:
@@ -247,9 +270,9 @@ async def _drains(tmp_path: Path) -> None:
 
         client.mesh.subscribe(client.mesh.keys.grants, Grants, on_grants)
         for name in names:
-            placed = await placing.placement(name)
-            if placed.host == "h0":
-                await placing.get(MigrateComponent(name, "h1"), Placement)
+            await placing.until(name, lambda one: one.movable)
+        elsewhere = [one.component for one in placed if one.host == "h0"]
+        await asyncio.gather(*(placing.get(MigrateComponent(name, "h1"), Placement) for name in elsewhere))
         revoked.clear()
         drained = await placing.get(DrainHost("h1"), Placements)
         assert drained.cordoned == ["h1"]

@@ -10,6 +10,7 @@ import pytest
 
 from tests.placing.placer_hosts import STANDS_BY
 from tests.placing.placer_world import RULES, World
+from tests.thorough import times
 from zscout.balancing.model import SECOND, HostName
 from zscout.placing.events import (
     DrainAsked,
@@ -38,7 +39,7 @@ OPS = (
 POLICIES: tuple[Restart, ...] = ("never", *("on_failure", "always") * 3)
 SETTLING = 60 * SECOND
 """Longer than any back-off, grace, look or time to stand by."""
-SEEDS = 2_000
+SEEDS = times(400)
 TRIES = 1_000
 """Starts in a row, in runs that are to give nothing up."""
 FINAL = {"running", "waiting", "ended", "given_up"}

@@ -1,34 +1,31 @@
-"""Plays a text file of commands through the placer's core and prints under each what it led to.
+"""Stories of the placer's core as text (see `tests/transcripts.py`). Its commands:
 
-One line is one batch of events; several commands of one instant are joined by `;`. Lines that start with
-`#` are comments, indented lines are the effects, and a blank line separates. Times are seconds.
-
-    at TIME                                 sets the clock for what follows; `at TIME COMMAND` too
-    until TIME                              lets time pass: each wake that was asked for is a batch of its own
-    lead COUNTER [rebalance]                a new placer, which inherits what the one before it knew
-    host HOST [cores=N] [speed=X] [load=X] [memory=MB] [labels=A,B]     its node is there, and reports on
-    report HOST ...                         from now on it reports so        silent HOST    no more reports
-    kind KIND cpu=X [memory=MB]             what a kind is known to use
-    place NAME [kind=K] [restart=R] [hosts=A,B] [labels=A,B] [memory=MB] [policy=P] [metric=M] [n=ANY]
-    end NAME       move NAME [HOST]         drain HOST       uncordon HOST       tick
-    start NAME INC HOST ok|refused|failed|unknown [movable] [final] [REASON]
-    stop NAME INC HOST done|said|unknown    `done`: and its token is gone; `said`: that is all
-    moved NAME INC HOST moved|refused|unknown [dead=S] [REASON]
-    appeared NAME INC HOST                  vanished NAME INC HOST
-    told HOST [only=NAME] NAME:INC:PHASE[:movable][:WHY] ...   PHASE: starting standby running, or an end
-    seen HOST      lost HOST                its node, without a report
+at TIME                                 sets the clock for what follows; `at TIME COMMAND` too
+until TIME                              lets time pass: each wake that was asked for is a batch of its own
+lead COUNTER [rebalance]                a new placer, which inherits what the one before it knew
+host HOST [cores=N] [speed=X] [load=X] [memory=MB] [labels=A,B]     its node is there, and reports on
+report HOST ...                         from now on it reports so        silent HOST    no more reports
+kind KIND cpu=X [memory=MB]             what a kind is known to use
+place NAME [kind=K] [restart=R] [hosts=A,B] [labels=A,B] [memory=MB] [policy=P] [metric=M] [n=ANY]
+end NAME       move NAME [HOST]         drain HOST       uncordon HOST       tick
+start NAME INC HOST ok|refused|failed|unknown [movable] [final] [REASON]
+stop NAME INC HOST done|said|unknown    `done`: and its token is gone; `said`: that is all
+moved NAME INC HOST moved|refused|unknown [dead=S] [REASON]
+appeared NAME INC HOST                  vanished NAME INC HOST
+told HOST [only=NAME] NAME:INC:PHASE[:movable][:WHY] ...   PHASE: starting standby running, or an end
+seen HOST      lost HOST                its node, without a report
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from random import Random
 from typing import Any
 
+from tests.transcripts import ns, seconds, settings
 from zscout.balancing.balancer import Balancer
-from zscout.balancing.model import REPORT_EVERY, SECOND, HostName, Ns, Profile, Report, Requirements
+from zscout.balancing.model import REPORT_EVERY, HostName, Ns, Profile, Report, Requirements
 from zscout.placing.events import (
     Appeared,
     Changed,
@@ -62,30 +59,15 @@ from zscout.placing.events import (
 from zscout.placing.placer import Placer
 from zscout.placing.rules import Rules
 
-INDENT = "    "
 MEGABYTE = 1_000_000
 MOST_WAKES = 1_000
 """Of one `until`: a placer that never rests is a fault."""
 
 
-def play(text: str, name: str) -> str:
-    """The same transcript with the effects as they are now. `ValueError` names `name`, line and trouble."""
-    player = _Player()
-    lines: list[str] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.startswith(INDENT):
-            continue
-        lines.append(line)
-        if line.strip() and not line.startswith("#"):
-            try:
-                lines += [INDENT + effect for effect in player.batch(line)]
-            except (ValueError, KeyError, IndexError) as error:
-                raise ValueError(f"{name}:{number}: {line!r}: {error!r}") from error
-    return "\n".join(lines) + "\n"
-
-
 @dataclass
-class _Player:
+class PlacerPlayer:
+    """A placer with the balancer that it asks; whose hosts report whenever time passes."""
+
     balancer: Balancer = field(default_factory=lambda: Balancer(Random(1)))  # noqa: S311
     now: Ns = 0
     wake: Ns | None = None
@@ -101,10 +83,10 @@ class _Player:
         for command in line.split(";"):
             words = command.split()
             if words[0] == "at":
-                self.pass_to(_seconds(words[1]))
+                self.pass_to(ns(words[1]))
                 words = words[2:]
             if words[:1] == ["until"]:
-                return self.wait(_seconds(words[1]))
+                return self.wait(ns(words[1]))
             if words[:1] == ["stop"] and words[-1] == "done":
                 events.append(Vanished(words[1], int(words[2]), words[3]))
             if words[:1] == ["lead"]:
@@ -138,7 +120,7 @@ class _Player:
             )
             self.pass_to(due)
             if self.wake is not None and self.wake <= due:
-                found += [f"at {_time(due)}: {line}" for line in self.handle(Tick())]
+                found += [f"at {seconds(due)}: {line}" for line in self.handle(Tick())]
             if due == until:
                 return found
         raise ValueError(f"woke {MOST_WAKES} times")
@@ -173,14 +155,14 @@ class _Player:
         match verb, *words:
             case "host" | "report", host, *options:
                 self.number += 1
-                self.reports[host] = _options(options, "cores", "speed", "load", "memory", "labels")
+                self.reports[host] = settings(options, "cores", "speed", "load", "memory", "labels")
                 self.report(host)
                 return HostSeen(host) if verb == "host" else None
             case "silent", host:
                 del self.reports[host]
                 return None
             case "kind", kind, *options:
-                known = _options(options, "cpu", "memory")
+                known = settings(options, "cpu", "memory")
                 memory = int(known.get("memory", 64)) * MEGABYTE
                 self.balancer.profiles[kind] = Profile(float(known["cpu"]), memory, 9)
                 return None
@@ -251,7 +233,7 @@ class _Player:
             case Refused(about, code, message):
                 return f"refused {about} {code}: {message}"
             case WakeAt(at):
-                return "wake " + ("never" if at is None else f"at {_time(at)}")
+                return "wake " + ("never" if at is None else f"at {seconds(at)}")
 
 
 def _print(record: Record) -> str:
@@ -263,7 +245,7 @@ def _print(record: Record) -> str:
     words += ["movable"] if record.movable else []
     words += [f"restarts={record.restarts}"] if record.restarts else []
     words += [f"moves={record.moves}"] if record.moves else []
-    words += [f"dead={_time(record.dead)}"] if record.dead is not None else []
+    words += [f"dead={seconds(record.dead)}"] if record.dead is not None else []
     return " ".join(words) + (f": {record.reason}" if record.reason else "")
 
 
@@ -285,13 +267,13 @@ def _start_answered(name: str, incarnation: int, host: str, result: str, rest: l
 def _move_answered(name: str, incarnation: int, host: str, result: str, rest: list[str]) -> MoveAnswered:
     if result not in {"moved", "refused", "unknown"}:
         raise ValueError(f"no such result: {result}")
-    dead = next((_seconds(word[5:]) for word in rest if word.startswith("dead=")), 0)
+    dead = next((ns(word[5:]) for word in rest if word.startswith("dead=")), 0)
     words = [word for word in rest if not word.startswith("dead=")]
     return MoveAnswered(name, incarnation, host, result, " ".join(words), dead)  # type: ignore[arg-type]
 
 
 def _spec(options: list[str]) -> Spec:
-    known = _options(options, "kind", "restart", "hosts", "labels", "memory", "policy", "metric", "n")
+    known = settings(options, "kind", "restart", "hosts", "labels", "memory", "policy", "metric", "n")
     return Spec(
         kind=known.get("kind", "job"),
         restart=known.get("restart", "on_failure"),
@@ -303,20 +285,5 @@ def _spec(options: list[str]) -> Spec:
     )
 
 
-def _options(words: list[str], *known: str) -> dict[str, Any]:
-    found = dict(word.split("=", 1) for word in words)
-    if unknown := found.keys() - set(known):
-        raise ValueError(f"unknown options {sorted(unknown)}")
-    return found
-
-
 def _names(text: str | None) -> frozenset[str]:
     return frozenset(text.split(",")) if text else frozenset()
-
-
-def _seconds(text: str) -> Ns:
-    return int(Fraction(text) * SECOND)
-
-
-def _time(at: Ns) -> str:
-    return f"{at / SECOND:g}"

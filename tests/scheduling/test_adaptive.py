@@ -13,6 +13,7 @@ from tests.scheduling.invariants import Ledger, check_settled
 from tests.scheduling.test_optimal import arc, proposed
 from tests.scheduling.workloads import workloads
 from tests.services.paper_run import RCS, TABLE1
+from tests.thorough import times
 from zscout.scheduling import priority
 from zscout.scheduling.adaptive import MAX_SLICES, SLICE, Adaptive, steps_for
 from zscout.scheduling.core import Core
@@ -101,7 +102,7 @@ def test_table_1_is_served_as_by_priority() -> None:
     assert adaptive.unserved == first.unserved == ()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=times(60), deadline=None)
 @given(workloads())
 def test_promises_hold_in_replay(workload: Workload) -> None:
     strategy = Adaptive()
@@ -116,7 +117,7 @@ def test_promises_hold_in_replay(workload: Workload) -> None:
     assert not ledger.open
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=times(100), deadline=None)
 @given(workloads())
 def test_no_instant_ends_with_less_than_priority_would_give(workload: Workload) -> None:
     core = Core(Adaptive())

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.workloads import capacity, rcs, requests
+from tests.thorough import times
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Propose, WakeAt
 from zscout.scheduling.events import (
@@ -207,7 +208,7 @@ class Chaos:
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=times(80), deadline=None)
 @given(st.data(), st.lists(st.tuples(st.sampled_from(OPS), st.integers(0, 11)), max_size=60))
 def test_promises_hold_in_any_chaos_and_in_the_end_all_are_served(
     strategy: StrategyName, draw: st.DataObject, ops: list[tuple[str, int]]

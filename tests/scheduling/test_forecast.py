@@ -5,6 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 
 from tests.scheduling.workloads import workloads
+from tests.thorough import times
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
 from zscout.scheduling.events import Asked, Event, RcJoined, Tick, Vote
@@ -50,7 +51,7 @@ def test_a_kept_hold_is_foretold_to_yield_after_its_time() -> None:
     assert forecast(core, 0).starts == {"next": 5 * SECOND}
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=times(60), deadline=None)
 @given(workloads(keep=False))
 def test_what_is_foretold_comes(workload: Workload) -> None:
     """After the last arrival, the forecast's starts are those of the run itself."""

@@ -9,6 +9,7 @@ import pytest
 
 from tests.scheduling.test_patterns import workload as with_patterns
 from tests.scheduling.test_waiting import workload as with_one_priority
+from tests.thorough import times
 from zscout.scheduling import optimal, priority
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.floor import Floor
@@ -81,7 +82,7 @@ def mixed(seed: int) -> Workload:
 @pytest.mark.parametrize("preempt", ["always", "after_min_runtime"])
 def test_the_index_finds_who_is_in_play(strategy: str, preempt: str) -> None:
     seen: Counter[int] = Counter()
-    for seed in range(150):
+    for seed in range(times(40)):
         made: Strategy = {"priority": priority.run_pass, "optimal": optimal.run_pass}.get(
             strategy, Adaptive()
         )

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from tests.scheduling.exhaustive import best_set
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.workloads import workloads
+from tests.thorough import times
 from zscout.scheduling import optimal
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
@@ -86,7 +87,7 @@ def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
     assert [len(one.holders) for one in proposed(effects)] == [8]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=times(60), deadline=None)
 @given(workloads())
 def test_promises_hold_in_replay(workload: Workload) -> None:
     ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])
@@ -94,7 +95,7 @@ def test_promises_hold_in_replay(workload: Workload) -> None:
     assert not ledger.open
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=times(60), deadline=None)
 @given(workloads(keep=False))
 def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
     """All ask at once; the RCs' own sums, not their votes, say which sets are ruled out."""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import random
 
-import pytest
-
 from tests.scheduling.exhaustive import best_set, may_end, vector
+from tests.thorough import times
 from zscout.scheduling import cpsat
 from zscout.scheduling.adaptive import steps_for
 from zscout.scheduling.local_search import LocalSearch
@@ -59,9 +58,8 @@ def _level(item: Item) -> int:
     return item.level
 
 
-@pytest.mark.parametrize("batch", range(10))
-def test_branch_and_bound_finds_the_very_set_that_trying_all_finds(batch: int) -> None:
-    for seed in range(batch * 150, (batch + 1) * 150):
+def test_branch_and_bound_finds_the_very_set_that_trying_all_finds() -> None:
+    for seed in range(times(500)):
         items, vetoes = case(seed)
         found = pack(problem((items, vetoes)))
         assert found.exact
@@ -70,7 +68,7 @@ def test_branch_and_bound_finds_the_very_set_that_trying_all_finds(batch: int) -
 
 
 def test_cpsat_finds_the_very_set_as_well() -> None:
-    for seed in range(60):
+    for seed in range(times(30)):
         items, vetoes = case(seed, most=7)
         asked = problem((items, vetoes))
         found = cpsat.improve(asked, asked.complete(), budget=5)
@@ -78,7 +76,7 @@ def test_cpsat_finds_the_very_set_as_well() -> None:
 
 
 def test_what_is_cut_short_is_lawful_no_better_than_the_best_and_no_worse_than_the_heuristic() -> None:
-    for seed in range(500):
+    for seed in range(times(200)):
         items, vetoes = case(seed)
         asked = problem((items, vetoes))
         exact = pack(asked)
@@ -99,7 +97,7 @@ def test_what_is_cut_short_is_lawful_no_better_than_the_best_and_no_worse_than_t
 
 
 def test_the_bound_is_one() -> None:
-    for seed in range(500):
+    for seed in range(times(200)):
         asked = problem(case(seed))
         assert asked.bound_of_all() >= pack(asked).value
 

@@ -10,6 +10,7 @@ from fractions import Fraction
 import pytest
 
 from tests.scheduling.invariants import Ledger
+from tests.thorough import times
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Propose
@@ -245,7 +246,7 @@ def could_start(core: Core, arc: Arc, work: Workload) -> bool:
 
 
 @pytest.mark.parametrize("strategy", ALL)
-@pytest.mark.parametrize("seed", range(150))
+@pytest.mark.parametrize("seed", range(times(40)))
 def test_nobody_waits_while_some_choice_is_free(strategy: StrategyName, seed: int) -> None:
     work = workload(seed)
     ledger = Ledger(work.rcs, [one.request for one in work.arrivals])

@@ -9,6 +9,7 @@ import pytest
 
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.test_waiting import workload
+from tests.thorough import times
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Revoked
 from zscout.scheduling.events import Asked, LeadTaken, RcJoined, Released, Standing, Tick
@@ -87,7 +88,7 @@ def test_protection_outlives_the_rcm() -> None:
 
 
 @pytest.mark.parametrize("strategy", ALL)
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(times(20)))
 def test_nobody_is_ever_preempted_in_a_protected_fleet(strategy: StrategyName, seed: int) -> None:
     draw = random.Random(seed)  # noqa: S311
     work = _with_priorities(workload(seed), draw, highest=9)
@@ -126,7 +127,7 @@ def test_a_low_priority_starves_unless_the_fleet_promises_all() -> None:
     assert start(Policy(patience=PATIENCE, promise="all")) == 6 * SECOND
 
 
-@pytest.mark.parametrize("seed", range(200))
+@pytest.mark.parametrize("seed", range(times(50)))
 def test_promise_all_keeps_the_other_promises(seed: int) -> None:
     draw = random.Random(seed)  # noqa: S311
     work = _with_priorities(workload(seed), draw, highest=12)
@@ -155,7 +156,7 @@ def test_a_host_has_its_quota(strategy: StrategyName) -> None:
 
 
 @pytest.mark.parametrize("strategy", ALL)
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(times(20)))
 def test_no_host_ever_has_more_than_its_quota(strategy: StrategyName, seed: int) -> None:
     draw = random.Random(seed)  # noqa: S311
     arrivals = tuple(

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from tests.scheduling import oracle
 from tests.scheduling.invariants import Ledger, check_settled
 from tests.scheduling.workloads import workloads
+from tests.thorough import times
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Propose, Revoked
 from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
@@ -78,7 +79,7 @@ class SlowPlayer:
                     pass
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=times(120), deadline=None)
 @given(workloads())
 def test_replay_is_the_oracle_exactly(workload: Workload) -> None:
     ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])
@@ -91,13 +92,13 @@ def test_replay_is_the_oracle_exactly(workload: Workload) -> None:
     assert not ledger.open
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=times(120), deadline=None)
 @given(workloads(), st.randoms(use_true_random=False))
 def test_votes_one_by_one_in_any_order_give_the_oracles_outcome(workload: Workload, order: Random) -> None:
     assert SlowPlayer(workload, order, linger=False).play() == oracle.play(workload, one_by_one=True)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=times(60), deadline=None)
 @given(workloads(), st.randoms(use_true_random=False))
 def test_votes_that_outlast_later_events_of_their_instant(workload: Workload, order: Random) -> None:
     """Ranks may then overtake, so only promises and the settled state are compared, and who is served."""

@@ -10,6 +10,7 @@ from random import Random
 import pytest
 
 from tests.scheduling.plain_pass import run_plain_pass
+from tests.thorough import times
 from zscout.scheduling import priority
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Propose, Queued, Revoked
@@ -50,7 +51,7 @@ SIZES = {
     "few, crowded": Size(5, 3, 25, 4, 1200, 2, 0.5),
     "few, exclusive": Size(6, 0, 40, 6, 1200, 2, 0.0),
     "many, slow votes": Size(20, 6, 250, 10, 400, 10, 0.6),
-    "thousands": Size(100, 10, 2000, 50, 40, 20, 0.05),
+    "large": Size(100, 10, times(700), 50, 40, 20, 0.05),
 }
 
 
@@ -178,7 +179,7 @@ def decisions(effects: list[Effect]) -> list[Effect]:
 @pytest.mark.parametrize(
     ("size", "seed"),
     # The largest takes ten times as long as the others.
-    [(size, seed) for name, size in SIZES.items() for seed in range(1 if name == "thousands" else 2)],
+    [(size, seed) for name, size in SIZES.items() for seed in range(1 if name == "large" else 2)],
 )
 def test_an_indexed_pass_is_a_full_pass(size: Size, seed: int) -> None:
     twins = Twins(size, seed)

@@ -8,6 +8,7 @@ from fractions import Fraction
 import pytest
 
 from tests.scheduling.invariants import Ledger
+from tests.thorough import times
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect
@@ -18,7 +19,8 @@ from zscout.scheduling.replay import Replay, replay
 from zscout.scheduling.reservations import MAX_OWED
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 
-RUNS = 10_000
+RUNS = times(1_000)
+PARTS = 10
 PATIENCE = 6 * SECOND
 POLICY = Policy(patience=PATIENCE)
 RADIO = WorkloadRc("radio/rf", sharable=True, capacity={"rate": Fraction(10)})
@@ -73,26 +75,26 @@ def check_bound(workload: Workload, played: Replay, patience: Ns) -> int:
     return tried
 
 
-@pytest.mark.parametrize("part", range(20))
+@pytest.mark.parametrize("part", range(PARTS))
 def test_nobody_waits_longer_than_promised(part: int) -> None:
     tried = 0
-    for seed in range(part * RUNS // 20, (part + 1) * RUNS // 20):
+    for seed in range(part, RUNS, PARTS):
         work = workload(seed)
         played = replay(work, strategy=Adaptive(), policy=POLICY)
-        assert not played.unserved
+        assert not played.unserved, seed
         tried += check_bound(work, played, PATIENCE)
-    assert tried > RUNS // 20, "hardly anybody had to wait for his patience: these runs prove nothing"
+    assert tried > RUNS // PARTS, "hardly anybody had to wait for his patience: these runs prove nothing"
 
 
 def test_the_bound_is_one_that_priority_breaks() -> None:
     broken = 0
-    for seed in range(300):
+    for seed in range(100):
         work = workload(seed)
         try:
             check_bound(work, replay(work), PATIENCE)
         except AssertionError:
             broken += 1
-    assert broken > 3
+    assert broken > 1
 
 
 def narrow_stream(robots: int, *, runtime: Ns, until: Ns) -> Workload:
@@ -123,7 +125,7 @@ def test_the_wide_one_gets_its_turn() -> None:
     assert wide == SECOND + PATIENCE
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(times(30)))
 def test_reservations_keep_every_other_promise(seed: int) -> None:
     """Priorities, votes and preemption besides: never two holders, never half a gang, nobody in vain."""
     draw = random.Random(seed)  # noqa: S311

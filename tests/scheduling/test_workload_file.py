@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.thorough import times
 from zscout.scheduling.model import Request
 from zscout.scheduling.replay import replay
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
@@ -284,7 +285,7 @@ ODD = [
         st.sampled_from(ODD) | st.text(max_size=5),
     ),
 )
-@settings(deadline=None, max_examples=500)
+@settings(deadline=None, max_examples=times(200))
 def test_no_file_ends_in_another_error(heads: list[str], keys: dict[str, str]) -> None:
     text = "\n".join([*heads, *(f"{key} = {value}" for key, value in keys.items())])
     try:

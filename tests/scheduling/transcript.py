@@ -1,7 +1,4 @@
-"""Plays a text file of commands through the core and prints under each what it led to.
-
-One line is one batch of events; several commands of one instant are joined by `;`. Lines that start with
-`#` are comments, indented lines are the effects, and a blank line separates. Times are seconds.
+"""Stories of the scheduling core as text (see `tests/transcripts.py`). Its commands:
 
     at TIME                                    sets the clock for what follows; `at TIME COMMAND` too
     join RC [sharable]                         leave RC [REASON]            lost CLIENT
@@ -21,6 +18,7 @@ import re
 from dataclasses import dataclass, field
 from fractions import Fraction
 
+from tests.transcripts import ns, seconds, settings
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Dropped, Effect, Granted, Propose, Queued, Revoked, WakeAt
 from zscout.scheduling.events import (
@@ -40,30 +38,15 @@ from zscout.scheduling.events import (
     VoteOverdue,
     Waiting,
 )
-from zscout.scheduling.model import SECOND, Grant, Ns, Params, Place, Request, Term
+from zscout.scheduling.model import Grant, Ns, Params, Place, Request, Term
 
-INDENT = "    "
 _NEED = re.compile(r"([\w.-]+/[\w.-]+)(?:\{([^}]*)\})?")
 
 
-def play(text: str, name: str) -> str:
-    """The same transcript with the effects as they are now. `ValueError` names `name`, line and trouble."""
-    player = _Player()
-    lines: list[str] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.startswith(INDENT):
-            continue
-        lines.append(line)
-        if line.strip() and not line.startswith("#"):
-            try:
-                lines += [INDENT + effect for effect in player.batch(line)]
-            except (ValueError, KeyError, IndexError) as error:
-                raise ValueError(f"{name}:{number}: {line!r}: {error!r}") from error
-    return "\n".join(lines) + "\n"
-
-
 @dataclass
-class _Player:
+class CorePlayer:
+    """The core; it is checked after every batch."""
+
     core: Core = field(default_factory=Core)
     now: Ns = 0
     standing: list[Standing] = field(default_factory=list)
@@ -74,7 +57,7 @@ class _Player:
         for command in line.split(";"):
             words = command.split(maxsplit=2)
             if words[0] == "at":
-                self.now = _seconds(words[1])
+                self.now = ns(words[1])
                 words = words[2].split(maxsplit=2) if len(words) > 2 else []
             if words and (event := self.event(words[0], " ".join(words[1:]))) is not None:
                 events.append(event)
@@ -92,7 +75,7 @@ class _Player:
                 return Asked(request, _place(options["place"]) if "place" in options else None)
             case "standing":
                 request, options = _request(rest)
-                start = _seconds(options["start"])
+                start = ns(options["start"])
                 grant = Grant(*_place(options["grant"]))
                 place = _place(options["place"])
                 self.standing.append(Standing(request, place, grant, start, start + request.min_runtime))
@@ -147,23 +130,17 @@ def _request(text: str) -> tuple[Request, dict[str, str]]:
             raise ValueError(f"not a need: {need}")
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
-    options = dict(word.split("=", 1) for word in rest if word != "keep")
-    known = {"priority", "runtime", "client", "place", "grant", "start"}
-    if unknown := options.keys() - known:
-        raise ValueError(f"unknown options {sorted(unknown)}")
+    words = (word for word in rest if word != "keep")
+    options = settings(words, "priority", "runtime", "client", "place", "grant", "start")
     request = Request(
         arc=arc,
         client=options.get("client", "host/" + arc),
         needs=wanted,
         priority=int(options.get("priority", "0")),
-        min_runtime=_seconds(options.get("runtime", "10")),
+        min_runtime=ns(options.get("runtime", "10")),
         keep="keep" in rest,
     )
     return request, options
-
-
-def _seconds(text: str) -> Ns:
-    return int(Fraction(text) * SECOND)
 
 
 def _term(text: str) -> Term:
@@ -193,7 +170,7 @@ def _print(effect: Effect) -> str:
         case Propose(proposal=number, rc=rc, holders=holders):
             return f"propose {number} {rc}: " + ", ".join(arc + _share(holders[arc]) for arc in holders)
         case Granted(arc=arc, client=client, grant=grant, rcs=rcs, start=start, end=end):
-            span = f"from {_time(start)} " + ("on" if end is None else f"to {_time(end)}")
+            span = f"from {seconds(start)} " + ("on" if end is None else f"to {seconds(end)}")
             return f"grant {arc} to {client} ({_grant(grant)}): {', '.join(rcs)} {span}"
         case Revoked(arc=arc, grant=grant, outcome=outcome, reason=reason, requeued=requeued, by=by):
             took = f" by {by}" if by is not None else ""
@@ -204,15 +181,11 @@ def _print(effect: Effect) -> str:
         case Dropped(arc=arc, outcome=outcome, reason=reason):
             return f"dropped {arc} {outcome.value}: {reason}"
         case WakeAt(at=at):
-            return "wake " + ("never" if at is None else f"at {_time(at)}")
+            return "wake " + ("never" if at is None else f"at {seconds(at)}")
 
 
 def _share(params: Params) -> str:
     return "{" + " ".join(f"{key}={float(value):g}" for key, value in sorted(params.items())) + "}"
-
-
-def _time(at: Ns) -> str:
-    return f"{at / SECOND:g}"
 
 
 def _grant(grant: Grant) -> str:

@@ -12,7 +12,7 @@ from typing import Any, Final
 import msgspec
 
 from zscout.components.kinds import installed
-from zscout.config import Components, Fleet
+from zscout.config import MAX_KINDS, Components, Fleet
 from zscout.keyexpr import BadName, check_name
 from zscout.mesh import Declared, Mesh, Refused, Request
 from zscout.messages import (
@@ -45,8 +45,6 @@ MAX_ENDED: Final = 64
 """Components that are told of after their end."""
 MAX_UNDERWAY: Final = 512
 """Operations at one time."""
-MAX_KINDS: Final = 256
-"""That are told of."""
 MAKE_WAY: Final = 5.0
 """Seconds that an incarnation on its way out has until the next one is refused."""
 GRACE: Final = 2.0

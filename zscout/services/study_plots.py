@@ -23,6 +23,8 @@ TIME: Final = "virtual_time"
 """The timeline of the curves: a duration in seconds from the first request."""
 COLOURS: Final = (0x56C1FFFF, 0xFFB454FF, 0xB5E07BFF, 0xD6A6FFFF)
 """RGBA by strategy."""
+MARGIN: Final = 0.03
+"""Part of the whole that is left free at the sides of a plot."""
 WRITE_SECONDS: Final = 10.0
 
 BARS: Final = (
@@ -42,7 +44,7 @@ def record(path: Path, report: Report, curves: Mapping[tuple[str, str], Curve]) 
 
     recording = rr.RecordingStream(APPLICATION)
     try:
-        recording.save(path, default_blueprint=_blueprint(report))
+        recording.save(path, default_blueprint=_blueprint(report, curves))
         for family in report.families:
             _family(recording, family, curves)
         recording.log("summary", rr.TextDocument(_words(report), media_type="text/markdown"), static=True)
@@ -87,16 +89,29 @@ def _steps(
     recording.send_columns(path, indexes=[times], columns=columns)
 
 
-def _blueprint(report: Report) -> rrb.Blueprint:
+def _window(drawn: Sequence[Curve]) -> rr.TimeRange:
+    """From the first request to the last end: without it a plot shows what the viewer's cursor is near."""
+    import rerun as rr
+
+    end = max((curve.times[-1] for curve in drawn if curve.times), default=0) / SECOND or 1.0
+    boundary = rr.TimeRangeBoundary
+    return rr.TimeRange(
+        start=boundary.absolute(seconds=-MARGIN * end), end=boundary.absolute(seconds=(1 + MARGIN) * end)
+    )
+
+
+def _blueprint(report: Report, curves: Mapping[tuple[str, str], Curve]) -> rrb.Blueprint:
     import rerun.blueprint as rrb
 
     seed = report.seeds[0]
 
     def tab(family: FamilyReport) -> rrb.Container:
-        curves = [
+        window = _window([curve for (name, _), curve in curves.items() if name == family.family])
+        plots = [
             rrb.TimeSeriesView(
                 origin=f"/{family.family}/{name}",
                 name=f"{title}, seed {seed}",
+                axis_x=rrb.archetypes.TimeAxis(view_range=window),
                 plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
             )
             for name, title in (("used", "RCs in use"), ("waiting", "ARCs that wait"))
@@ -108,7 +123,7 @@ def _blueprint(report: Report) -> rrb.Blueprint:
             )
             for field, title, _ in BARS
         ]
-        return rrb.Vertical(*curves, rrb.Horizontal(*bars), row_shares=[3, 3, 2], name=family.family)
+        return rrb.Vertical(*plots, rrb.Horizontal(*bars), row_shares=[3, 3, 2], name=family.family)
 
     return page([tab(family) for family in report.families], TIME)
 
@@ -125,7 +140,8 @@ def page(tabs: Sequence[rrb.Container], time: str) -> rrb.Blueprint:
         ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=time),
+        # Else it plays, and the cursor runs over plots that show everything anyway.
+        rrb.TimePanel(state="collapsed", timeline=time, play_state="following"),
         auto_layout=False,
         auto_views=False,
     )

@@ -1,0 +1,243 @@
+"""Fleet files: what good ones mean, and the exact line that each kind of bad one ends in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.config.kit import ENDPOINT_RULE, MULTICAST_RULE, NAME_RULE, short, write
+from zscout import config
+from zscout.scheduling.model import SECOND
+from zscout.scheduling.policy import Policy
+from zscout.strict import BadInput
+
+SYNTAX = "mend the TOML there or just before"
+
+BAD_FLEETS = {
+    # TOML itself
+    "x = ": f"line 1, column 5, the end: Invalid value; {SYNTAX}",
+    "x = 1\nx = 2": f"line 2, column 6, the end: Cannot overwrite a value; {SYNTAX}",
+    "\n[fleet\nname = 1": f"line 2, column 7: Expected ']' at the end of a table declaration; {SYNTAX}",
+    "x = " + "1" * 5000: "a whole number has thousands of digits; shorten it",
+    "x = " + "[" * 5000: "is nested too deep; no key goes deeper than a few tables",
+    "\n" + ".".join(["a"] * 300_000) + " = 1": "line 2 has a dotted key of more than 32 parts; shorten it",
+    "["
+    + " . ".join(['"\\""', "'b'"] * 60_000)
+    + "]": "line 1 has a dotted key of more than 32 parts; shorten it",
+    # Keys and tables
+    "[flet]": "flet: unknown key; did you mean fleet?",
+    "[fleet]\ncandiates = []": "fleet.candiates: unknown key; did you mean candidates?",
+    "[limits]\nmax_needed = 1": "limits.max_needed: unknown key; did you mean max_needs or max_queued?",
+    "[fleet]\nzzz = 1": "fleet.zzz: unknown key; known here: candidates, name, operator_priority, "
+    "patience, preempt, promise, strategy",
+    '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: fleet, limits, mesh, placement, timing',
+    'fleet = "lab"': 'fleet: is the text "lab"; write a table, under [fleet]',
+    "[[fleet]]": "fleet: is a list; write a table, under [fleet]",
+    # [fleet]
+    '[fleet]\nname = "a b"': f'fleet.name: "a b" is not a name; {NAME_RULE}',
+    '[fleet]\nname = ""': f'fleet.name: "" is not a name; {NAME_RULE}',
+    "[fleet]\nname = '''a\n'''": rf'fleet.name: "a\n" is not a name; {NAME_RULE}',
+    f'[fleet]\nname = "{"x" * 65}"': f'fleet.name: "{"x" * 60}..." is not a name; {NAME_RULE}',
+    '[fleet]\ncandidates = "anvil"': 'fleet.candidates: is the text "anvil"; write a list',
+    '[fleet]\ncandidates = ["a", 1]': "fleet.candidates[1]: is 1; write a text in quotes",
+    '[fleet]\ncandidates = ["a", ""]': f'fleet.candidates[1]: "" is not a name; {NAME_RULE}',
+    '[fleet]\ncandidates = ["a", "b", "a"]': (
+        'fleet.candidates[2]: "a" stands at fleet.candidates[0] already; rename or remove one of the two'
+    ),
+    f"[fleet]\ncandidates = {['a'] * 1001}": "fleet.candidates: has 1,001 entries; at most 1,000 are allowed",
+    '[fleet]\nstrategy = "fifo"': (
+        'fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"'
+    ),
+    '[fleet]\npreempt = "never"': 'fleet.preempt: is the text "never"; write "after_min_runtime" or "always"',
+    "[fleet]\npatience = -1": "fleet.patience: is -1 s; write 0 to 31622400 seconds",
+    "[fleet]\npatience = nan": "fleet.patience: is not a finite number; write a number",
+    '[fleet]\npromise = "all"\npatience = 0': (
+        'fleet.promise: is "all", but only "adaptive" with some patience promises anything; '
+        'write strategy = "adaptive" and a patience above 0, or promise = "equals"'
+    ),
+    '[fleet]\npromise = "all"\nstrategy = "optimal"': (
+        'fleet.promise: is "all", but only "adaptive" with some patience promises anything; '
+        'write strategy = "adaptive" and a patience above 0, or promise = "equals"'
+    ),
+    "[limits]\nmax_running_per_host = -1": (
+        "limits.max_running_per_host: is -1; write a whole number from 0 to 100000"
+    ),
+    "[fleet]\noperator_priority = -1": (
+        "fleet.operator_priority: is -1; write a whole number from 0 to 1000000000"
+    ),
+    "[fleet]\noperator_priority = 1.0": (
+        "fleet.operator_priority: is 1.0; write a whole number from 0 to 1000000000"
+    ),
+    "[fleet]\noperator_priority = true": (
+        "fleet.operator_priority: is true; write a whole number from 0 to 1000000000"
+    ),
+    # [mesh]
+    "[mesh]\nlease = 0.1": "mesh.lease: is 0.1; write a number from 0.2 to 30",
+    "[mesh]\nlease = nan": "mesh.lease: is not a finite number; write a number from 0.2 to 30",
+    "[mesh]\nlease = 1979-05-27": "mesh.lease: is a date or a time; write a number from 0.2 to 30",
+    '[mesh]\nlease = "1"': 'mesh.lease: is the text "1"; write a number from 0.2 to 30',
+    '[mesh]\nlisten = ["tcp/127.0.0.1"]': (
+        f'mesh.listen[0]: "tcp/127.0.0.1" is not an endpoint; {ENDPOINT_RULE}'
+    ),
+    '[mesh]\nlisten = ["tcp/a:0", "ipx/a:1"]': (
+        f'mesh.listen[1]: "ipx/a:1" is not an endpoint; {ENDPOINT_RULE}'
+    ),
+    '[mesh]\nconnect = ["tcp/1.2.3:7"]': (
+        f'mesh.connect[0]: "tcp/1.2.3:7" is not an endpoint; {ENDPOINT_RULE}'
+    ),
+    '[mesh]\nconnect = ["tcp/[::g]:7"]': (
+        f'mesh.connect[0]: "tcp/[::g]:7" is not an endpoint; {ENDPOINT_RULE}'
+    ),
+    '[mesh]\nconnect = ["tcp/[::fff1:1:2:3:4:5:6:7:8]:7"]': (
+        f'mesh.connect[0]: "tcp/[::fff1:1:2:3:4:5:6:7:8]:7" is not an endpoint; {ENDPOINT_RULE}'
+    ),
+    '[mesh]\nconnect = ["tcp/anvil:0"]': (
+        'mesh.connect[0]: "tcp/anvil:0" has no valid port; write one from 1 to 65535'
+    ),
+    '[mesh]\nlisten = ["tcp/anvil:70000"]': (
+        'mesh.listen[0]: "tcp/anvil:70000" has no valid port; write one from 0 to 65535'
+    ),
+    '[mesh]\nconnect = ["tcp/a:1", "tcp/a:1"]': (
+        'mesh.connect[1]: "tcp/a:1" stands at mesh.connect[0] already; rename or remove one of the two'
+    ),
+    "[mesh]\nmulticast = 1": "mesh.multicast: is 1; write true or false",
+    '[mesh]\nmulticast_address = "10.0.0.1:7446"': (
+        f'mesh.multicast_address: "10.0.0.1:7446" is not a multicast address; {MULTICAST_RULE}'
+    ),
+    '[mesh]\nmulticast_address = "224.0.0.224"': (
+        f'mesh.multicast_address: "224.0.0.224" is not a multicast address; {MULTICAST_RULE}'
+    ),
+    '[mesh]\ninterface = ""': 'mesh.interface: "" names no interface; write "auto", or as in "eth0"',
+    # [limits]
+    "[limits]\nmax_needs = 0": "limits.max_needs: is 0; write a whole number from 1 to 1000",
+    "[limits]\nmax_payload = 1e400": (
+        "limits.max_payload: is 1E+400; write a whole number from 1024 to 16777216"
+    ),
+    # [timing]
+    "[timing]\nheartbeat = 0": "timing.heartbeat: is 0 s; write 0.05 to 10 seconds",
+    "[timing]\nrebuild = -0.1": "timing.rebuild: is -0.1 s; write 0.01 to 10 seconds",
+    "[timing]\nrebuild = inf": "timing.rebuild: is not a finite number; write a number",
+    "[timing]\nrebuild = 1e99999999999999999999": "timing.rebuild: is not a finite number; write a number",
+    "[timing]\nrebuild = 1e30": "timing.rebuild: is too large; write a number below 1e18",
+    "[timing]\nrebuild = 1e-200": "timing.rebuild: has more than 100 decimal places; round it",
+    "[timing]\nheartbeat = 1.5": (
+        "timing.hold_lease: is 3 s; write more than 2 * timing.heartbeat, which is 3 s"
+    ),
+    "[timing]\nhold_lease = 1.2": (
+        "timing.hold_lease: is 1.2 s; write more than mesh.lease + timing.rebuild, which is 1.2 s"
+    ),
+    "[mesh]\nlease = 2.9": (
+        "timing.hold_lease: is 3 s; write more than mesh.lease + timing.rebuild, which is 3.1 s"
+    ),
+    # [placement]
+    "[placement]\nback_off = 0": "placement.back_off: is 0 s; write 0.05 to 3600 seconds",
+    "[placement]\ngain = 0": "placement.gain: is 0; write a number from 0.05 to 100",
+    '[placement]\nrebalance = "yes"': 'placement.rebalance: is the text "yes"; write true or false',
+}
+
+
+def fleet(text: str) -> config.Fleet:
+    return config.load_fleet(write("lab.toml", text))
+
+
+@pytest.mark.parametrize(("text", "line"), BAD_FLEETS.items(), ids=map(short, BAD_FLEETS))
+def test_bad_fleet_file(text: str, line: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        fleet(text)
+    assert str(caught.value) == f"lab.toml: {line}"
+
+
+def test_an_empty_fleet_file_means_the_defaults() -> None:
+    made = fleet("")
+    assert made == config.default_fleet()
+    assert (made.name, made.candidates, made.strategy, made.operator_priority) == (
+        "zscout",
+        (),
+        "adaptive",
+        10,
+    )
+    assert made.policy == Policy()
+    assert made.mesh == config.Mesh(
+        listen=(),
+        connect=(),
+        multicast=True,
+        multicast_address="224.0.0.224:7446",
+        interface="auto",
+        lease=1.0,
+    )
+    assert made.limits == config.Limits(10_000, 64, 256, 65_536)
+    assert made.timing == config.Timing(500_000_000, 3_000_000_000, 250_000_000, 200_000_000)
+
+
+def test_every_key_of_a_fleet_file() -> None:
+    made = fleet(
+        """
+        [fleet]
+        name = "lab"
+        candidates = ["anvil", "bench"]
+        strategy = "adaptive"
+        operator_priority = 7
+        preempt = "after_min_runtime"
+        patience = 2.5
+        promise = "all"
+        [mesh]
+        listen = ["tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"]
+        connect = ["quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"]
+        multicast = false
+        multicast_address = "[ff02::1]:7446"
+        interface = "eth0,wlan0"
+        lease = 2
+        [limits]
+        max_queued = 1
+        max_needs = 2
+        max_requests_per_client = 3
+        max_payload = 4096
+        max_running_per_host = 5
+        [timing]
+        heartbeat = 0.1
+        hold_lease = 5
+        vote_timeout = 0.3
+        rebuild = 1.25
+        """
+    )
+    assert made == config.Fleet(
+        name="lab",
+        candidates=("anvil", "bench"),
+        strategy="adaptive",
+        policy=Policy("after_min_runtime", 7, 5 * SECOND // 2, "all", 5),
+        mesh=config.Mesh(
+            listen=("tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"),
+            connect=("quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"),
+            multicast=False,
+            multicast_address="[ff02::1]:7446",
+            interface="eth0,wlan0",
+            lease=2.0,
+        ),
+        limits=config.Limits(1, 2, 3, 4096, 5),
+        timing=config.Timing(SECOND // 10, 5 * SECOND, 3 * SECOND // 10, 5 * SECOND // 4),
+    )
+    assert isinstance(made.mesh.lease, float)
+
+
+def test_the_fleet_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert config.fleet_from_env() == config.default_fleet()
+    monkeypatch.setenv(config.FLEET_VARIABLE, "")
+    assert config.fleet_from_env() == config.default_fleet()
+    monkeypatch.setenv(config.FLEET_VARIABLE, str(write("lab.toml", '[fleet]\nname = "lab"')))
+    assert config.fleet_from_env().name == "lab"
+    monkeypatch.setenv(config.FLEET_VARIABLE, "no.toml")
+    with pytest.raises(BadInput, match=r"^no\.toml: there is no such file; .* \(named by \$ZSCOUT_FLEET\)$"):
+        config.fleet_from_env()
+
+
+def test_a_byte_order_mark_is_no_error() -> None:
+    Path("lab.toml").write_bytes(b"\xef\xbb\xbf[fleet]\r\nname = 'lab'\r\n")
+    assert config.load_fleet(Path("lab.toml")).name == "lab"
+
+
+def test_an_error_is_one_printable_line_whatever_the_file_says() -> None:
+    path = write("l\x1b[31m\nab.toml", '"\\u001b[2J\\u202e\\n" = 1')
+    with pytest.raises(BadInput) as caught:
+        config.load_fleet(path)
+    assert str(caught.value).isprintable()

@@ -1,0 +1,178 @@
+"""Node files: what good ones mean, and the exact line that each kind of bad one ends in."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+
+from tests.config.kit import ENDPOINT_RULE, NAME_RULE, RC_RULE, short, write
+from zscout import config, strict
+from zscout.strict import BadInput, Where
+
+ROBOT = '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
+RADIO = '[[rc]]\nname = "radio/r"\ndriver = "capacity"\n'
+
+BAD_NODES = {
+    '[node]\nhots = "a"': "node.hots: unknown key; did you mean host?",
+    '[node]\nhost = "a/b"': f'node.host: "a/b" is not a name; {NAME_RULE}',
+    '[node]\nhost = ""': f'node.host: "" is not a name; {NAME_RULE}',
+    '[node]\nload = "yes"': 'node.load: is the text "yes"; write true, false or "tree"',
+    "[node]\nload = 1": 'node.load: is 1; write true, false or "tree"',
+    '[components]\nkinds = ["a b"]': f'components.kinds[0]: "a b" is not a name; {NAME_RULE}',
+    "[components]\nmax = 0": "components.max: is 0; write a whole number from 1 to 256",
+    "[node]\nfleet = 1": "node.fleet: is 1; write a text in quotes",
+    '[node]\nlabels = "gpu"': 'node.labels: is the text "gpu"; write a list',
+    '[node]\nlabels = ["gpu", "a b"]': f'node.labels[1]: "a b" is not a name; {NAME_RULE}',
+    '[node]\nlabels = ["gpu", "gpu"]': (
+        'node.labels[1]: "gpu" stands at node.labels[0] already; rename or remove one of the two'
+    ),
+    f"[node]\nlabels = {['a'] * 33}": "node.labels: has 33 entries; at most 32 are allowed",
+    "[mesh]\nlease = 1": "mesh.lease: unknown key; known here: connect, interface, listen",
+    '[mesh]\nconnect = ["anvil"]': f'mesh.connect[0]: "anvil" is not an endpoint; {ENDPOINT_RULE}',
+    '[mesh]\ninterface = "a b"': 'mesh.interface: "a b" names no interface; write "auto", or as in "eth0"',
+    '[rc]\nname = "robot/a"': "rc: is a table; write tables, each under [[rc]]",
+    "rc = [1]": "rc[0]: is 1; write a table",
+    '[[rc]]\ndriver = "exclusive"': "rc[0].name: is missing; add it",
+    '[[rc]]\nname = "robot/a"': "rc[0].driver (robot/a): is missing; add it",
+    '[[rc]]\nname = "robot"\ndriver = "exclusive"': (
+        f'rc[0].name: "robot" is not the name of an RC; {RC_RULE}'
+    ),
+    '[[rc]]\nname = "a/b/c"\ndriver = "exclusive"': (
+        f'rc[0].name: "a/b/c" is not the name of an RC; {RC_RULE}'
+    ),
+    '[[rc]]\nname = "robot/a"\ndriver = "fast"': (
+        'rc[0].driver (robot/a): is the text "fast"; '
+        'write "capacity", "exclusive", "framegrabber", "radio", "robot" or "video"'
+    ),
+    ROBOT + RADIO + "capacity = { a = 1 }\n" + ROBOT: (
+        'rc[2].name: "robot/a" stands at rc[0] already; rename or remove one of the two'
+    ),
+    ROBOT + "capacity = {}": (
+        'rc[0].capacity (robot/a): the driver "exclusive" has none; remove it, or write driver = "capacity"'
+    ),
+    ROBOT + RADIO: (
+        "rc[1].capacity (radio/r): is missing or empty; add one, as in capacity = { command_rate = 10 }"
+    ),
+    RADIO + "capacity = {}": (
+        "rc[0].capacity (radio/r): is missing or empty; add one, as in capacity = { command_rate = 10 }"
+    ),
+    RADIO + "capacity = { rate = -1 }": "rc[0].capacity.rate (radio/r): is -1; write 0 or more",
+    RADIO + "capacity = { rate = nan }": (
+        "rc[0].capacity.rate (radio/r): is not a finite number; write a number"
+    ),
+    RADIO + 'capacity = { rate = "10" }': 'rc[0].capacity.rate (radio/r): is the text "10"; write a number',
+    RADIO + 'capacity = { "a b" = 1 }': f'rc[0].capacity (radio/r): "a b" is not a name; {NAME_RULE}',
+    ROBOT + "activation = -1": "rc[0].activation (robot/a): is -1 s; write 0 to 3600 seconds",
+    ROBOT + "activation = 3601": "rc[0].activation (robot/a): is 3601 s; write 0 to 3600 seconds",
+    ROBOT + "actvation = 1": "rc[0].actvation (robot/a): unknown key; did you mean activation?",
+    '[recorder]\nbind = "0.0.0.0"': (
+        'recorder.bind: "0.0.0.0" shows the recording to other hosts; '
+        'write "127.0.0.1", or add allow_remote = true if that is meant'
+    ),
+    '[recorder]\nbind = "anvil"': (
+        'recorder.bind: "anvil" is not an IP address; write one, as in "127.0.0.1"'
+    ),
+    "[recorder]\nport = 0": "recorder.port: is 0; write a whole number from 1 to 65535",
+    '[recorder]\npath = ""': 'recorder.path: "" is no folder; name one, as in path = "runs"',
+}
+
+
+def node(text: str) -> config.Node:
+    return config.load_node(write("node.toml", text))
+
+
+@pytest.mark.parametrize(("text", "line"), BAD_NODES.items(), ids=map(short, BAD_NODES))
+def test_bad_node_file(text: str, line: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        node(text)
+    assert str(caught.value) == f"node.toml: {line}"
+
+
+def test_every_key_of_a_node_file() -> None:
+    write(
+        "lab.toml", '[fleet]\nname = "lab"\n[mesh]\nlisten = ["tcp/a:1"]\nconnect = ["tcp/a:2"]\nlease = 0.5'
+    )
+    Path("hosts").mkdir()
+    path = write(
+        "hosts/node.toml",
+        """
+        [node]
+        host = "anvil"
+        fleet = "../lab.toml"
+        candidate = false
+        load = false
+        labels = ["gpu", "arm64"]
+        [mesh]
+        connect = ["tcp/b:3"]
+        interface = "eth1"
+        [[rc]]
+        name = "robot/scout33"
+        driver = "exclusive"
+        activation = 2.5
+        [[rc]]
+        name = "radio/rf0"
+        driver = "capacity"
+        capacity = { command_rate = 10, share = 0.1 }
+        [recorder]
+        path = "tapes"
+        bind = "0.0.0.0"
+        port = 1234
+        allow_remote = true
+        """,
+    )
+    made = config.load_node(path)
+    assert made.fleet.name == "lab"
+    assert made.fleet.mesh == config.Mesh(
+        listen=("tcp/a:1",), connect=("tcp/b:3",), interface="eth1", lease=0.5
+    )
+    assert (made.host, made.candidate, made.load) == ("anvil", False, False)
+    assert made.labels == ("gpu", "arm64")
+    assert made.rcs == (
+        config.RcSpec("robot/scout33", "exclusive", {}, 2_500_000_000),
+        config.RcSpec("radio/rf0", "capacity", {"command_rate": Fraction(10), "share": Fraction(1, 10)}, 0),
+    )
+    assert made.recorder == config.Recorder(Path("hosts/tapes"), "0.0.0.0", 1234)  # noqa: S104
+
+
+def test_an_empty_node_file_means_the_defaults() -> None:
+    made = node("")
+    assert made == config.default_node()
+    assert (made.fleet, made.candidate, made.load, made.rcs) == (config.default_fleet(), True, True, ())
+    assert (made.recorder, made.labels) == (None, ())
+    assert strict.check_name(made.host, Where("host")) == made.host
+
+
+def test_an_empty_recorder_table_records_on_loopback() -> None:
+    recorder = node("[recorder]").recorder
+    assert recorder == config.Recorder(Path("runs"), "127.0.0.1", 9876)
+    assert node('[recorder]\nbind = "localhost"').recorder == recorder
+    other = node('[recorder]\nbind = "::1"').recorder
+    assert other is not None
+    assert ipaddress.ip_address(other.bind).is_loopback
+
+
+@pytest.mark.parametrize(
+    ("hostname", "host"),
+    [("anvil.lab", "anvil.lab"), ("my host!", "my-host-"), ("x" * 70, "x" * 64), ("", "unnamed")],
+)
+def test_the_host_is_named_by_its_hostname(hostname: str, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: hostname)
+    assert node("").host == host
+
+
+def test_a_fleet_file_that_a_node_file_names() -> None:
+    def line(text: str) -> str:
+        with pytest.raises(BadInput) as caught:
+            node(text)
+        return str(caught.value)
+
+    by = "(named by node.fleet in node.toml)"
+    assert line('[node]\nfleet = "no.toml"') == f"no.toml: there is no such file; check the path {by}"
+    assert line('[node]\nfleet = ""') == f".: is a directory; name a file in it {by}"
+    assert line('[node]\nfleet = "a\\u0000b"') == rf"a\x00b: is not a file name; check the path {by}"
+    write("lab.toml", "[fleet]\nname = 1")
+    assert line('[node]\nfleet = "lab.toml"') == f"lab.toml: fleet.name: is 1; write a text in quotes {by}"

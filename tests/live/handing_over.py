@@ -1,0 +1,38 @@
+"""For tests of hand-overs: what a client has, and how all of it goes to another one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from zscout.behaviors.client import Client
+from zscout.behaviors.request import OpenArc
+from zscout.keyexpr import Sender
+from zscout.messages import RcmState
+from zscout.scheduling.model import Grant
+
+NEEDS: dict[str, dict[str, dict[str, int]]] = {
+    "drive": {"robot/x": {}},
+    "talk": {"radio/f": {"rate": 2}},
+    "later": {"robot/x": {}},
+}
+"""By name of the ARC: two that run, and one that waits for the first."""
+
+
+def me(client: Client) -> Sender:
+    return client.mesh.me
+
+
+async def settle_down(old: Client, new: Client, names: Sequence[str]) -> dict[str, OpenArc]:
+    """Moves all of `old` to `new`, which asks for it by `names`."""
+    old.pause()
+    new.expect(old.open_requests())
+    await old.hand_over_all(me(new))
+    return await claimed(new, names)
+
+
+async def claimed(client: Client, names: Sequence[str]) -> dict[str, OpenArc]:
+    return {name: await client.request(name, NEEDS[name], min_runtime=600) for name in names}
+
+
+def holding(state: RcmState) -> dict[str, tuple[str, Grant]]:
+    return {view.arc: (view.client, view.grant) for view in state.holds}

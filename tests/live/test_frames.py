@@ -1,0 +1,367 @@
+"""Frames on a real mesh: who looks gets the newest, and a framegrabber publishes for holders and lookers."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.drivers.mjpeg import MjpegServer, jpeg, number_of, numbered
+from tests.live.bench import Bench, SharedBench, Stand, answer, running, until
+from tests.live.lab import START, Lab
+from zscout.behaviors.client import Client
+from zscout.drivers import frame_pump, framegrabber
+from zscout.drivers.base import ResourceController
+from zscout.drivers.framegrabber import FramegrabberDriver
+from zscout.keyexpr import Sender
+from zscout.mesh import Mesh
+from zscout.mesh.frames import Frame, FrameWatch
+from zscout.messages import MAX_FRAME, FrameHead
+from zscout.scheduling.model import Term
+from zscout.services.rcm import Rcm
+from zscout.services.rebuild import Inheritance
+
+pytestmark = pytest.mark.live
+
+GRABBER = "framegrabber/f"
+BLUE = 1_000
+"""The pictures of the second server are coloured, and numbered from here."""
+
+
+def head(number: int) -> FrameHead:
+    return FrameHead(number=number, time=float(number), width=160, height=120)
+
+
+def picture_in(frame: Frame) -> Any:
+    picture = cv2.imdecode(np.frombuffer(frame.jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    return picture
+
+
+async def frame_of(watch: FrameWatch) -> Frame:
+    frame = await watch.next(START)
+    assert frame is not None
+    return frame
+
+
+def refused(watch: FrameWatch, count: int) -> bool:
+    """Whether it has refused so many; fails if it takes what is no frame."""
+    assert watch.take() is None
+    return watch.malformed == count
+
+
+def test_who_looks_has_the_newest_frame_and_whoever_publishes_knows(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            lab = Lab(tmp_path)
+            here, there = [
+                await stack.enter_async_context(
+                    await Mesh.open(lab.fleet.name, Sender(name, "node"), lab.fleet.mesh)
+                )
+                for name in ("here", "there")
+            ]
+            key = here.keys.frame(GRABBER)
+            publisher = here.frame_publisher(key)
+            told: list[bool] = []
+            publisher.follow(told.append)
+            assert not publisher.watched
+            assert told == []
+            publisher.put(head(1), b"for nobody")
+
+            watch = there.frames(there.keys.frame_any)
+            await until(lambda: publisher.watched)
+            publisher.put(head(2), b"two")
+            frame = await frame_of(watch)
+            assert (frame.key, frame.head, frame.jpeg) == (key, head(2), b"two")
+            assert watch.take() is None
+            assert await watch.next(0.01) is None
+
+            # Who is slow gets the newest of what came meanwhile, and knows how many it has missed.
+            for number in range(3, 9):
+                publisher.put(head(number), b"x" * number)
+                await until(lambda number=number: watch.missed == number - 3)  # type: ignore[misc]
+            frame = await frame_of(watch)
+            assert (frame.head.number, len(frame.jpeg)) == (8, 8)
+            assert watch.take() is None
+
+            with pytest.raises(ValueError, match="too large"):
+                publisher.put(head(9), b"x" * (MAX_FRAME + 1))
+            publisher.put(head(10), b"x" * MAX_FRAME)
+            assert len((await frame_of(watch)).jpeg) == MAX_FRAME
+
+            # What is no frame is passed over; the watch goes on.
+            bad: list[tuple[bytes, bytes | None]] = [
+                (b"no head", None),
+                (b"no JSON", b"{"),
+                (b"a field of the wrong type", b'{"number": "1", "time": 0, "width": 1, "height": 1}'),
+                (b"a head without end", b" " * 100_000),
+                (b"x" * (MAX_FRAME + 1), b'{"number": 1, "time": 0, "width": 1, "height": 1}'),
+            ]
+            for count, (payload, attachment) in enumerate(bad, 1):
+                here._session.put(key, payload, attachment=attachment)
+                await until(lambda count=count: refused(watch, count))  # type: ignore[misc]
+            publisher.put(head(11), b"good")
+            assert (await frame_of(watch)).head.number == 11
+
+            watch.close()
+            await until(lambda: not publisher.watched)
+            assert told == [True, False]
+            with there.frames(key):
+                await until(lambda: publisher.watched)
+            publisher.close()
+
+    asyncio.run(story())
+
+
+async def sends(server: MjpegServer, pictures: int) -> None:
+    """Waits until a server has sent so many more."""
+    sent = server.sent
+    await until(lambda: server.sent > sent + pictures)
+
+
+@dataclass
+class Scene:
+    """A framegrabber on a mesh with an RCM, and two video channels that it can receive."""
+
+    lab: Lab
+    client: Client
+    rc: ResourceController
+    driver: FramegrabberDriver
+    one: MjpegServer
+    two: MjpegServer
+
+    def watch(self) -> FrameWatch:
+        return self.client.mesh.frames(self.client.mesh.keys.frame(GRABBER))
+
+    async def ask(self, grant: Any, name: str, **how: Any) -> Any:
+        return (await self.client.command(GRABBER, grant, {"name": name} | how)).result
+
+
+@asynccontextmanager
+async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
+    async with AsyncExitStack() as stack:
+        lab = await stack.enter_async_context(Lab(folder))
+        stand = await stack.enter_async_context(Stand(lab))
+        one = stack.enter_context(MjpegServer(rate=40))
+        two = stack.enter_context(
+            MjpegServer(rate=40, picture=lambda number: jpeg(numbered(BLUE + number, grey=False)))
+        )
+        leader = await Mesh.open(lab.fleet.name, Sender("leader", "node"), lab.fleet.mesh)
+        stack.push_async_callback(leader.close)
+        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: None)
+        rcm.start(Inheritance())
+        stack.callback(rcm.stop)
+        sources = {"video/ch1": one.url, "video/ch2": two.url}
+        driver = FramegrabberDriver(sources, rate=rate, quality=80)
+        rc = await stand.rc(GRABBER, driver)
+        for name in ("video/ch1", "video/ch2", "video/ch9"):
+            await stand.rc(name, SharedBench())
+        await stand.rc("robot/a", Bench())
+        client = await lab.client()
+        await lab.ready(client, GRABBER, "video/ch1", "video/ch2", "video/ch9", "robot/a")
+        yield Scene(lab, client, rc, driver, one, two)
+
+
+def test_frames_are_published_while_somebody_holds_and_somebody_looks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoded: list[bytes] = []
+    encode = frame_pump.encode
+
+    def counted(picture: Any, quality: int) -> bytes:
+        encoded.append(encode(picture, quality))
+        return encoded[-1]
+
+    monkeypatch.setattr(frame_pump, "encode", counted)
+
+    async def story() -> None:
+        async with scene(tmp_path) as at:
+            # Free: somebody looks, and nothing is opened.
+            watch = at.watch()
+            await until(lambda: at.driver._publisher.watched)
+            assert at.one.accepted + at.two.accepted == 0
+
+            first, grant = await running(at.client, "first", GRABBER, "video/ch1")
+            frames = [await frame_of(watch) for _ in range(6)]
+            assert {(frame.head.grant, frame.head.source) for frame in frames} == {(grant, "video/ch1")}
+            numbers = [frame.head.number for frame in frames]
+            assert numbers == sorted(set(numbers))
+            times = [frame.head.time for frame in frames]
+            assert times == sorted(times)
+            for frame in frames:
+                picture = picture_in(frame)
+                # It came in three colours, and had none.
+                assert picture.shape == (frame.head.height, frame.head.width) == (120, 160)
+                assert 0 < number_of(picture) <= at.one.sent
+            drawn = [number_of(picture_in(frame)) for frame in frames]
+            # Numbers count the source's pictures, those included that were not published.
+            assert len({here - there for here, there in zip(drawn, numbers, strict=True)}) == 1
+
+            told = await at.ask(grant, "snapshot")
+            assert told["source"] == "video/ch1"
+            assert (told["health"], told["width"], told["height"]) == ("ok", 160, 120)
+            assert told["number"] >= numbers[-1]
+            await until(lambda: at.driver.figures()["latency_ms"] > 0)
+            figures = (await at.lab.rc(at.client, GRABBER)).figures
+            assert (figures["opened"], figures["stalls"], figures["width"]) == (1, 0, 160)
+            assert 0 < figures["frames_per_second"] <= 60
+            assert figures["published"] >= 6
+
+            # A gang on another channel, with more weight: from its first frame on nothing is of the old hold.
+            second, newer = await running(at.client, "second", GRABBER, "video/ch2", priority=5)
+            seen = [await frame_of(watch)]
+            while seen[-1].head.grant != newer:
+                assert (seen[-1].head.grant, seen[-1].head.source) == (grant, "video/ch1")
+                seen.append(await frame_of(watch))
+            for _ in range(4):
+                frame = await frame_of(watch)
+                assert (frame.head.grant, frame.head.source) == (newer, "video/ch2")
+                picture = picture_in(frame)
+                assert picture.shape == (120, 160, 3)
+                assert BLUE < number_of(picture) <= BLUE + at.two.sent
+                assert frame.head.number > numbers[-1]
+            await until(lambda: at.one.connected == 0)
+
+            # Nobody looks: it stays open, and encodes nothing.
+            watch.close()
+            await until(lambda: not at.driver._publisher.watched)
+            done = len(encoded)
+            await sends(at.two, 10)
+            assert len(encoded) <= done + 1
+            assert at.two.connected == 1
+            # Somebody looks again: at once there are frames, and not of those that gathered.
+            sent = at.two.sent
+            with at.watch() as watch:
+                assert number_of(picture_in(await frame_of(watch))) > BLUE + sent - 5
+
+                # Free again: it stays open for the next while somebody looks, and publishes nothing.
+                await at.client.end(first)
+                await at.client.end(second)
+                await until(lambda: at.driver._holder is None)
+                watch.take()
+                published = at.driver.figures()["published"]
+                await sends(at.two, 10)
+                assert at.driver.figures()["published"] == published
+                assert (at.two.connected, at.driver.figures()["opened"]) == (1, 2)
+
+                # The next holder has it at once, but nothing that was there before its hold.
+                assert at.driver._capture is not None
+                before = at.driver._before.pictures + at.driver._capture.number
+                third, newest = await running(at.client, "third", GRABBER, "video/ch2")
+                frame = await frame_of(watch)
+                assert frame.head.grant == newest
+                assert frame.head.number > before
+                assert at.driver.figures()["opened"] == 2
+
+                # What is too old or too large is not sent.
+                for limit, value in (("MAX_AGE", -1.0), ("MAX_FRAME", 100)):
+                    with monkeypatch.context() as patch:
+                        patch.setattr(frame_pump, limit, value)
+                        await sends(at.two, 3)
+                        published = at.driver.figures()["published"]
+                        await sends(at.two, 10)
+                        assert at.driver.figures()["published"] == published
+                assert at.driver.figures()["too_large"] > 0
+                await at.client.end(third)
+                await until(lambda: at.driver._holder is None)
+            await until(lambda: at.two.connected == 0)
+            assert at.driver._capture is None
+
+    asyncio.run(story())
+
+
+def test_tuning_by_hand(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with scene(tmp_path, rate=10) as at:
+            watch = at.watch()
+            arc, grant = await running(at.client, "free", GRABBER, "robot/a")
+            told = await at.ask(grant, "snapshot")
+            assert told["source"] is None
+            assert told["health"] == "no video RC is in its gang; tune it to one of video/ch1, video/ch2"
+            assert at.one.accepted + at.two.accepted == 0
+
+            def tune(**how: Any) -> Any:
+                return answer(at.client.command(GRABBER, at_grant, {"name": "tune"} | how))
+
+            at_grant = grant
+            for wrong in ({}, {"to": 1}, {"to": "video/ch9"}, {"to": ["video/ch1"]}):
+                assert await tune(**wrong) == "bad_command"
+            assert await at.ask(grant, "tune", to="video/ch2") == {"source": "video/ch2"}
+            times = []
+            for _ in range(5):
+                frame = await frame_of(watch)
+                times.append(frame.head.time)
+                assert frame.head.source == "video/ch2"
+            # Of 40 a second 10 are published; one may be half an interval early.
+            assert times[-1] - times[0] > 0.34
+            assert await tune(to="video/ch1") == "done"
+            frame = await frame_of(watch)
+            while frame.head.source != "video/ch1":
+                frame = await frame_of(watch)
+            assert frame.head.grant == grant
+            assert await answer(at.client.command(GRABBER, grant, {"name": "zoom"})) == "unknown_command"
+            await at.client.end(arc)
+
+            # A gang that has a channel is not shown another one's.
+            arc, at_grant = await running(at.client, "mine", GRABBER, "video/ch1")
+            assert await tune(to="video/ch2") == "bad_command"
+            await at.client.end(arc)
+            arc, at_grant = await running(at.client, "deaf", GRABBER, "video/ch9")
+            assert "does not receive video/ch9" in (await at.ask(at_grant, "snapshot"))["health"]
+            assert at.rc.health == "ok"
+            await at.client.end(arc)
+
+    asyncio.run(story())
+
+
+def test_a_source_that_falls_silent_loses_the_framegrabber_until_it_is_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(framegrabber, "LOST_AFTER", 0.7)
+
+    async def story() -> None:
+        async with scene(tmp_path) as at:
+            monkeypatch.setattr(framegrabber, "TRY_NEXT", 600)
+            arc, grant = await running(at.client, "hide", GRABBER, "video/ch1")
+            # Whether or not somebody looks: whoever holds it may be about to.
+            await until(lambda: at.driver._capture is not None and at.driver._capture.number > 0)
+            at.one.close()
+            await until(lambda: arc.state == "queued")
+            assert arc.ending is not None
+            assert arc.ending.outcome == "lost"
+            assert "no picture of video/ch1 for 0.7 s: http://127.0.0.1" in arc.ending.reason
+            assert "can't be opened" in arc.ending.reason
+            assert "no picture of video/ch1" in (await at.lab.rc(at.client, GRABBER)).health
+            await until(lambda: at.driver._holder is None)
+            at.one.open()
+            again = await at.client.granted(arc)
+            assert again is not None
+            assert again > grant
+            watch = at.watch()
+            frame = await frame_of(watch)
+            while frame.head.grant != again:
+                frame = await frame_of(watch)
+            assert at.rc.health == "ok"
+
+            # With several sources it is there for others as soon as any of them works.
+            monkeypatch.setattr(framegrabber, "TRY_NEXT", 0.3)
+            at.one.close()
+            await until(lambda: arc.state == "queued")
+            await at.client.end(arc)
+            await until(lambda: at.rc.health == "ok")
+            arc, grant = await running(at.client, "other", GRABBER, "video/ch2")
+            frame = await frame_of(watch)
+            while frame.head.grant != grant:
+                frame = await frame_of(watch)
+            assert frame.head.source == "video/ch2"
+            watch.close()
+            await at.client.end(arc)
+
+    asyncio.run(story())
