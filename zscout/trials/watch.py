@@ -1,0 +1,95 @@
+"""A hidden robot that watches, under virtual time: what it alerts to, and when it does so for nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from zscout.simulation.air import Air
+from zscout.simulation.plan import Plan
+from zscout.simulation.world import World
+from zscout.vision.garble import garbled
+from zscout.vision.motion import MotionDetector
+
+PIXELS: Final = 60
+"""Of a person in the picture, from which a crossing counts."""
+IN_TIME: Final = 1.0
+"""Seconds within which it is to be alerted."""
+CLEAR: Final = 2.0
+"""Seconds after the last pixel of a person during which a word about motion is no false alarm."""
+STEP: Final = 0.1
+
+
+@dataclass(slots=True)
+class Watched:
+    """What came of it."""
+
+    crossings: int = 0
+    alerted: int = 0
+    """Of these, within IN_TIME."""
+    late: list[float] = field(default_factory=list)
+    """Seconds by which the others were later; what was never alerted is not here."""
+    false_alarms: int = 0
+    empty: float = 0.0
+    """Seconds in which nobody was in view."""
+    garbled: int = 0
+    pictures: int = 0
+
+
+def watch(plan: Plan, *, seed: int, noise: float, seconds: float, rate: float = 5.0) -> Watched:
+    """Watches from a dark place of `plan` that faces the light, at `rate` pictures a second, with `noise`
+    times the usual noise of camera and air."""
+    spoiled = msgspec.structs.replace(plan.noise, sensor=noise, analog=noise)
+    world = World(msgspec.structs.replace(plan, noise=spoiled), seed=seed)
+    air, detector, out = Air(seed=seed), MotionDetector(), Watched()
+    robot = hide_at_random(world, np.random.default_rng(seed))
+    world.bodies[robot].transmit(1, -60.0)
+    due, since, told, moving_before, last_person = 1.0, None, False, False, -60.0
+    while world.time < seconds:
+        world.step(STEP)
+        if world.time < due:
+            continue
+        due += 1 / rate
+        picture, now = air.receive(world, 1), world.time
+        people = world.people_in_view(robot)
+        out.pictures += 1
+        if people:
+            last_person = now
+        if garbled(picture):
+            out.garbled += 1
+            continue
+        moving = detector.see(now, picture).moving
+        if people >= PIXELS and since is None:
+            since, told = now, False
+            out.crossings += 1
+        if since is not None and moving and not told:
+            told = True
+            if now - since <= IN_TIME + 1e-6:
+                out.alerted += 1
+            else:
+                out.late.append(now - since)
+        if now - last_person > CLEAR:
+            since = None
+            out.empty += 1 / rate
+            out.false_alarms += moving and not moving_before
+        moving_before = moving
+    return out
+
+
+def hide_at_random(world: World, rng: np.random.Generator) -> str:
+    """Puts the first robot into a dark place from which it faces the light; its name. Raises ValueError where
+    there is none."""
+    name = next(iter(world.bodies))
+    truth = world.truth
+    dark = np.argwhere(truth.dark)
+    for _ in range(5_000):
+        row, column = dark[rng.integers(len(dark))]
+        x, y = (float(column) + 0.5) * truth.cell, (float(row) + 0.5) * truth.cell
+        heading = float(rng.uniform(-np.pi, np.pi))
+        if truth.faces_light(x, y, heading) and world.clear(x, y):
+            world.bodies[name].place(x, y, heading)
+            return name
+    raise ValueError(f"{world.plan.name} has no dark place that faces the light")

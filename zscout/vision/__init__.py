@@ -1,0 +1,1 @@
+"""What is in a picture. Pure: pictures in, findings out."""
