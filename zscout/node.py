@@ -17,9 +17,10 @@ import click
 import uvloop
 
 from zscout import __version__
-from zscout.config import Node, RcSpec, default_node, load_node
+from zscout.config import Framegrabber, Node, Radio, RcSpec, Robot, Video, default_node, load_node
 from zscout.drivers.base import Driver, ResourceController
 from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
+from zscout.drivers.video import VideoDriver
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError
 from zscout.scheduling.model import SECOND
@@ -47,7 +48,8 @@ async def run_node(node: Node, stop: asyncio.Event) -> None:
         stack.callback(stall.stop)
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
         stack.callback(token.close)
-        for spec in node.rcs:
+        # Robots end first: their last word goes through a radio, which may be one of this node.
+        for spec in sorted(node.rcs, key=lambda spec: isinstance(spec.device, Robot)):
             rc = ResourceController(
                 mesh,
                 spec.name,
@@ -84,9 +86,32 @@ async def run_node(node: Node, stop: asyncio.Event) -> None:
 def driver_for(spec: RcSpec) -> Driver:
     """The driver that an RC of a node file asks for."""
     activation = spec.activation / SECOND
-    if spec.driver == "capacity":
-        return CapacityDriver(spec.capacity, activation=activation)
-    return ExclusiveDriver(activation=activation)
+    # What a device needs is loaded where there is one: pyserial, OpenCV.
+    match spec.device:
+        case Radio() as radio:
+            from zscout.drivers.radio import RadioDriver
+
+            return RadioDriver(radio.port, baud=radio.baud, bound=radio.bound / SECOND)
+        case Robot() as robot:
+            from zscout.drivers.robot import RobotDriver
+
+            return RobotDriver(
+                robot.id,
+                radio=robot.radio,
+                channels=robot.channels,
+                warm_up=robot.warm_up / SECOND,
+                dead_man=robot.dead_man / SECOND,
+            )
+        case Video():
+            return VideoDriver()
+        case Framegrabber() as grabber:
+            from zscout.drivers.framegrabber import FramegrabberDriver
+
+            return FramegrabberDriver(grabber.sources, rate=grabber.rate, quality=grabber.quality)
+        case None if spec.driver == "capacity":
+            return CapacityDriver(spec.capacity, activation=activation)
+        case None:
+            return ExclusiveDriver(activation=activation)
 
 
 async def _refuse_twin(mesh: Mesh) -> None:

@@ -41,6 +41,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "view": ("zscout.cli.view", "Watch the fleet live on a timeline, or open a recording."),
     "replay": ("zscout.cli.replay", "Schedule a workload file under virtual time."),
     "study": ("zscout.cli.study", "Compare scheduling strategies on random workloads."),
+    "simulate": ("zscout.cli.simulate", "Serve a simulated building with robots, radio and cameras."),
     "demo": ("zscout.cli.demo.command", "Show what zscout does, on a live mesh on this machine."),
     "completion": ("zscout.cli.completion", "Print the completion script for bash, zsh or fish."),
 }

@@ -51,24 +51,25 @@ def _headline(look: Look, state: RcmState | None) -> str:
     return f"Fleet {fleet}: {state.host} leads, term {state.term.counter} ({_many(links, 'link')})"
 
 
-def _tables(look: Look, state: RcmState | None) -> Iterator[Table]:
+def _tables(look: Look, state: RcmState | None, lost: frozenset[str]) -> Iterator[Table]:
     if state is not None:
-        yield _rc_table(look, state)
+        yield _rc_table(look, state, lost)
         yield _running_table(look, state)
         yield _waiting_table(state)
     yield _host_table(look)
 
 
-def _rc_table(look: Look, state: RcmState) -> Table:
+def _rc_table(look: Look, state: RcmState, lost: frozenset[str]) -> Table:
     homes = {token.name: token.host for token in look.tokens(Role.RC)}
     rows, styles = [], []
     for view in state.rcs:
         holders = [hold for hold in state.holds if view.rc in hold.needs]
-        words = "absent" if not view.present else "held" if holders else "free"
+        there = "held" if holders else "free"
+        words = there if view.present else "lost" if view.rc in lost else "absent"
         kind = "shared" if view.sharable else "exclusive"
         names = ", ".join(_with_params(hold, view.rc) for hold in holders)
         rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
-        styles.append({"absent": "red", "held": "yellow", "free": "green"}[words])
+        styles.append({"absent": "red", "lost": "red", "held": "yellow", "free": "green"}[words])
     return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles)
 
 
@@ -164,9 +165,9 @@ def _many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def fleet_picture(look: Look, state: RcmState | None) -> Picture:
-    """RCs, what runs and waits, and the hosts."""
-    return Picture(_headline(look, state), list(_tables(look, state)), alarm=state is None)
+def fleet_picture(look: Look, state: RcmState | None, lost: frozenset[str] = frozenset()) -> Picture:
+    """RCs, what runs and waits, and the hosts. `lost`: RCs that are there and say that they can't serve."""
+    return Picture(_headline(look, state), list(_tables(look, state, lost)), alarm=state is None)
 
 
 def print_picture(picture: Picture) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import click
@@ -12,6 +12,7 @@ from msgspec import structs
 
 from zscout import clock
 from zscout.cli import common
+from zscout.cli.devices import Devices
 from zscout.cli.look import Host, Look
 from zscout.cli.picture import Picture, fleet_picture
 from zscout.cli.watching import pause, show_once, shower
@@ -22,29 +23,35 @@ from zscout.scheduling.model import SECOND, Ns
 
 @click.command()
 @click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
+@click.option(
+    "--devices", "every", is_flag=True, help="Show the figures of all devices: rates, drops, latency."
+)
 @common.json_option("Print one JSON object; with --watch, one on each line.")
-def status(watch: bool, as_json: bool) -> None:
+def status(watch: bool, every: bool, as_json: bool) -> None:
     """Show the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
 
     The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are
-    shown even where they are not there; other hosts that died only with --watch. --watch refreshes once a
-    second; in a pipe it prints a new block when something else than a load or a time has changed. Exit code
-    3: no RCM.
+    shown even where they are not there; other hosts that died only with --watch. A device that says that
+    something is wrong with it is shown with its words, and counts as lost until it is well. --watch refreshes
+    once a second; in a pipe it prints a new block when something else than a load, a time or a figure has
+    changed. Exit code 3: no RCM.
 
     \b
     Examples:
       zscout status
       zscout status --json | jq -r '.queue[] | .arc + ": " + .reason'
-      zscout status --watch
+      zscout status --devices --watch
     """
-    common.run(_watch(as_json) if watch else _once(as_json))
+    common.run(_watch(every, as_json) if watch else _once(every, as_json))
 
 
-async def _once(as_json: bool) -> None:
+async def _once(every: bool, as_json: bool) -> None:
     async with common.connected("status", need_rcm=False) as client:
         look = Look(client)
+        devices = Devices(look)
         state, nobody = await _first(look)
-        show_once(Standing(look, state), as_json=as_json)
+        await devices.ask()
+        show_once(Standing(look, state, devices, every), as_json=as_json)
         if nobody is not None:
             raise nobody
 
@@ -57,7 +64,7 @@ async def _first(look: Look) -> tuple[RcmState | None, common.NobodyThere | None
         return None, nobody
 
 
-async def _watch(as_json: bool) -> None:
+async def _watch(every: bool, as_json: bool) -> None:
     news, stop = asyncio.Event(), asyncio.Event()
 
     def end() -> None:
@@ -68,6 +75,8 @@ async def _watch(as_json: bool) -> None:
         client = await stack.enter_async_context(common.connected("status", need_rcm=False))
         look = Look(client)
         stack.callback(look.close)
+        devices = Devices(look)
+        stack.callback(devices.close)
         # Whatever becomes of an ARC is told to its client.
         heard = client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
         stack.callback(heard.close)
@@ -75,7 +84,8 @@ async def _watch(as_json: bool) -> None:
         state, _ = await _first(look)
         while not stop.is_set():
             look.forget_the_gone()
-            show(Standing(look, state))
+            await devices.ask()
+            show(Standing(look, state, devices, every))
             await pause(news, stop)
             state = await client.state(forecast=True)
 
@@ -85,19 +95,23 @@ async def _watch(as_json: bool) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """How the fleet stands; `state` is None where there is no RCM."""
+    """How the fleet stands; `state` is None where there is no RCM. `every`: with figures of all devices."""
 
     look: Look
     state: RcmState | None
+    devices: Devices
+    every: bool
 
     def picture(self) -> Picture:
-        return fleet_picture(self.look, self.state)
+        lost = frozenset(rc for rc in self.devices.living() if self.devices.ill(rc))
+        picture = fleet_picture(self.look, self.state, lost)
+        return replace(picture, tables=[*picture.tables, self.devices.table(every=self.every)])
 
     def as_object(self) -> dict[str, Any]:
-        return as_object(self.look, self.state)
+        return as_object(self.look, self.state, self.devices)
 
 
-def as_object(look: Look, state: RcmState | None) -> dict[str, Any]:
+def as_object(look: Look, state: RcmState | None, devices: Devices) -> dict[str, Any]:
     """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
     now = clock.now()
     homes = {token.name: token.host for token in look.tokens(Role.RC)}
@@ -112,6 +126,7 @@ def as_object(look: Look, state: RcmState | None) -> dict[str, Any]:
                 "host": homes.get(view.rc),
                 "holders": [{"arc": hold.arc, "id": hold.id, "client": hold.client} for hold in holders],
             }
+            | devices.as_object(view.rc)
         )
     return {
         "fleet": look.client.fleet.name,

@@ -19,7 +19,7 @@ HASTE: Final = 0.1
 """The same where something has changed."""
 PASSING: Final = frozenset(
     {"held", "remaining", "waited", "starts_in", "seq", "links", "load", "age", "gone"}
-    | {"uptime", "cpu", "memory"}
+    | {"uptime", "cpu", "memory", "figures"}
 )
 """Fields that change without anything having happened."""
 

@@ -11,7 +11,7 @@ from msgspec import structs
 
 from zscout.cli import common
 from zscout.cli.seen import SeenNeed, hold_json, needs_seen
-from zscout.messages import HoldView, RcmState, StoryLine, WaitView
+from zscout.messages import HoldView, RcAsk, RcmState, RcState, StoryLine, WaitView
 from zscout.strict import quoted
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 MAX_TWINS: Final = 20
 """Open ARCs of one name that are told of."""
 MAX_NAMED: Final = 8
+ASK_RC: Final = 0.5
+"""Seconds that an RC has to say what ails it."""
 
 View = HoldView | WaitView
 
@@ -74,7 +76,10 @@ async def _told(client: Client, view: View, state: RcmState) -> dict[str, Any]:
     story = (await common.state_of(client, _full(view))).story
     told = structs.asdict(view) | {
         "state": "running" if isinstance(view, HoldView) else "queued",
-        "needs": [_need(need, view) for need in needs_seen(state, view.needs, _full(view))],
+        "needs": [
+            _need(need, view) | {"health": await _health(client, need)}
+            for need in needs_seen(state, view.needs, _full(view))
+        ],
         "story": _story(story),
     }
     if isinstance(view, WaitView):
@@ -94,6 +99,16 @@ def _need(seen: SeenNeed, view: View) -> dict[str, Any]:
         "params": view.needs[seen.need],
         "holders": holders,
     }
+
+
+async def _health(client: Client, need: SeenNeed) -> str | None:
+    """Why an RC that counts as lost does so, in its own words; None where it is well or does not answer."""
+    if need.rc is None or need.present:
+        return None
+    mesh = client.mesh
+    reply = await mesh.ask_one(mesh.keys.rc_state(need.rc), RcAsk(), RcState, timeout=ASK_RC)
+    state = None if reply is None else reply.message
+    return None if state is None or state.health == "ok" else state.health
 
 
 def _story(lines: list[StoryLine]) -> list[dict[str, Any]]:
@@ -168,7 +183,7 @@ def _need_words(need: dict[str, Any]) -> Iterator[Line]:
     what = need["need"] if rc in (None, need["need"]) else f"{rc} for {need['need']}"
     name = f"  {what}" + (f" ({amounts})" if amounts else "")
     if not need["present"]:
-        yield f"{name}: not on the mesh", {"fg": "red"}
+        yield f"{name}: {need['health'] or 'not on the mesh'}", {"fg": "red"}
     elif rc is None and need["free"]:
         yield f"{name}: no ARC holds {', '.join(need['free'])}", {"fg": "green"}
     elif not need["holders"]:

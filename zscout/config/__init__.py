@@ -5,6 +5,7 @@ line that names file, key and remedy. Durations are whole ns (`Ns`), but seconds
 them (`Mesh`).
 """
 
+from zscout.config.devices import Device, Driver, Framegrabber, Radio, Robot, Video
 from zscout.config.fleet import (
     DEFAULT_FLEET_NAME,
     FLEET_VARIABLE,
@@ -17,8 +18,8 @@ from zscout.config.fleet import (
     load_fleet,
 )
 from zscout.config.node import (
+    MAX_KINDS,
     Components,
-    Driver,
     Node,
     RcSpec,
     Recorder,
@@ -29,15 +30,21 @@ from zscout.config.node import (
 __all__ = [
     "DEFAULT_FLEET_NAME",
     "FLEET_VARIABLE",
+    "MAX_KINDS",
     "Components",
+    "Device",
     "Driver",
     "Fleet",
+    "Framegrabber",
     "Limits",
     "Mesh",
     "Node",
+    "Radio",
     "RcSpec",
     "Recorder",
+    "Robot",
     "Timing",
+    "Video",
     "default_fleet",
     "default_node",
     "fleet_from_env",

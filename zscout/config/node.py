@@ -11,6 +11,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta, Struct, structs
 
+from zscout.config.devices import Device, DeviceTable, Driver, check_keys, device
 from zscout.config.fleet import Endpoints, Fleet, default_fleet, load_fleet
 from zscout.endpoints import check_links, ip_of
 from zscout.keyexpr import valid_name
@@ -33,10 +34,12 @@ MAX_RCS: Final = 1_000
 MAX_PARAMETERS: Final = 64
 """Capacities of one RC."""
 MAX_KINDS: Final = 256
+"""Kinds of components that a node may be limited to, and that it tells of."""
 MAX_STARTED: Final = 256
 """Components of one node that run at one time; a load report holds no more."""
+FRAMES: Final = 2.0
+"""Pictures a second that a recorder shows of each camera, unless told otherwise."""
 
-Driver = Literal["exclusive", "capacity"]
 LoadKind = bool | Literal["tree"]
 
 
@@ -50,6 +53,8 @@ class RcSpec(Struct, frozen=True):
     """Of a `capacity` driver: the greatest sum of each bandwidth parameter; empty for others."""
     activation: Ns
     """From a grant until the device can be used, in ns (a camera warms up)."""
+    device: Device | None = None
+    """What the drivers of devices are told; None for `exclusive` and `capacity`."""
 
 
 class Recorder(Struct, frozen=True):
@@ -60,6 +65,8 @@ class Recorder(Struct, frozen=True):
     bind: str
     """IP address; loopback unless the file allowed others."""
     port: int
+    frames: float = FRAMES
+    """Pictures a second shown of each camera; 0: none."""
 
 
 class Components(Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,11 +110,11 @@ class _NodeTable(Struct, frozen=True, forbid_unknown_fields=True):
     labels: Annotated[tuple[str, ...], Meta(max_length=MAX_LABELS)] = ()
 
 
-class _RcTable(Struct, frozen=True, forbid_unknown_fields=True):
+class _RcTable(DeviceTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
     name: str
     driver: Driver
     capacity: Annotated[dict[str, Decimal], Meta(max_length=MAX_PARAMETERS)] | None = None
-    activation: Decimal = Decimal(0)
+    activation: Decimal | None = None
 
 
 class _RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -115,6 +122,7 @@ class _RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
     bind: str = "127.0.0.1"
     port: Annotated[int, Meta(ge=1, le=65_535)] = 9876
     allow_remote: bool = False
+    frames: Annotated[float, Meta(ge=0, le=30)] = FRAMES
 
 
 class _NodeMeshTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -175,12 +183,9 @@ def _node(file: _NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
 def _rc(table: _RcTable, at: Where) -> RcSpec:
     check_rc_name(table.name, at / "name")
     capacity = table.capacity or {}
+    check_keys(structs.asdict(table), table.driver, at)
     if table.driver == "capacity" and not capacity:
         raise (at / "capacity").bad("is missing or empty", "add one, as in capacity = { command_rate = 10 }")
-    if table.driver != "capacity" and table.capacity is not None:
-        raise (at / "capacity").bad(
-            f'the driver "{table.driver}" has none', 'remove it, or write driver = "capacity"'
-        )
     for parameter in capacity:
         check_name(parameter, at / "capacity")
     hour = Decimal(3600)
@@ -188,7 +193,8 @@ def _rc(table: _RcTable, at: Where) -> RcSpec:
         name=table.name,
         driver=table.driver,
         capacity=amounts(capacity, at / "capacity"),
-        activation=seconds_to_ns(table.activation, at / "activation", high=hour),
+        activation=seconds_to_ns(table.activation or Decimal(0), at / "activation", high=hour),
+        device=device(table, table.name, table.driver, at),
     )
 
 
@@ -203,4 +209,4 @@ def _recorder(table: _RecorderTable, folder: Path, at: Where) -> Recorder:
             f"{quoted(table.bind)} shows the recording to other hosts",
             'write "127.0.0.1", or add allow_remote = true if that is meant',
         )
-    return Recorder(path=folder / table.path, bind=str(address), port=table.port)
+    return Recorder(folder / table.path, str(address), table.port, table.frames)

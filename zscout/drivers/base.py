@@ -1,6 +1,6 @@
 """A resource controller on the mesh: the part that every driver shares.
 
-A driver subclasses `Driver` and says what its device does; `ResourceController` owns the keys, checks every
+A driver (`driver.py`) says what its device does; `ResourceController` owns the keys, checks every
 command against the hold that stands when it is carried out, votes, and puts the device into its safe state
 when its holder is gone.
 """
@@ -9,31 +9,29 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Mapping
+from collections.abc import Awaitable, Coroutine
 from typing import Any
 
 from zscout import clock
-from zscout.drivers.holding import Change, Holding
-from zscout.keyexpr import Role, Token, new_instance
+from zscout.drivers.driver import Driver as Driver
+from zscout.drivers.holding import Change, Holding, Refusal
+from zscout.drivers.offers import Offers
+from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Declared, Mesh, Refused, Reply, Request
 from zscout.messages import (
-    Amounts,
     Ballot,
     Command,
     Done,
     EndedHold,
-    Figures,
     Grants,
-    Holder,
     Proposal,
-    ProposedHolder,
     RcAsk,
     RcmState,
     RcState,
     StateAsk,
     absurd,
 )
-from zscout.scheduling.model import SECOND, Ns
+from zscout.scheduling.model import SECOND, Grant, Ns
 from zscout.stall import StallWatch
 
 log = logging.getLogger(__name__)
@@ -46,50 +44,6 @@ REREADS = 4
 COMMAND_QUEUE = 64
 FIGURES_PERIOD = 1.0
 """Seconds from one look at a driver's figures to the next."""
-
-
-class Driver:
-    """What a device does. The defaults are those of an exclusive device without commands of its own.
-
-    Everything runs in the node's event loop, one call at a time; nothing may block.
-    """
-
-    sharable = False
-    activation: float = 0.0
-    """Seconds after a grant until the device has its full use, like a camera that warms up."""
-
-    async def open(self, rc: ResourceController) -> None:
-        """The RC is about to be offered: the time to take what is needed of `rc.mesh`. A device that is not
-        there is no error: call `rc.fail`, go on trying, and `rc.recover`."""
-
-    async def close(self) -> None:
-        """The RC has left the mesh, and `safe` has been called."""
-
-    async def begin(self, holder: Holder) -> None:
-        """Somebody begins to hold the device."""
-
-    async def safe(self) -> None:
-        """Nobody holds the device any more: motors stopped, transmitter off. Must not raise."""
-
-    async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        """Carries out `do` and returns what is answered. Raises Refused for what can't be done."""
-        raise Refused("unknown_command", f"this device does not know {str(do.get('name'))[:64]!r}")
-
-    def vote(self, holders: list[ProposedHolder]) -> str:
-        """Why a sharable device can't carry these holders; empty if it can, and any subset of them."""
-        return ""
-
-    def capacity(self) -> Amounts:
-        """Bounds that people may like to see, by bandwidth parameter."""
-        return {}
-
-    def figures(self) -> Figures:
-        """Rates, drops, latency and the like, by name; told when they change, once a second at most."""
-        return {}
-
-    def usable_cold(self, do: Mapping[str, Any]) -> bool:
-        """Whether this command can be carried out while the device still warms up."""
-        return False
 
 
 class ResourceController:
@@ -115,6 +69,8 @@ class ResourceController:
         """Something was missed that has not been read since."""
         self._timer: asyncio.TimerHandle | None = None
         self._stall = stall
+        self.offers = Offers(mesh) if driver.relays else None
+        """Which host offers which RC; only of a driver that relays."""
 
     async def start(self) -> None:
         """Starts empty, and obeys nothing before it has subscribed and then read `rcm/state`."""
@@ -123,6 +79,8 @@ class ResourceController:
         self._declared.append(mesh.watch(keys.alive_any(Role.RCM), self._on_leader))
         self._declared.append(mesh.subscribe(keys.grants, Grants, self._on_grants))
         await self._read_state()
+        if self.offers is not None:
+            self._declared.append(self.offers.watch())
         await self.driver.open(self)
         self._spawn(self._worker())
         self._spawn(self._tell_figures())
@@ -221,13 +179,16 @@ class ResourceController:
 
     def _on_command(self, request: Request[Command]) -> None:
         self.mesh.keys.sender_of(request.key)  # a sender without a valid name is refused here
-        if self._work.qsize() >= COMMAND_QUEUE:
+        # What stops a robot is let in where commands are not.
+        room = COMMAND_QUEUE if request.message.grant is not None else 2 * COMMAND_QUEUE
+        if self._work.qsize() >= room:
             raise Refused("busy", f"{self.name} has {COMMAND_QUEUE} commands waiting; ask again")
         if not 0 < request.message.ttl <= MAX_TTL:
             raise Refused("bad_command", f"ttl must lie between 0 and {MAX_TTL:g} seconds")
         self._work.put_nowait(("command", request))
 
-    async def _carry_out(self, request: Request[Command]) -> None:
+    async def _carry_out(self, request: Request[Command]) -> Any:
+        """What is answered, or a Future of it."""
         command = request.message
         sender = self.mesh.keys.sender_of(request.key)
         waited = self._waited(request)
@@ -235,20 +196,31 @@ class ResourceController:
             raise Refused(
                 "stale", f"the command waited {waited / SECOND:.2f} s, longer than its ttl {command.ttl:g} s"
             )
-        refusal = self.holding.check(command.grant, str(sender), clock.now())
+        if command.grant is None:
+            return await self.driver.command_without_grant(sender, command.do)
+        refusal = self._objection(command.grant, sender)
         if refusal is not None and refusal.code == "not_yet":
             await self._read_state()
-            refusal = self.holding.check(command.grant, str(sender), clock.now())
+            refusal = self._objection(command.grant, sender)
         if refusal is not None:
             raise Refused(refusal.code, refusal.message, self.holding.term)
         warming = max(0.0, (self._warm_at - clock.now()) / SECOND)
         if command.do.get("name") == "confirm":
-            request.answer(Done(warming=warming))
-            return
+            return Done(warming=warming)
         if warming and not self.driver.usable_cold(command.do):
             raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
-        result = await self.driver.command(self.holding.held[command.grant].holder, command.do)
-        request.answer(Done(result=result))
+        return await self.driver.command(self.holding.held[command.grant].holder, command.do)
+
+    def _objection(self, grant: Grant, sender: Sender) -> Refusal | None:
+        """Why `sender` is not obeyed under `grant`; None: it is."""
+        client, held = str(sender), self.holding.held.get(grant)
+        if (
+            held is not None
+            and self.offers is not None
+            and self.offers.of_gang(sender, held.holder, self.name)
+        ):
+            client = held.holder.client
+        return self.holding.check(grant, client, clock.now())
 
     def _waited(self, request: Request[Command]) -> Ns:
         """How long a command may have waited: in our queue, and before it in the network through a stall."""
@@ -259,13 +231,17 @@ class ResourceController:
         while True:
             what, item = await self._work.get()
             if what == "command":
-                await self._answer(item)
+                await self._answer(item, self._carry_out(item))
             else:
                 await self._change(item)
 
-    async def _answer(self, request: Request[Command]) -> None:
+    async def _answer(self, request: Request[Command], work: Awaitable[Any]) -> None:
         try:
-            await self._carry_out(request)
+            result = await work
+            if isinstance(result, asyncio.Future):
+                self._spawn(self._answer(request, result))
+            else:
+                request.answer(result if isinstance(result, Done) else Done(result=result))
         except Refused as refused:
             request.refuse(refused.problem)
         except Exception:
@@ -273,6 +249,10 @@ class ResourceController:
             request.refuse(Refused("failed", f"{self.name} could not do it; see the log of its node").problem)
 
     async def _change(self, change: Change) -> None:
+        going_on = {holder.place: holder.client for holder in change.began}
+        for holder in change.stopped:
+            if going_on.get(holder.place, holder.client) == holder.client:
+                await self._guard(self.driver.end(holder))
         # A device that still serves others, or goes on in another client, stays as it is.
         if change.stopped and not change.stayed and not _handed_over(change):
             await self._guard(self.driver.safe())

@@ -40,11 +40,12 @@ class Ballot(Message, frozen=True):
 class Command(Message, frozen=True):
     """Do `do` under `grant`, unless it has waited longer than `ttl` seconds by then.
 
-    `do` names what to do in `name`; the rest is the driver's. Every RC knows `confirm`.
+    `do` names what to do in `name`; the rest is the driver's. Every RC knows `confirm`. Without a grant only
+    what stops a robot is done, by a radio, for the node of that robot's RC.
     """
 
-    grant: Grant
     do: dict[str, Any]
+    grant: Grant | None = None
     ttl: float = 1.0
 
 

@@ -15,7 +15,9 @@ BOUND: Final = 0.25
 BOUND_BYTES: Final = 60
 """... or as long as so many bytes take."""
 MAX_BOUND: Final = 10.0
+MIN_RATE: Final = 0.1
 MAX_RATE: Final = 60.0
+"""Of a framegrabber's frames a second."""
 
 
 def video_name(channel: int) -> str:
@@ -23,37 +25,33 @@ def video_name(channel: int) -> str:
     return f"video/ch{channel}"
 
 
-def node_file(
-    served: Served, *, host: str, fleet: Path | None, framegrabbers: int, frame_rate: float | None = None
-) -> str:
-    """TOML with an RC for the radio, each robot, each video channel and `framegrabbers` receivers that tune in
-    to any of them. Times are ours: a building twice as fast warms up its cameras in half of the time."""
+def node_file(served: Served, *, fleet: Path | None, framegrabbers: int) -> str:
+    """TOML with an RC for the radio, each robot, each video channel and `framegrabbers` receivers that tune
+    in to any of them. Times are ours: a building twice as fast warms up its cameras in half of the time."""
     speed = served.speed
     channels = {video_name(number + 1): number + 1 for number in range(len(served.channels))}
-    sources = {
-        rc: _text(served.video.url(served.channels[number - 1])) for rc, number in channels.items()
-    }
+    sources = {rc: _text(served.video.url(served.channels[number - 1])) for rc, number in channels.items()}
     baud = min(max(served.radio.baud, MIN_BAUD), MAX_BAUD)
     bound = min(MAX_BOUND, max(BOUND, BOUND_BYTES * BITS / baud))
     port = served.radio.link.absolute() if served.radio.link is not None else served.radio.port
-    node = {"host": _text(host)} | ({} if fleet is None else {"fleet": _text(str(fleet.absolute()))})
-    rate = min(MAX_RATE, (frame_rate or served.frame_rate) * speed)
+    node = {} if fleet is None else {"fleet": _text(str(fleet.absolute()))}
+    rate = min(MAX_RATE, max(MIN_RATE, served.frame_rate * speed))
     tables = [
         "# The devices of a simulated building, written by zscout simulate. For: zscout-node THIS_FILE\n",
         _table("[node]", node),
         _rc(RADIO, "radio", port=_text(str(port)), baud=str(baud), bound=_number(bound)),
     ]
-    for robot in served.plan.robots:
-        tables.append(
-            _rc(
-                f"robot/{robot.name}",
-                "robot",
-                id=str(robot.id),
-                radio=_text(RADIO),
-                channels=_inline({rc: str(number) for rc, number in channels.items()}),
-                warm_up=_number(WARM_UP / speed),
-            )
+    tables += [
+        _rc(
+            f"robot/{robot.name}",
+            "robot",
+            id=str(robot.id),
+            radio=_text(RADIO),
+            channels=_inline({rc: str(number) for rc, number in channels.items()}),
+            warm_up=_number(WARM_UP / speed),
         )
+        for robot in served.plan.robots
+    ]
     tables += [_rc(rc, "video") for rc in channels]
     tables += [
         _rc(f"framegrabber/fgrab{number + 1}", "framegrabber", sources=_inline(sources), rate=_number(rate))

@@ -45,10 +45,10 @@ T = TypeVar("T")
 class Served:
     """A plan in motion that drivers cannot tell from a building. Use as an async context manager.
 
-    `speed` of its seconds pass in one of ours; `frame_rate` is in frames per second of the building, and so is
-    `baud` its line's rate there. `loss` is the share of radio packets that no robot hears. `http` is host and
-    port (0: any free one) of the video, `radio_link` a name for the radio's port, `channels` how many video
-    channels have a receiver. Entering raises BadInput where something can't be had.
+    `speed` of its seconds pass in one of ours; `frame_rate` (frames a second) and `baud` (of the radio's
+    line) are in the building's seconds. `loss` is the share of radio packets that no robot hears. `http` is
+    host and port (0: any free one) of the video, `radio_link` a name for the radio's port, `channels` how
+    many video channels have a receiver. Entering raises BadInput where something can't be had.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class Served:
 
     async def map(self) -> BuildingPlan:
         """The building seen from above."""
-        return await self.in_world(lambda: building_plan(self.plan))
+        return await asyncio.to_thread(building_plan, self.plan)
 
     async def in_world(self, work: Callable[[], T]) -> T:
         """Calls `work` between two steps, on the thread that has the world."""

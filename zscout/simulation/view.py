@@ -156,16 +156,19 @@ class _Sheet:
         """Last, so that nothing covers them; each with a rim, for dark grounds and light ones."""
         high, wide = self.pixels.shape[:2]
         for name, x, y, across in self._names:
-            text, size = name.replace("_", " "), 0.42
+            text, size = name.replace("_", " "), 0.5
             room = max(across * self.scale - 4, 56.0)
             (width, height), _ = cv2.getTextSize(text, _FONT, size, 1)
             if width > room:
-                size = max(0.32, size * room / width)
+                size = max(0.36, size * room / width)
                 (width, height), _ = cv2.getTextSize(text, _FONT, size, 1)
             left = int(np.clip(x * self.scale - width / 2, 4, max(4, wide - width - 4)))
             low = (self.plan.depth - y) * self.scale + height / 2
             base = left, int(np.clip(low, height + 4, max(height + 4, high - 5)))
-            cv2.putText(self.pixels, text, base, _FONT, size, _PAPER, 3, cv2.LINE_AA)
+            # Not drawn thicker: in OpenCV 5 a bold text is wider as well.
+            for way_x, way_y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+                at = base[0] + way_x, base[1] + way_y
+                cv2.putText(self.pixels, text, at, _FONT, size, _PAPER, 1, cv2.LINE_AA)
             cv2.putText(self.pixels, text, base, _FONT, size, _INK, 1, cv2.LINE_AA)
 
     def _pixels(self, places: NDArray[np.float32]) -> NDArray[np.int32]:

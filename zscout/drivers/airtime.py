@@ -1,0 +1,130 @@
+"""What a radio's line can carry: its vote, and the bucket that keeps each holder to its share. Pure.
+
+A holder asks for `command_rate` packets a second of at most `packet_size` bytes. Its packets pass a token
+bucket with room for one packet: in any `t` seconds at most `L (1 + r t)` bytes of it come out (`L` bytes a
+packet, `r` packets a second). They then stand in one queue, first come first served, before a line of `C`
+bytes a second. Halts and stops go ahead of them. These and everything that is sent again together keep to a
+bucket of their own of `U` bytes, filled at `s C`: the reserve.
+
+The bound (network calculus; Le Boudec and Thiran, "Network Calculus", section 1.4: FIFO server, leaky
+buckets). Let a packet enter the queue at `t`, be through the line at `t + d`, and let the line have been busy
+since `b <= t`. What it carried in between came in after `b`, or was under way then (`M` bytes, one packet):
+
+    C (t + d - b)  <=  M + sum L + sum r L (t - b) + U + s C (t + d - b)
+
+If `sum r L <= C (1 - s)`, which is the first half of the vote, then it follows that
+
+    d  <=  (M + sum L + U) / (C (1 - s))
+
+The second half is that this is within `bound`. `U` has room for one halt for each holder. Both sums grow with
+every holder, so what is accepted is accepted of every part. A holder that joins while the line is busy begins
+with an empty bucket, so the sums hold across changes of holders, too.
+
+The promise is suspended while more than `U` bytes of halts and stops come at once: they go first even so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+from typing import Final
+
+from zscout.amounts import exact_amounts
+from zscout.packets import MAX_PACKET, OVERHEAD
+from zscout.scheduling.model import SECOND, Ns
+
+BITS_PER_BYTE: Final = 10
+"""On the line: a start bit, eight of data, a stop bit."""
+RESERVE: Final = Fraction(1, 10)
+"""Share of the line that is kept for halts, stops and what is sent again."""
+MAX_RATE: Final = Fraction(5_000)
+"""Bytes a second that are counted on at most: a faster line is not what holds commands up."""
+URGENT: Final = OVERHEAD
+"""Bytes of a halt or a stop."""
+
+
+def line_rate(baud: int) -> Fraction:
+    """Bytes a second that are counted on at `baud` bits a second."""
+    return min(Fraction(baud, BITS_PER_BYTE), MAX_RATE)
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """What one holder may send: `rate` packets a second of at most `size` bytes."""
+
+    rate: Fraction
+    size: Fraction
+
+    @property
+    def bytes_per_second(self) -> Fraction:
+        return self.rate * self.size
+
+
+def share_of(params: Mapping[str, Decimal]) -> Share:
+    """The share that bandwidth parameters ask for. Raises ValueError with a reason in words."""
+    amounts = exact_amounts(params)
+    rate = amounts.get("command_rate")
+    if rate is None:
+        raise ValueError("command_rate is missing: say how many packets a second, as in command_rate = 5")
+    size = amounts.get("packet_size", Fraction(MAX_PACKET))
+    if size < OVERHEAD:
+        raise ValueError(f"packet_size is {_text(size)}; the shortest packet has {OVERHEAD} bytes")
+    return Share(rate, size)
+
+
+def urgent_burst(holders: int) -> int:
+    """`U`: bytes of halts, stops and repeats that may come at once."""
+    return max(URGENT * holders, MAX_PACKET)
+
+
+def longest_wait(rate: Fraction, shares: Iterable[Share]) -> Fraction:
+    """Seconds from when a packet enters the queue until it is through the line, at most. See above."""
+    sizes = [share.size for share in shares]
+    return (MAX_PACKET + sum(sizes) + urgent_burst(len(sizes))) / (rate * (1 - RESERVE))
+
+
+def objection(rate: Fraction, bound: Fraction, shares: Iterable[Share]) -> str:
+    """Why a line of `rate` bytes a second can't carry these shares, no packet waiting longer than `bound`
+    seconds; empty if it can."""
+    shares = list(shares)
+    room = rate * (1 - RESERVE)
+    wanted = sum((share.bytes_per_second for share in shares), Fraction(0))
+    if wanted > room:
+        sizes = {share.size for share in shares if share.rate}
+        size = sizes.pop() if len(sizes) == 1 else Fraction(1)
+        unit = "bytes/s" if size == 1 else f"packets/s of {_text(size)} bytes"
+        return f"its holders would send {_text(wanted / size)} of {_text(room / size)} {unit}"
+    wait = longest_wait(rate, shares) if shares else Fraction(0)
+    if wait > bound:
+        return f"a packet could wait {_text(wait)} s, the bound is {_text(bound)} s"
+    return ""
+
+
+class Bucket:
+    """A token bucket in bytes. Times are whole ns going in, exact ns coming out."""
+
+    __slots__ = ("_full_at", "_ns_per_byte", "size")
+
+    def __init__(self, size: Fraction, bytes_per_second: Fraction, now: Ns, *, full: bool = True) -> None:
+        """`bytes_per_second` must be positive."""
+        self.size = size
+        self._ns_per_byte = SECOND / bytes_per_second
+        self._full_at = now + (0 if full else size * self._ns_per_byte)
+
+    def ready(self, needed: int) -> Fraction:
+        """When there is enough for `needed` bytes (at most `size`)."""
+        return Fraction(self._full_at - (self.size - needed) * self._ns_per_byte)
+
+    def take(self, needed: int, at: Fraction | Ns) -> None:
+        """Takes `needed` bytes out at `at`; more than there is leaves it in debt."""
+        self._full_at = max(self._full_at, at) + needed * self._ns_per_byte
+
+    def fill(self, now: Ns) -> None:
+        """Makes it full."""
+        self._full_at = min(self._full_at, now)
+
+
+def _text(value: Fraction) -> str:
+    return f"{float(value):.3g}" if value < 100 else f"{float(value):.0f}"

@@ -1,0 +1,308 @@
+"""The newest picture of any source that OpenCV can open: a device, a file, or a URL.
+
+OpenCV hands out pictures in order, however old they are: who reads more slowly than they come falls behind
+without end. So a thread of its own reads all of them and keeps only the newest. It opens its source again
+whenever that fails, and says in words how it stands.
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import re
+import stat
+import threading
+import weakref
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zscout import clock
+from zscout.scheduling.model import SECOND
+
+log = logging.getLogger(__name__)
+
+RETRY_FIRST: Final = 0.2
+RETRY_MOST: Final = 2.0
+"""Seconds between two attempts to open a source: doubled from the first to the last."""
+STOP_WAIT: Final = 1.0
+MAX_PIXELS: Final = 1 << 24
+"""Of one picture; larger ones count as a failure of the source."""
+FILE_RATE: Final = 25.0
+"""Pictures a second of a file that does not tell its rate, or tells one beyond belief."""
+FILE_RATES: Final = (0.1, 240.0)
+STALLED: Final = 0.8
+"""A read that failed after this share of its timeout ran into it; one that failed sooner was cut off."""
+MISSES: Final = 3
+"""Reads in a row that may fail: FFmpeg gives up a picture that it can't make out, and reads on."""
+EXIT_WAIT: Final = 2.5
+"""Seconds that the end of the process waits for threads that OpenCV holds up: longer than their timeouts."""
+
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """One picture. `number` counts from 1 and goes on when the source is opened again; `time` is when it was
+    read, in seconds of this host's own clock; `picture` is uint8, (height, width) or (height, width, 3) BGR.
+    """
+
+    number: int
+    time: float
+    picture: NDArray[np.uint8]
+
+
+class Capture:
+    """Reads one source in a thread of its own, from `start` to `stop`; begins only once.
+
+    `source` is a device (`/dev/video0`, or its number), a URL (`http://`, `rtsp://`, ...) or else a file,
+    which is read at its own rate, and from its start again when it ends. `open_timeout` and `read_timeout`
+    are seconds; a source that gives no picture for `read_timeout` is opened again. All attributes may be read
+    from any thread.
+    """
+
+    def __init__(self, source: str, *, open_timeout: float = 2.0, read_timeout: float = 1.5) -> None:
+        self.source = source
+        self.kind = kind_of(source)
+        self.health = "not open yet"
+        """`ok` while pictures come; or in words what is wrong, without passwords that stand in a URL."""
+        self.opened = 0
+        """How often the source was opened."""
+        self.dropped = 0
+        """Pictures that a newer one replaced before anybody looked at them."""
+        self.stalls = 0
+        """How often an open source gave nothing for `read_timeout`."""
+        self._open_timeout = open_timeout
+        self._read_timeout = read_timeout
+        self._stop = threading.Event()
+        self._news = threading.Condition()
+        self._newest: Captured | None = None
+        self._looked = True
+        self._number = 0
+        self._due = 0.0
+        # A daemon: a process that ends need not wait for ever until OpenCV has given up.
+        self._thread = threading.Thread(target=self._run, name=f"capture {shown(source)}"[:60], daemon=True)
+
+    def start(self) -> None:
+        _LIVING.add(self)
+        self._thread.start()
+
+    def stop(self, wait: float = STOP_WAIT) -> None:
+        """Ends the reading, and waits at most `wait` seconds for it: a thread that OpenCV holds up ends by
+        itself at the source's timeout."""
+        self._stop.set()
+        with self._news:
+            self._news.notify_all()
+        if self._thread.ident is not None and self._thread is not threading.current_thread():
+            self._thread.join(wait)
+
+    @property
+    def number(self) -> int:
+        """Of the newest picture; 0 while there was none."""
+        return self._number
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs, be it only until OpenCV lets go of it."""
+        return self._thread.is_alive()
+
+    def newest(self, after: int) -> Captured | None:
+        """The newest picture if its number is above `after`."""
+        with self._news:
+            return self._take(after)
+
+    def wait(self, after: int, timeout: float) -> Captured | None:
+        """The newest picture with a number above `after`, as soon as there is one; None if none came within
+        `timeout` seconds, or when the capture was stopped."""
+        with self._news:
+            self._news.wait_for(lambda: self._number > after or self._stop.is_set(), timeout)
+            return None if self._stop.is_set() else self._take(after)
+
+    def _take(self, after: int) -> Captured | None:
+        if self._newest is None or self._newest.number <= after:
+            return None
+        self._looked = True
+        return self._newest
+
+    # In the thread
+
+    def _run(self) -> None:
+        pause = RETRY_FIRST
+        while not self._stop.is_set():
+            before = self._number
+            try:
+                self._read_all()
+            except cv2.error as error:
+                self._ails(f"OpenCV failed on {shown(self.source)}: {str(error).strip()[:200]}")
+            if self._number > before:
+                pause = RETRY_FIRST
+                if self.kind == "file":
+                    continue
+            self._stop.wait(pause)
+            pause = min(RETRY_MOST, 2 * pause)
+
+    def _read_all(self) -> None:
+        """Opens the source, and reads it until it fails or ends."""
+        began = _now()
+        video = _open(self.source, self.kind, self._open_timeout, self._read_timeout)
+        try:
+            if not video.isOpened():
+                self._ails(self._why_closed(_now() - began))
+                return
+            self.opened += 1
+            if self._number == 0:
+                self.health = "open, no picture yet"
+            period = _file_period(video) if self.kind == "file" else 0.0
+            misses = 0
+            while not self._stop.is_set():
+                if period and not misses and self._rest(period):
+                    return
+                asked = _now()
+                good, picture = video.read()
+                if self._stop.is_set():
+                    return
+                if not good:
+                    misses += 1
+                    waited = _now() - asked
+                    if misses < MISSES and waited < STALLED * self._read_timeout:
+                        continue
+                    self._ended(waited, before=self._number)
+                    return
+                misses = 0
+                if picture.dtype != np.uint8 or picture.shape[0] * picture.shape[1] > MAX_PIXELS:
+                    self._ails(f"the pictures of {shown(self.source)} are too large, or not of 8 bits")
+                    return
+                self._keep(np.asarray(picture, np.uint8))
+        finally:
+            video.release()
+
+    def _rest(self, period: float) -> bool:
+        """Waits until the next picture of a file is due; whether the capture was stopped meanwhile."""
+        now = _now()
+        # After a stall it goes on from there, rather than rush through what it missed.
+        self._due = max(self._due + period, now)
+        return self._stop.wait(max(0.0, self._due - now))
+
+    def _keep(self, picture: NDArray[np.uint8]) -> None:
+        if self.health != "ok":
+            log.info("%s gives pictures", shown(self.source))
+        with self._news:
+            if not self._looked:
+                self.dropped += 1
+            self._looked = False
+            self._number += 1
+            self._newest = Captured(self._number, _now(), picture)
+            self.health = "ok"
+            self._news.notify_all()
+
+    def _ended(self, waited: float, before: int) -> None:
+        if self.kind == "file":
+            if before == 0:
+                self._ails(f"there is no picture in {shown(self.source)}")
+        elif waited >= STALLED * self._read_timeout:
+            self.stalls += 1
+            self._ails(f"no picture from {shown(self.source)} for {self._read_timeout:g} s")
+        else:
+            self._ails(f"{shown(self.source)} was cut off")
+
+    def _why_closed(self, waited: float) -> str:
+        name = shown(self.source)
+        if self.kind == "url":
+            if waited >= STALLED * self._open_timeout:
+                return f"{name} did not answer within {self._open_timeout:g} s"
+            return f"{name} can't be opened: does its server run, and is the address right?"
+        path = _device_path(self.source) if self.kind == "device" else Path(self.source)
+        try:
+            mode = path.stat().st_mode
+        except OSError as error:
+            return f"{name} can't be opened: {error.strerror}"
+        if not os.access(path, os.R_OK):
+            return f"{name} can't be opened: permission denied"
+        if self.kind == "file" and not stat.S_ISREG(mode):
+            return f"{name} is not a file"
+        return f"{name} can't be opened: " + (
+            "is it a camera, and free?" if self.kind == "device" else "it is not a video"
+        )
+
+    def _ails(self, words: str) -> None:
+        if words != self.health:
+            log.warning("%s", words)
+            self.health = words
+
+
+_LIVING: weakref.WeakSet[Capture] = weakref.WeakSet()
+
+
+@atexit.register
+def _stop_all() -> None:
+    """A thread that comes out of OpenCV while the interpreter goes down would abort the process."""
+    captures = list(_LIVING)
+    for capture in captures:
+        capture.stop(0)
+    end = _now() + EXIT_WAIT
+    for capture in captures:
+        capture.stop(max(0.0, end - _now()))
+
+
+def kind_of(source: str) -> Literal["device", "file", "url"]:
+    """What a source is, by its form alone."""
+    if source.isascii() and source.isdigit():
+        return "device"
+    if source.startswith("/dev/"):
+        return "device"
+    return "url" if _URL.match(source) else "file"
+
+
+def shown(source: str) -> str:
+    """A source as it may be told and logged: a URL without user, password and query, where secrets stand."""
+    if kind_of(source) != "url":
+        return source
+    try:
+        parts = urlsplit(source)
+        host = parts.hostname or ""
+        port = "" if parts.port is None else f":{parts.port}"
+    except ValueError:
+        return f"{source.partition('://')[0]}://..."
+    host = f"[{host}]" if ":" in host else host
+    return f"{parts.scheme}://{host}{port}{parts.path}"
+
+
+def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> cv2.VideoCapture:
+    # These are read when a backend is first used. FFmpeg would complain about every torn picture on the
+    # node's own stderr (-8: quiet), and hands out half a picture as a whole one unless told to discard it
+    # (TCP for RTSP is what OpenCV itself asks for). Without OpenCV's lock around it one silent server held up
+    # the opening of all other sources; FFmpeg has needed none since 4.0.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp|fflags;discardcorrupt")
+    os.environ.setdefault("OPENCV_FFMPEG_IS_THREAD_SAFE", "1")
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(max(1, round(read_timeout))))
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    if kind == "device":
+        return cv2.VideoCapture(str(_device_path(source)), cv2.CAP_V4L2)
+    # One thread to decode: several would each hold a picture back.
+    options: list[Any] = [cv2.CAP_PROP_N_THREADS, 1]
+    if kind == "url":
+        options += [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(1000 * open_timeout)]
+        options += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(1000 * read_timeout)]
+    return cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
+
+
+def _device_path(source: str) -> Path:
+    return Path(f"/dev/video{source}" if source.isdigit() else source)
+
+
+def _file_period(video: cv2.VideoCapture) -> float:
+    rate = video.get(cv2.CAP_PROP_FPS)
+    least, most = FILE_RATES
+    return 1 / (rate if least <= rate <= most else FILE_RATE)
+
+
+def _now() -> float:
+    return clock.now() / SECOND

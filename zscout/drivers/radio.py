@@ -1,0 +1,232 @@
+"""A radio: one serial line that several ARCs share, each for as many packets a second as it asked for.
+
+Nobody acknowledges on this radio, so an answer tells that a packet is in the queue and when it will be out.
+What goes out is handed to the line no sooner than the line can carry it (`air_queue`): in the buffers of the
+system there is a packet or two, and a halt sent now goes out now.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+from collections import deque
+from collections.abc import Mapping
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any, Final
+
+from zscout import clock
+from zscout.drivers.air_queue import AirQueue, Full
+from zscout.drivers.airtime import RESERVE, Share, line_rate, objection, share_of
+from zscout.drivers.base import Driver, ResourceController
+from zscout.drivers.line import CLOSE_TIMEOUT, DEPTH, Line
+from zscout.drivers.orders import RadioHalt, RadioStop, radio_order
+from zscout.keyexpr import Sender
+from zscout.mesh import Refused
+from zscout.messages import Amounts, Figures, Holder, ProposedHolder
+from zscout.packets import MAX_PACKET, Halt, Stop, encode
+from zscout.scheduling.model import SECOND, Grant, Ns
+
+RECENT: Final = 64
+"""Packets whose wait is told."""
+OPENING: Final = 1.0
+"""Seconds that a node waits for the line before it offers the RC without it."""
+LONGEST_SLEEP: Final = 60.0
+
+
+class RadioDriver(Driver):
+    """The RC of a radio. It carries what stops robots for everybody, and the rest for its holders."""
+
+    sharable = True
+    relays = True
+
+    def __init__(self, port: str, *, baud: int, bound: float) -> None:
+        """`port` for `serial.serial_for_url`; `bound` in seconds: how long a packet may wait at most."""
+        self._port, self._baud = port, baud
+        self._rate = line_rate(baud)
+        self._bound = Fraction(str(bound))
+        # Not 0: the last radio of these robots may have begun there.
+        self._air = AirQueue(self._rate, first_number=random.randrange(256))  # noqa: S311
+        self._robots: dict[int, str] = {}
+        """Which robot RC an id belongs to: the first that spoke for it, while it is there."""
+        self._up = False
+        self._why = "its line is not open yet"
+        self._known = asyncio.Event()
+        """It was found out whether there is a line."""
+        self._quiet = asyncio.Event()
+        self._outstanding = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._packets = self._bytes = self._echoes = self._halts = self._losses = 0
+        self._waits: deque[Fraction] = deque(maxlen=RECENT)
+
+    async def open(self, rc: ResourceController) -> None:
+        self._rc = rc
+        self._loop = asyncio.get_running_loop()
+        self._line = Line(self._port, self._baud, self)
+        self._line.start()
+        try:
+            await asyncio.wait_for(self._known.wait(), OPENING)
+        except TimeoutError:
+            rc.fail(self._why)
+
+    async def close(self) -> None:
+        """Halts that are not out yet still go out, if the line works."""
+        if self._up and self._air.urgent:
+            self._quiet.clear()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._quiet.wait(), CLOSE_TIMEOUT)
+        if self._timer is not None:
+            self._timer.cancel()
+        await self._line.stop()
+
+    # Holders
+
+    def vote(self, holders: list[ProposedHolder]) -> str:
+        shares: list[Share] = []
+        for holder in holders:
+            try:
+                shares.append(share_of(holder.params))
+            except ValueError as error:
+                return f"{holder.arc}: {error}"
+        return objection(self._rate, self._bound, shares)
+
+    def capacity(self) -> Amounts:
+        """`command_rate`: packets of the full size a second, all holders together."""
+        room = self._rate * (1 - RESERVE)
+        return {
+            "command_rate": Decimal(repr(float(room / MAX_PACKET))),
+            "bytes_per_second": Decimal(repr(float(room))),
+        }
+
+    async def begin(self, holder: Holder) -> None:
+        try:
+            share = share_of(holder.params)
+        except ValueError:  # it was never voted for
+            share = Share(Fraction(0), Fraction(MAX_PACKET))
+        self._air.join(holder.place, share, clock.now())
+
+    async def end(self, holder: Holder) -> None:
+        """What waits for this holder is dropped, and the robots that it drove are halted: their own RCs do so
+        too, unless their hosts are gone."""
+        for robot in self._air.leave(holder.place):
+            self._urge(robot, Halt)
+
+    async def safe(self) -> None:
+        for place in self._air.places():
+            for robot in self._air.leave(place):
+                self._urge(robot, Halt)
+
+    # Commands
+
+    async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
+        order = radio_order(do)
+        owner = self._robots.get(order.robot)
+        if owner is not None and owner not in holder.rcs and self._offered(owner):
+            raise Refused("not_yours", f"robot {order.robot} is {owner}, which this ARC does not hold")
+        self._refuse_down()
+        if isinstance(order, RadioStop | RadioHalt):
+            return self._urge(order.robot, Stop if isinstance(order, RadioStop) else Halt)
+        try:
+            after = self._air.offer(holder.place, holder.grant, order, clock.now())
+        except Full:
+            raise Refused("busy", "too many packets of this ARC wait; send fewer") from None
+        except ValueError as error:
+            raise Refused("bad_command", str(error)) from None
+        self._pump()
+        return {"after": after / SECOND}
+
+    async def command_without_grant(self, sender: Sender, do: Mapping[str, Any]) -> Any:
+        """A stop or a halt for a robot, from the node of its RC: always carried."""
+        if do.get("name") not in ("stop", "halt"):
+            return await super().command_without_grant(sender, do)
+        order = radio_order(do)
+        assert isinstance(order, RadioStop | RadioHalt)  # noqa: S101 - by their names
+        offers = self._rc.offers
+        if order.rc is None or offers is None or not offers.speaks_for(sender, order.rc):
+            raise Refused("no_grant", f"{sender} does not offer {order.rc}, the robot that it speaks for")
+        # A halt does no harm, whoever else claims the robot; but the claim of who is there stands.
+        owner = self._robots.get(order.robot)
+        if owner is None or not self._offered(owner):
+            self._robots[order.robot] = order.rc
+        self._refuse_down()
+        return self._urge(order.robot, Stop if isinstance(order, RadioStop) else Halt)
+
+    def _offered(self, rc: str) -> bool:
+        return self._rc.offers is not None and bool(self._rc.offers.hosts(rc))
+
+    def _refuse_down(self) -> None:
+        if not self._up:
+            raise Refused("down", self._why)
+
+    def _urge(self, robot: int, kind: type[Stop] | type[Halt]) -> dict[str, float]:
+        self._halts += kind is Halt
+        after = self._air.urge(robot, kind, clock.now())
+        self._pump()
+        return {"after": after / SECOND}
+
+    # Going out
+
+    def _pump(self) -> None:
+        """Hands the line what it has room for, and comes back when it has room again."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if not self._up:
+            return
+        while self._outstanding < DEPTH:
+            now = clock.now()
+            outgoing = self._air.next(now, self._stands)
+            if outgoing is None:
+                break
+            data = encode(outgoing.packet)
+            if self._line.write(data):
+                self._outstanding += 1
+            self._packets += 1
+            self._bytes += len(data)
+            self._echoes += outgoing.echo
+            if not outgoing.echo:
+                self._waits.append(outgoing.through - outgoing.entered)
+        if not self._air.urgent:
+            self._quiet.set()
+        at = self._air.wake(clock.now())
+        if at is not None and self._outstanding < DEPTH:
+            delay = min(max(0.0, (at - clock.now()) / SECOND), LONGEST_SLEEP)
+            self._timer = self._loop.call_later(delay, self._pump)
+
+    def _stands(self, grant: Grant) -> bool:
+        """Whether the hold of a packet is in force at the moment when it goes out."""
+        held = self._rc.holding.held.get(grant)
+        return held is not None and self._rc.holding.check(grant, held.holder.client, clock.now()) is None
+
+    def line_up(self) -> None:
+        self._up, self._why, self._outstanding = True, "", 0
+        self._known.set()
+        if self._rc.health != "ok":
+            self._rc.recover()
+        self._pump()
+
+    def line_down(self, why: str) -> None:
+        self._losses += self._up
+        self._up, self._why = False, why
+        self._known.set()
+        self._quiet.set()
+        self._rc.fail(why)
+
+    def line_wrote(self, at: Ns) -> None:
+        self._outstanding = max(0, self._outstanding - 1)
+        self._pump()
+
+    def figures(self) -> Figures:
+        worst = max(self._waits, default=Fraction(0))
+        return {
+            "packets": float(self._packets),
+            "bytes": float(self._bytes),
+            "repeats": float(self._echoes),
+            "halts": float(self._halts),
+            "replaced": float(self._air.replaced),
+            "dropped": float(self._air.dropped),
+            "waiting": float(self._air.waiting),
+            "longest_wait_ms": round(float(worst / SECOND * 1000), 1),
+            "unplugged": float(self._losses),
+        }
