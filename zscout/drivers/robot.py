@@ -105,7 +105,7 @@ class RobotDriver(Driver):
             # A newer command makes those void that wait: the newest is the true one.
             for waiting in [waiting for waiting in self._waiting if isinstance(waiting.order, RadioDrive)]:
                 self._waiting.remove(waiting)
-                waiting.answer.set_result({"replaced": True})
+                _settle(waiting.answer, {"replaced": True})
             if isinstance(order, Drive):
                 sent = RadioDrive(self._id, order.left, order.right, order.lasts)
                 self._drives(turns=bool(order.left or order.right))

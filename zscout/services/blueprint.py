@@ -11,6 +11,14 @@ from typing import Final
 import rerun as rr
 import rerun.blueprint as rrb
 
+from zscout.services.robot_layout import (
+    LIVE_BEHAVIOR_ROWS,
+    Shown,
+    behavior_pane,
+    device_pane,
+    robot_column,
+)
+
 APPLICATION: Final = "zscout"
 """Rerun's application id: recordings and blueprints find each other by it."""
 TIME: Final = "mesh_time"
@@ -65,8 +73,11 @@ MARGIN: Final = 0.03
 """Part of a finished run's length that is left free after its end."""
 LIVE_WINDOW: Final = 60.0
 """Seconds of the past that a live view shows."""
+LIVE_ROWS: Final = 6
+"""RCs, and ARCs, that a live view with robots has room for at least: most come after the first robot."""
 LIVE_HOST_ROWS: Final = 10
 """Components that a live view has room for."""
+NO_ROBOTS: Final = Shown()
 
 
 def blueprint(
@@ -77,6 +88,7 @@ def blueprint(
     rc_rows: int = 6,
     arc_rows: int = 6,
     host_rows: int = 0,
+    robots: Shown = NO_ROBOTS,
 ) -> rrb.Blueprint:
     """The layout: who holds what, what each ARC does and the loads on one time axis, events beside them; with
     components, also what runs on each host and what it uses.
@@ -85,6 +97,8 @@ def blueprint(
     range `begin` to `end` in seconds of the timeline, or all there is when `end` is None. `rc_rows`,
     `arc_rows` and `host_rows` are the rows expected in the upper panes, which share the height accordingly.
     Without components `host_rows` is 0; a pane of RCs or ARCs that would be empty beside them is left out.
+    With `robots`, their behaviors follow the ARCs, loads and hosts share a place, and floor and cameras are
+    at the right, above the events.
     """
     axis = rrb.archetypes.TimeAxis(view_range=_window(live, begin, end))
     lanes = [
@@ -93,19 +107,31 @@ def blueprint(
         ("/host", "What runs on each host", host_rows),
     ]
     shown = [lane for lane in lanes if lane[2] or (lane[0] != "/host" and not host_rows)]
-    panes = rrb.Vertical(
-        *(rrb.StateTimelineView(origin=origin, name=name, time_view=axis) for origin, name, _ in shown),
-        rrb.TimeSeriesView(
-            origin="/",
-            contents=["/load/**", "/mark/**"],
-            name="Load average (1 min) per host" + (f"   {MARK_WORDS}" if host_rows else ""),
-            axis_x=axis,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        ),
-        row_shares=[*(_share(rows) for _, _, rows in shown), 7],
+    views: list[rrb.View | rrb.Container] = [
+        rrb.StateTimelineView(origin=origin, name=name, time_view=axis) for origin, name, _ in shown
+    ]
+    shares = [_share(rows) for _, _, rows in shown]
+    load: rrb.View | rrb.Container = rrb.TimeSeriesView(
+        origin="/",
+        contents=["/load/**", "/mark/**"],
+        name="Load average (1 min) per host" + (f"   {MARK_WORDS}" if host_rows else ""),
+        axis_x=axis,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
     )
+    if robots.any:
+        if host_rows:
+            load = rrb.Tabs(load, views.pop())
+            shares.pop()
+        if robots.behavior_rows:
+            views.append(behavior_pane(axis))
+            shares.append(_share(LIVE_BEHAVIOR_ROWS if live else robots.behavior_rows))
+    panes = rrb.Vertical(*views, load, row_shares=[*shares, 5 if robots.any else 7])
     return rrb.Blueprint(
-        rrb.Horizontal(panes, _beside(axis, uses=host_rows > 0), column_shares=[62, 38]),
+        rrb.Horizontal(
+            panes,
+            _beside(axis, host_rows > 0, robots),
+            column_shares=[57, 43] if robots.any else [62, 38],
+        ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=TIME, play_state="following"),
@@ -114,14 +140,16 @@ def blueprint(
     )
 
 
-def _beside(axis: rrb.archetypes.TimeAxis, *, uses: bool) -> rrb.View | rrb.Container:
+def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: Shown) -> rrb.View | rrb.Container:
     events = rrb.TextLogView(
         origin="/events",
         name="Events",
         columns=rrb.archetypes.TextLogColumns(timeline_columns=[TIME], text_log_columns=["loglevel", "body"]),
     )
-    if not uses:
+    if not uses and not robots.any:
         return events
+    # As tabs they have little room for words.
+    more = ("", "") if robots.any else (" of the heaviest components", ", in the colours of the lanes")
     curves = [
         rrb.TimeSeriesView(
             origin=f"/use/{folder}",
@@ -131,10 +159,13 @@ def _beside(axis: rrb.archetypes.TimeAxis, *, uses: bool) -> rrb.View | rrb.Cont
             plot_legend=rrb.PlotLegend(visible=False),
         )
         for folder, name in (
-            ("cpu", "CPU of the heaviest components (cores), in the colours of the lanes"),
-            ("memory", "Memory of the heaviest components (MB)"),
+            ("cpu", f"CPU{more[0]} (cores){more[1]}"),
+            ("memory", f"Memory{more[0]} (MB)"),
         )
     ]
+    if robots.any:
+        devices = [device_pane(axis)] if robots.devices else []
+        return robot_column(robots, [events, *(curves if uses else []), *devices])
     return rrb.Vertical(events, *curves, row_shares=[5, 3, 3])
 
 

@@ -83,9 +83,9 @@ def rows_of(lanes: Mapping[str, Lane]) -> int:
     return sum(lane.rows for lane in lanes.values())
 
 
-def clean_path(folder: str, name: str) -> list[object]:
-    """The entity of something with this name, which may have up to four parts with `/` between."""
-    parts = (re.sub(r"[^A-Za-z0-9_.-]", "_", part)[:64] for part in name.split("/")[:4])
+def clean_path(folder: str, name: str, depth: int = 4) -> list[object]:
+    """The entity of something with this name, which may have up to `depth` parts with `/` between."""
+    parts = (re.sub(r"[^A-Za-z0-9_.-]", "_", part)[:64] for part in name.split("/")[:depth])
     return [*folder.split("/"), *(part or "_" for part in parts)]
 
 

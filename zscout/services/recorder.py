@@ -2,8 +2,8 @@
 
 It only listens. The holders of each RC come from what the RCM publishes; why an ARC waits, from the notices
 to its client; hosts and RCs that come and go, from liveliness; what runs on which host, from the component
-placer. `rcm/state` is read at the start and where something was missed, so that a recorder may begin in the
-middle of things.
+placer; what robots do and see, from behaviors, framegrabbers and buildings. `rcm/state` is read at the start
+and where something was missed, so that a recorder may begin in the middle of things.
 
 As a program, `python -m zscout.services.recorder`, it is told what to do as `recorder_process.Job` says.
 """
@@ -32,8 +32,11 @@ from zscout.messages import (
 )
 from zscout.messages import Holder as ToldHolder
 from zscout.scheduling.model import NO_TERM, SECOND, Grant, Term
+from zscout.services.comings import words_of
 from zscout.services.host_pane import Use
 from zscout.services.recorder_placements import PlacementFollower
+from zscout.services.recorder_robots import RobotFollower
+from zscout.services.robot_story import hold_of
 from zscout.services.timeline import Holder, Timeline
 
 log = logging.getLogger(__name__)
@@ -41,6 +44,8 @@ log = logging.getLogger(__name__)
 READ_TIMEOUT = 2.0
 PAUSE = 0.1
 """Seconds before a leader that did not answer is asked again."""
+LAST_WORDS = 0.5
+"""Seconds for what was said before the end and is on its way still."""
 LOOK = 1.0
 """Seconds between two looks at whether anything was dropped here."""
 DEPTH = 8_192
@@ -68,9 +73,10 @@ class _Arc:
 
 
 class Recorder:
-    """Follows one fleet and writes it to `timeline`, in seconds since this object was made."""
+    """Follows one fleet and writes it to `timeline`, in seconds since this object was made; of each camera at
+    most `frames` pictures a second, with 0 none."""
 
-    def __init__(self, mesh: Mesh, fleet: Fleet, timeline: Timeline) -> None:
+    def __init__(self, mesh: Mesh, fleet: Fleet, timeline: Timeline, frames: float = 2.0) -> None:
         self.mesh, self.fleet, self.timeline = mesh, fleet, timeline
         self.term: Term = NO_TERM
         self.seq = 0
@@ -83,6 +89,7 @@ class Recorder:
         self._declared: list[Declared] = []
         self._leaders: set[Token] = set()
         self._placements = PlacementFollower(mesh, timeline, self._now)
+        self._robots = RobotFollower(mesh, timeline, self._now, frames)
         self._wanted = asyncio.Event()
         self._missed = 0
         self._caught_up = False
@@ -98,19 +105,29 @@ class Recorder:
             self._placements.subscribe(),
             mesh.watch(keys.alive_any(), self._on_token),
         ]
+        # Apart: of what these miss, the RCM's state tells nothing.
+        robots = self._robots.subscribe()
         self._wanted.set()
         reading = [
             asyncio.create_task(self._keep_reading()),
             asyncio.create_task(self._placements.keep_reading()),
+            asyncio.create_task(self._robots.run()),
         ]
         try:
             await stop.wait()
+            await self._hear_out()
         finally:
             for task in reading:
                 task.cancel()
             await asyncio.gather(*reading, return_exceptions=True)
-            for declared in reversed(self._declared):
+            for declared in [*robots, *reversed(self._declared)]:
                 declared.close()
+
+    async def _hear_out(self) -> None:
+        """Whoever ends this may be quicker than what was published before. An answer of the RCM comes behind
+        all that it has published, on the same link; where nobody leads there is nothing to wait for."""
+        key = self.mesh.keys.rcm_state
+        await self.mesh.ask(key, StateAsk(), RcmState, timeout=LAST_WORDS, enough=lambda _: True)
 
     def _now(self) -> float:
         return (clock.now() - self._zero) / SECOND
@@ -265,8 +282,12 @@ class Recorder:
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
         """A hold that ended at the device has ended, whether an RCM is there to say so or not."""
-        if state.ended and self.mesh.keys.rc_of(key) == state.rc:
-            self._drop(self._now(), state.rc, {ended.grant for ended in state.ended})
+        if self.mesh.keys.rc_of(key) != state.rc:
+            return
+        at = self._now()
+        if state.ended:
+            self._drop(at, state.rc, {ended.grant for ended in state.ended})
+        self._robots.story.state(at, state)
 
     def _on_load(self, key: str, report: LoadReport) -> None:
         host = self.mesh.keys.host_of(key)
@@ -290,25 +311,14 @@ class Recorder:
                 self._placements.read_again()
         if bool(instances) == before and token.role != Role.RCM:
             return
+        self._robots.token(token, alive)
         at = self._now()
-        level = "INFO" if alive else "WARN"
-        match token.role:
-            case Role.NODE:
-                self.timeline.event(at, f"node {token.host} {'is there' if alive else 'is gone'}", level)
-            case Role.RCM:
-                self.timeline.event(
-                    at, f"{token.host} {'leads' if alive else 'does not lead any more'}", level
-                )
-            case Role.RC:
-                words = f"{token.name} {'is offered by' if alive else 'is gone from'} {token.host}"
-                self.timeline.event(at, words, level)
-                # Before the state was read, nobody knows that a new RC is free.
-                if self._caught_up and (not alive or token.name not in self._rcs):
-                    self._show(at, token.name, [])
-            case Role.CLIENT:
-                self.timeline.event(at, f"client {token.host}/{token.name} {'joined' if alive else 'left'}")
-            case _:
-                pass
+        words = words_of(token, alive)
+        if words is not None:
+            self.timeline.event(at, *words)
+        # Before the state was read, nobody knows that a new RC is free.
+        if token.role == Role.RC and self._caught_up and (not alive or token.name not in self._rcs):
+            self._show(at, token.name, [])
 
     # The timeline
 
@@ -344,14 +354,16 @@ class Recorder:
     def _show(self, at: float, rc: str, holders: Iterable[tuple[str, ToldHolder | HoldView]]) -> None:
         if rc not in self._rcs and len(self._rcs) >= MAX_RCS:
             return
-        operator = self.fleet.operator_priority
+        operator, holders = self.fleet.operator_priority, list(holders)
         self._rcs[rc] = {hold.grant: Holder(label, hold.priority >= operator) for label, hold in holders}
+        self._robots.story.held(rc, {hold.grant: hold_of(hold, operator) for _, hold in holders})
         self.timeline.holders(at, rc, list(self._rcs[rc].values()))
 
     def _drop(self, at: float, rc: str, grants: set[Grant]) -> None:
         held = self._rcs.get(rc, {})
         if grants & held.keys():
             self._rcs[rc] = {grant: holder for grant, holder in held.items() if grant not in grants}
+            self._robots.story.dropped(rc, grants)
             self.timeline.holders(at, rc, list(self._rcs[rc].values()))
 
 

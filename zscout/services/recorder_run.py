@@ -75,7 +75,7 @@ async def _record(job: Job, tell: BinaryIO) -> None:
         async with await Mesh.open(fleet.name, Sender(job.host, "recorder"), fleet.mesh) as mesh:
             tell.write(msgspec.json.encode(Recording(str(path.absolute()), timeline.url)) + b"\n")
             tell.flush()
-            await Recorder(mesh, fleet, timeline).run(stop)
+            await Recorder(mesh, fleet, timeline, settings.frames).run(stop)
     log.info("the recording is %s", path)
 
 

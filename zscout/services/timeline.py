@@ -11,7 +11,8 @@ import math
 import os
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +24,7 @@ import rerun.blueprint as rrb
 from zscout.services.blueprint import (
     APPLICATION,
     LIVE_HOST_ROWS,
+    LIVE_ROWS,
     OPERATOR,
     OTHER,
     PALETTE,
@@ -32,6 +34,7 @@ from zscout.services.blueprint import (
 )
 from zscout.services.host_pane import HostPane, Mark, Running, Use
 from zscout.services.lanes import Lane, clean_path, clean_text, rows_of
+from zscout.services.robot_panes import RobotPanes
 from zscout.strict import BadInput
 
 SERVER_MEMORY: Final = "200MB"
@@ -98,6 +101,8 @@ class Timeline:
         self._components: dict[str, int] = {}
         self._coloured = 0
         self._placing = False
+        self.robots = RobotPanes(self._recording, self._writing, self._note, self._arrange)
+        """What is shown of robots."""
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
         self._open(path, bind, port)
@@ -171,7 +176,7 @@ class Timeline:
                 if not self._placing:
                     # Only now: a fleet without components has no use for empty panes.
                     self._placing = True
-                    self._recording.send_blueprint(self._layout(live=True))
+                    self._arrange()
                 self._hosts.runs(at, host, components)
 
     def mark(self, at: float, host: str, mark: Mark, component: str) -> None:
@@ -218,10 +223,25 @@ class Timeline:
         """Panes for what there is; those of a live view may fill yet."""
         rc_rows, arc_rows, host_rows = rows_of(self._rc_lanes), len(self._arc_lanes), self._hosts.rows
         if live:
-            rc_rows, arc_rows, host_rows = max(rc_rows, 1), max(arc_rows, 1), LIVE_HOST_ROWS
+            least = LIVE_ROWS if self.robots.shown.any else 1
+            rc_rows, arc_rows, host_rows = max(rc_rows, least), max(arc_rows, least), LIVE_HOST_ROWS
         return blueprint(
-            live, self._end, begin=self._begin, rc_rows=rc_rows, arc_rows=arc_rows, host_rows=host_rows
+            live,
+            self._end,
+            begin=self._begin,
+            rc_rows=rc_rows,
+            arc_rows=arc_rows,
+            host_rows=host_rows if self._placing else 0,
+            robots=self.robots.shown,
         )
+
+    def _arrange(self) -> None:
+        self._recording.send_blueprint(self._layout(live=True))
+
+    @contextmanager
+    def _writing(self, at: float) -> Iterator[bool]:
+        with self._lock:
+            yield self._ready(at)
 
     def __enter__(self) -> Timeline:
         return self

@@ -13,18 +13,18 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Final
 
+import cv2
 import numpy as np
 
 from zscout.hiding.body import Act
 from zscout.hiding.hider import Hider
 from zscout.packets import Camera, Drive, Packet, Stop
 from zscout.simulation.air import Air
-from zscout.simulation.drawn import drawn_plan
-from zscout.simulation.plan import Plan, load_plan, shipped_plans
-from zscout.simulation.world import Pose, World
+from zscout.simulation.bodies import Pose
+from zscout.simulation.plan import Plan
+from zscout.simulation.world import World
 from zscout.vision.lens import Picture
 
 LIMIT: Final = 120.0
@@ -93,7 +93,7 @@ def trial(
     robot = plan.robots[0]
     world = World(plan, seed=seed, starts={robot.name: start})
     air = Air(seed=seed)
-    dice = random.Random(seed)
+    dice = random.Random(seed)  # noqa: S311 - a trial is repeated by its seed
     hider = Hider(seed=seed)
     body = world.bodies[robot.name]
     number = 0
@@ -151,3 +151,67 @@ def trial(
         share=share,
         path=tuple(path),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One trial of a batch: a random start, lit and clear, drawn by the seed."""
+
+    plan: Plan
+    seed: int
+    link: Link = Link()
+
+
+def run(job: Job) -> Outcome:
+    """Carries out one job."""
+    start = World(job.plan, seed=job.seed).random_start(np.random.default_rng(job.seed))
+    return trial(job.plan, start, job.seed, link=job.link)
+
+
+def run_all(jobs: Sequence[Job], *, processes: int = 2) -> list[Outcome]:
+    """All jobs, in their order, spread over processes."""
+    if processes < 2:
+        return [run(job) for job in jobs]
+    with ProcessPoolExecutor(processes, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
+        return list(pool.map(run, jobs))
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Of the trials in one building."""
+
+    building: str
+    trials: int
+    hidden: int
+    """Said to be hidden, in a truly dark place, within the limit."""
+    good: int
+    """Of these, with the camera to the lit part."""
+    median: float
+    """Seconds until hidden, of the good ones; NaN if there is none."""
+    slow: float
+    """Nine of ten good ones were faster."""
+    bumped: float
+    """Mean seconds of pushing against something."""
+
+
+def figures(outcomes: Iterable[Outcome]) -> list[Figures]:
+    """Sums up by building, in the order in which they first come."""
+    by_building: dict[str, list[Outcome]] = {}
+    for outcome in outcomes:
+        by_building.setdefault(outcome.building, []).append(outcome)
+    summed = []
+    for building, those in by_building.items():
+        times = [one.hidden_at for one in those if one.good and one.hidden_at is not None]
+        median, slow = np.percentile(times, [50, 90]) if times else (math.nan, math.nan)
+        summed.append(
+            Figures(
+                building=building,
+                trials=len(those),
+                hidden=sum(one.hidden_at is not None and one.dark for one in those),
+                good=len(times),
+                median=float(median),
+                slow=float(slow),
+                bumped=float(np.mean([one.bumped for one in those])),
+            )
+        )
+    return summed

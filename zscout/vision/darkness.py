@@ -9,12 +9,12 @@ sought at several levels of darkness, so that a gap in the shade of a dark sofa 
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zscout.vision.lens import BEARINGS, COLUMNS, EYE, FOCAL, RISE, ROWS, Picture, bearing, linear
+from zscout.vision.lens import COLUMNS, EYE, FOCAL, RISE, ROWS, Picture, bearing, linear
 
 LEVELS: Final = (0.04, 0.08, 0.15, 0.25)
 """Shares of the lit floor's brightness, below which something is dark: from the depth of a gap to shade."""
@@ -62,21 +62,15 @@ class View(NamedTuple):
     """The floor seen in the brighter half of the columns."""
     above: float
     """What is above, at the top of the picture: a roof is dark where it is dark below, a wall is not."""
-    free: float
-    """Metres ahead, over the robot's width, until the floor ends or changes."""
 
 
 _ROOF: Final = 14
 """Rows at the top of the picture."""
-MOST_CONTRAST: Final = 40.0
-_ROWS: Final = 4
-_CHANGE: Final = 0.28
-"""Share of its grey by which the floor may change from one four rows to the next."""
-_CORRIDOR: Final = 0.09
-"""Metres to each side of the robot's middle."""
-_FAR: Final = 10.0
+MOST_CONTRAST: Final = 120.0
 _DOWN: Final = ROWS - _BELOW
 _COUNT: Final = np.arange(ROWS)[:, None]
+_THINNEST: Final = 3
+"""Columns less one of a place that counts: the narrowest way in, 6 m off."""
 _COLUMN: Final = np.arange(COLUMNS)
 _CLOSE: Final = 0.3
 """Metres; nearer than that, a gap's upper edge may be out of the picture."""
@@ -87,48 +81,29 @@ def look(picture: Picture) -> View:
     light = linear(picture)
     floor = light[_BELOW + 3 :]
     lit = max(float(np.percentile(floor, 80)), 1e-4)
-    near = float(np.median(light[110:, 20:140]))
+    near = _middle(light[110:, 20:140])
     # The fourth brightest row: floor, not a line of light at its end.
     top = np.partition(light[_BELOW + 1 : 104], -4, axis=0)[-4]
     contrast = np.minimum(top / max(near, 2e-4), MOST_CONTRAST)
     outside = float(np.percentile(top, 75))
-    above = float(np.median(light[:_ROOF]))
+    above = _middle(light[:_ROOF])
     band = light[_BELOW - 16 : _BELOW + 4]
-    sides = float(np.median(band[:, : COLUMNS // 2])), float(np.median(band[:, COLUMNS // 2 :]))
+    sides = _middle(band[:, : COLUMNS // 2]), _middle(band[:, COLUMNS // 2 :])
     return View(
         lit=lit,
         near=near,
-        middling=float(np.median(light[::3, ::3])),
+        middling=_middle(light[::3, ::3]),
         sides=sides,
         places=_places(light, lit),
         contrast=contrast,
         outside=outside,
         above=above,
-        free=free_ahead(picture),
     )
 
 
-def free_ahead(picture: Picture) -> float:
-    """Metres ahead, over the robot's width, until the floor ends or changes: a foot, a wall, a rug, a shadow.
-
-    Each column is climbed from the bottom; the floor ends where four rows differ from the four below, and so
-    do the next four, so that a joint between two tiles is none."""
-    grey = picture[_BELOW - 2 * _ROWS :].astype(np.float32)
-    sums = np.concatenate((np.zeros((1, COLUMNS), np.float32), np.cumsum(grey, axis=0)))
-    fours = (sums[_ROWS:] - sums[:-_ROWS]) / _ROWS
-    here, above, further = fours[2 * _ROWS :], fours[_ROWS:-_ROWS], fours[: -2 * _ROWS]
-    one, two = above - here, further - here
-    bound = _CHANGE * (np.maximum(here, above) + 8)
-    ends = (np.abs(one) > bound) & (np.abs(two) > 0.8 * bound) & (one * two > 0)
-    ends = ends[::-1]
-    rows = np.where(ends.any(axis=0), len(ends) - 1 - np.argmax(ends, axis=0), 0)
-    distance = RISE / (rows + 0.5)
-    within = np.abs(np.tan(BEARINGS)) * distance < _CORRIDOR
-    return float(np.sort(np.where(within, distance, _FAR))[2])
-
-
 def _places(light: NDArray[np.float32], lit: float) -> tuple[DarkPlace, ...]:
-    """Candidates of all levels; of those that overlap, the widest at the darkest level that still holds it."""
+    """Candidates of all levels; of those that overlap, the widest at the darkest level that still holds
+    it."""
     # A little smoothing along the rows: noise does not break a gap, edges between rows stay.
     smooth = light.copy()
     smooth[:, 1:-1] = (light[:, :-2] + light[:, 1:-1] + light[:, 2:]) / 3
@@ -155,10 +130,12 @@ def _at_level(light: NDArray[np.float32], lit: float, level: float) -> list[Dark
     exact = _exact(light, below)
     places = []
     for first, last in _stretches(inside, below):
+        if last - first < _THINNEST:
+            continue
         columns = slice(first, last + 1)
         held = inside[columns]
-        under = float(np.median(exact[columns][held]))
-        over = float(np.median(above[columns][held]))
+        under = _middle(exact[columns][held])
+        over = _middle(above[columns][held])
         distance = RISE / under
         width = (last + 1 - first) / FOCAL * distance
         height = EYE * (1 + over / under)
@@ -167,9 +144,9 @@ def _at_level(light: NDArray[np.float32], lit: float, level: float) -> list[Dark
         if width < NARROWEST or not LOWEST <= height <= HIGHEST:
             continue
         rows = slice(max(0, _BELOW - int(over)), _BELOW + max(1, int(under)))
-        darkness = float(np.median(light[rows, columns])) / lit
+        darkness = _middle(light[rows, columns]) / lit
         lintel = light[max(0, _BELOW - int(1.4 * over) - 4) : max(0, _BELOW - int(over) - 1), columns]
-        if lintel.size and float(np.median(lintel)) < max(2 * darkness, 0.5 * level) * lit:
+        if lintel.size and _middle(lintel) < max(2 * darkness, 0.5 * level) * lit:
             # No edge above: the lower part of a dark face.
             continue
         centre = bearing((first + last) / 2)
@@ -177,9 +154,15 @@ def _at_level(light: NDArray[np.float32], lit: float, level: float) -> list[Dark
     return places
 
 
+def _middle(values: NDArray[Any]) -> float:
+    """The median, or the upper one of two; many times as quick as NumPy's for a few numbers."""
+    flat = values.ravel()
+    return float(np.partition(flat, flat.size // 2)[flat.size // 2])
+
+
 def _run(dark: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Per column: how many rows come before the first dark one, and before the first light one after that. Both
-    are 0 if none is dark."""
+    """Per column: how many rows come before the first dark one, and before the first light one after that.
+    Both are 0 if none is dark."""
     first = np.argmax(dark, axis=0)
     light = ~dark & (_COUNT[: len(dark)] > first)
     last = np.where(light.any(axis=0), np.argmax(light, axis=0), len(dark))
@@ -189,7 +172,8 @@ def _run(dark: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _exact(light: NDArray[np.float32], below: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Rows below the horizon at which the dark ends, between the pixels: the row where it ends is part dark."""
+    """Rows below the horizon at which the dark ends, between the pixels: the row where it ends is part
+    dark."""
     end = np.minimum(_BELOW + below, ROWS - 2)
     part, whole = light[end, _COLUMN], light[end + 1, _COLUMN]
     result: NDArray[np.float32] = below + 1 - np.clip(part / np.maximum(whole, 1e-5), 0, 1)

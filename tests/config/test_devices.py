@@ -1,0 +1,152 @@
+"""Devices in a node file: what good tables mean, and the exact line that each kind of bad one ends in."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.config.kit import RC_RULE, short, write
+from zscout import config
+from zscout.config import Framegrabber, Radio, Robot, Video
+from zscout.node import driver_for
+from zscout.scheduling.model import SECOND
+from zscout.strict import BadInput
+
+
+def table(name: str, **keys: str) -> str:
+    kind = name.partition("/")[0]
+    lines = [f'name = "{name}"', f'driver = "{keys.pop("driver", kind)}"']
+    lines += [f"{key} = {value}" for key, value in keys.items()]
+    return "[[rc]]\n" + "\n".join(lines) + "\n"
+
+
+def device(text: str) -> config.Device | None:
+    (rc,) = config.load_node(write("node.toml", text)).rcs
+    return rc.device
+
+
+def robot(**keys: str) -> str:
+    return table("robot/a", **({"id": "33", "radio": '"radio/r"'} | keys))
+
+
+def radio(**keys: str) -> str:
+    return table("radio/r", **({"port": '"/dev/ttyUSB0"'} | keys))
+
+
+BAD = {
+    table("radio/r"): 'rc[0].port (radio/r): is missing; add it, as in port = "/dev/ttyUSB0"',
+    radio(port='""'): (
+        'rc[0].port (radio/r): "" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'
+    ),
+    radio(port=r'"\u0000"'): (
+        'rc[0].port (radio/r): "\\x00" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'
+    ),
+    radio(baud="299"): "rc[0].baud (radio/r): is 299; write a whole number from 300 to 1000000",
+    radio(baud="9600.0"): "rc[0].baud (radio/r): is 9600.0; write a whole number from 300 to 1000000",
+    radio(bound="0"): "rc[0].bound (radio/r): is 0 s; write 0.01 to 10 seconds",
+    radio(bound="nan"): "rc[0].bound (radio/r): is not a finite number; write a number",
+    radio(capacity="{ command_rate = 1 }"): (
+        'rc[0].capacity (radio/r): the driver "radio" has none; remove it, or write driver = "capacity"'
+    ),
+    radio(activation="1"): (
+        'rc[0].activation (radio/r): the driver "radio" has none; '
+        'remove it, or write driver = "exclusive" or "capacity"'
+    ),
+    table("radio/r", driver="capacity", capacity="{ a = 1 }", port='"/dev/x"'): (
+        'rc[0].port (radio/r): the driver "capacity" has none; remove it, or write driver = "radio"'
+    ),
+    table("mast/r", driver="radio", port='"/dev/x"'): (
+        'rc[0].name: "mast/r" is no radio, as driver = "radio" says; '
+        "name it radio/r, or choose another driver"
+    ),
+    table("robot/a", radio='"radio/r"'): (
+        "rc[0].id (robot/a): is missing; add the id that its packets carry, as in id = 33"
+    ),
+    table("robot/a", id="33"): (
+        'rc[0].radio (robot/a): is missing; add the radio that carries its halt, as in radio = "radio/rf0"'
+    ),
+    robot(id="255"): "rc[0].id (robot/a): is 255; write a whole number from 0 to 254",
+    robot(radio='"r"'): f'rc[0].radio (robot/a): "r" is not the name of an RC; {RC_RULE}',
+    robot(radio='"video/r"'): ('rc[0].radio (robot/a): "video/r" is no radio; name one, as in "radio/..."'),
+    robot(channels='{ "video/1" = 16 }'): (
+        'rc[0].channels."video/1" (robot/a): is 16; write a whole number from 1 to 15'
+    ),
+    robot(channels='{ "radio/r" = 1 }'): (
+        'rc[0].channels."radio/r" (robot/a): "radio/r" is no video; name one, as in "video/..."'
+    ),
+    robot(channels='{ "video/1" = 1, "video/2" = 1 }'): (
+        'rc[0].channels."video/2" (robot/a): is 1, as video/1 is; give each its own channel'
+    ),
+    robot(dead_man="0"): "rc[0].dead_man (robot/a): is 0 s; write 0.05 to 5 seconds",
+    robot(warm_up="61"): "rc[0].warm_up (robot/a): is 61 s; write 0 to 60 seconds",
+    robot(port='"/dev/x"'): (
+        'rc[0].port (robot/a): the driver "robot" has none; remove it, or write driver = "radio"'
+    ),
+    robot(warmup="1"): "rc[0].warmup (robot/a): unknown key; did you mean warm_up?",
+    table("video/1", quality="1"): (
+        'rc[0].quality (video/1): the driver "video" has none; remove it, or write driver = "framegrabber"'
+    ),
+    table("framegrabber/f"): (
+        'rc[0].source (framegrabber/f): is missing; add it, as in source = "/dev/video0", or a table sources'
+    ),
+    table("framegrabber/f", source='"a"', sources='{ "video/1" = "b" }'): (
+        "rc[0].sources (framegrabber/f): stands beside source; remove one of the two"
+    ),
+    table("framegrabber/f", sources="{}"): (
+        'rc[0].sources (framegrabber/f): is empty; add one, as in "video/ch1" = "/dev/video0"'
+    ),
+    table("framegrabber/f", sources='{ ch1 = "b" }'): (
+        f'rc[0].sources.ch1 (framegrabber/f): "ch1" is not the name of an RC; {RC_RULE}'
+    ),
+    table("framegrabber/f", source='"a"', rate="61"): (
+        "rc[0].rate (framegrabber/f): is 61; write a number from 0.1 to 60"
+    ),
+    table("framegrabber/f", source='"a"', quality="0"): (
+        "rc[0].quality (framegrabber/f): is 0; write a whole number from 1 to 100"
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "line"), BAD.items(), ids=map(short, BAD))
+def test_a_bad_device_is_one_line_that_says_how_to_mend_it(text: str, line: str) -> None:
+    with pytest.raises(BadInput) as bad:
+        device(text)
+    assert str(bad.value) == f"node.toml: {line}"
+
+
+def test_what_a_table_says_and_what_it_leaves_out() -> None:
+    assert device(radio()) == Radio("/dev/ttyUSB0", 9600, SECOND // 4)
+    assert device(radio(port='"socket://mast:4001"', baud="1200", bound="1.5")) == Radio(
+        "socket://mast:4001", 1200, 3 * SECOND // 2
+    )
+    assert device(robot()) == Robot(33, "radio/r", {}, 2 * SECOND, SECOND // 2)
+    told = robot(channels='{ "video/1" = 1, "video/2" = 15 }', warm_up="0", dead_man="0.3")
+    assert device(told) == Robot(33, "radio/r", {"video/1": 1, "video/2": 15}, 0, 3 * SECOND // 10)
+    assert device(table("video/1")) == Video()
+    assert device(table("framegrabber/f", source='"/dev/video0"')) == Framegrabber(
+        {"": "/dev/video0"}, 10.0, 80
+    )
+    told = table("framegrabber/f", sources='{ "video/1" = "http://a/1" }', rate="2.5", quality="60")
+    assert device(told) == Framegrabber({"video/1": "http://a/1"}, 2.5, 60)
+    assert device(table("robot/a", driver="exclusive")) is None
+
+
+def test_every_device_has_its_driver() -> None:
+    text = radio() + robot() + table("video/1") + table("robot/b", driver="exclusive", activation="1.5")
+    drivers = [driver_for(rc) for rc in config.load_node(write("node.toml", text)).rcs]
+    assert [type(driver).__name__ for driver in drivers] == [
+        "RadioDriver",
+        "RobotDriver",
+        "VideoDriver",
+        "ExclusiveDriver",
+    ]
+    assert [driver.activation for driver in drivers] == [0, 2, 0, 1.5]
+    assert [driver.sharable for driver in drivers] == [True, False, True, False]
+
+
+def test_a_node_without_such_devices_loads_nothing_heavy() -> None:
+    look = "import sys, zscout.node; print({'serial', 'cv2', 'rerun'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"

@@ -1,0 +1,350 @@
+"""The newest picture of real sources, which stall, tear, go away and come back."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.drivers.mjpeg import MjpegServer, jpeg, number_of, numbered
+from zscout.drivers.capture import Capture, Captured, kind_of, shown
+
+PATIENCE = 20.0
+"""Seconds within which anything that is waited for must have come true, on a busy machine."""
+
+
+@contextmanager
+def capturing(source: str, **how: float) -> Iterator[Capture]:
+    capture = Capture(source, **how)
+    capture.start()
+    try:
+        yield capture
+    finally:
+        capture.stop()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def picture_of(capture: Capture, after: int = 0) -> Captured:
+    captured = capture.wait(after, PATIENCE)
+    assert captured is not None, capture.health
+    return captured
+
+
+def later(capture: Capture) -> Captured:
+    """A picture newer than all that is there."""
+    return picture_of(capture, capture.number)
+
+
+def recording(path: Path, numbers: int, *, rate: float, size: tuple[int, int] = (160, 120)) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, size)
+    assert writer.isOpened()
+    for number in range(1, numbers + 1):
+        writer.write(cv2.merge([numbered(number, width=size[0], height=size[1])] * 3))
+    writer.release()
+    return path
+
+
+def test_pictures_come_whole_and_in_order() -> None:
+    with MjpegServer(picture=lambda number: jpeg(numbered(number, grey=False))) as server:
+        with capturing(server.url) as capture:
+            first = picture_of(capture)
+            assert first.picture.shape == (120, 160, 3)
+            assert first.picture.dtype == np.uint8
+            seen = [first]
+            for _ in range(8):
+                seen.append(picture_of(capture, seen[-1].number))
+            assert capture.health == "ok"
+            assert (capture.opened, capture.stalls) == (1, 0)
+        told = [captured.number for captured in seen]
+        drawn = [number_of(captured.picture) for captured in seen]
+        assert told == sorted(set(told))
+        # No picture was lost before it was numbered: the difference is what went before the first.
+        assert len({number - here for number, here in zip(drawn, told, strict=True)}) == 1
+        times = [captured.time for captured in seen]
+        assert times == sorted(times)
+        # A capture that has ended lets go of its camera.
+        until(lambda: server.connected == 0)
+
+
+def test_a_slow_reader_gets_the_newest_picture() -> None:
+    with MjpegServer(rate=60) as server, capturing(server.url) as capture:
+        got = picture_of(capture)
+        for _ in range(3):
+            sent = server.sent
+            until(lambda sent=sent: server.sent >= sent + 20)  # type: ignore[misc]
+            before, sent = got, server.sent
+            got = picture_of(capture, got.number)
+            # Whatever gathered meanwhile is skipped: 20 pictures of a queue would still be ahead of it.
+            assert number_of(got.picture) > sent - 10
+            assert got.number > before.number + 5
+        assert capture.dropped >= 3 * 5
+
+
+def test_each_picture_is_given_once_and_read_ones_are_not_dropped() -> None:
+    with MjpegServer(rate=20) as server, capturing(server.url, read_timeout=0.4) as capture:
+        number = picture_of(capture).number
+        server.mode = "stall"
+        until(lambda: capture.stalls > 0)
+        last = capture.number
+        dropped = capture.dropped
+        assert capture.newest(last) is None
+        assert capture.wait(last, 0.01) is None
+        assert last == number or capture.newest(number) is not None
+        assert capture.newest(0) is not None
+        server.mode = "run"
+        picture_of(capture, last)
+        assert capture.dropped - dropped <= capture.number - last - 1
+
+
+def test_a_stalled_stream_is_opened_again() -> None:
+    with MjpegServer() as server, capturing(server.url, read_timeout=0.4) as capture:
+        before = later(capture)
+        server.mode = "stall"
+        until(lambda: capture.stalls == 1)
+        assert capture.health.startswith("no picture from http://127.0.0.1:")
+        assert "0.4 s" in capture.health
+        server.mode = "run"
+        after = picture_of(capture, capture.number)
+        assert after.number > before.number
+        assert number_of(after.picture) > number_of(before.picture)
+        assert capture.opened >= 2
+        assert capture.health == "ok"
+
+
+def test_a_server_that_goes_away_and_comes_back() -> None:
+    with MjpegServer() as server, capturing(server.url) as capture:
+        picture_of(capture)
+        server.close()
+        until(lambda: "can't be opened" in capture.health)
+        gone = capture.number
+        opened = capture.opened
+        server.open()
+        assert picture_of(capture, gone).number > gone
+        assert capture.opened == opened + 1
+        assert capture.stalls == 0
+
+
+@pytest.mark.parametrize("mode", ["half", "torn"])
+def test_half_a_picture_is_no_picture(mode: str) -> None:
+    texture = np.random.default_rng(1).integers(0, 20, (120, 160), np.uint8)
+    # The number stands in either half: FFmpeg fills what is missing from an older picture.
+    twice = 257
+    with (
+        MjpegServer(picture=lambda number: jpeg(numbered(twice * number) + texture)) as server,
+        capturing(server.url, open_timeout=0.4, read_timeout=0.4) as capture,
+    ):
+        seen = picture_of(capture)
+        server.mode = mode
+        accepted, halves = server.accepted, 0
+        end = time.monotonic() + PATIENCE
+        # Until it has opened the stream again after a half, and got whole ones.
+        while not halves or number_of(seen.picture) <= twice * halves:
+            if not halves and server.accepted > accepted:
+                server.mode, halves = "run", server.sent
+            seen = capture.wait(seen.number, 0.02) or seen
+            assert number_of(seen.picture) % twice == 0
+            assert server.sent < 256
+            assert time.monotonic() < end
+
+
+def test_garbled_pictures_do_not_end_the_stream() -> None:
+    with MjpegServer() as server, capturing(server.url) as capture:
+        picture_of(capture)
+        server.mode = "garble"
+        sent = server.sent
+        until(lambda: server.sent > sent + 20)
+        server.mode = "run"
+        after = server.sent
+        until(lambda: (got := capture.newest(0)) is not None and number_of(got.picture) > after)
+        assert capture.health == "ok"
+        assert capture.stalls == 0
+        assert server.accepted == capture.opened
+
+
+def test_the_first_picture_may_be_garbled() -> None:
+    with MjpegServer(rate=60) as server:
+        server.mode = "garble"
+        with capturing(server.url) as capture:
+            picture_of(capture)
+            assert server.accepted == 1
+
+
+def test_a_page_that_is_not_there_is_told_and_tried_again_ever_more_rarely() -> None:
+    with MjpegServer() as server:
+        server.mode = "404"
+        with capturing(server.url) as capture:
+            until(lambda: server.accepted >= 1)
+            began, accepted = time.monotonic(), server.accepted
+            until(lambda: server.accepted >= accepted + 2)
+            # 0.2 and 0.4 s: a busy machine makes it longer, never shorter.
+            assert time.monotonic() - began > 0.5
+            assert "can't be opened" in capture.health
+            assert (capture.opened, capture.number) == (0, 0)
+            server.mode = "run"
+            picture_of(capture)
+            assert capture.health == "ok"
+
+
+def test_of_two_openers_the_second_waits_for_the_first() -> None:
+    with MjpegServer(clients=1) as server:
+        with capturing(server.url) as first:
+            picture_of(first)
+            second = Capture(server.url)
+            second.start()
+            until(lambda: "can't be opened" in second.health)
+            assert later(first).number > 0
+        picture_of(second)
+        assert second.health == "ok"
+        second.stop()
+
+
+def test_a_silent_server_holds_up_nobody_and_stop_does_not_wait_for_it() -> None:
+    with MjpegServer() as silent, MjpegServer() as server:
+        silent.mode = "stall"
+        blocked = Capture(silent.url, open_timeout=60)
+        blocked.start()
+        until(lambda: silent.accepted == 1)
+        with capturing(server.url) as capture:
+            # OpenCV's own lock would keep this one out for 60 s.
+            picture_of(capture)
+        blocked.stop(0.05)
+        assert blocked.alive
+        silent.cut()
+        until(lambda: not blocked.alive)
+
+
+@pytest.mark.parametrize("mode", ["run", "stall"])
+def test_a_process_ends_whatever_its_captures_do(mode: str) -> None:
+    with MjpegServer() as server:
+        server.mode = mode
+        code = (
+            "import sys\n"
+            "from zscout.drivers import capture\n"
+            "capture.EXIT_WAIT = 0.3\n"
+            "capture = capture.Capture(sys.argv[1], open_timeout=600)\n"
+            "capture.start()\n"
+            "sys.stdin.readline()\n"
+        )
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, server.url], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        until(lambda: server.accepted == 1 and (mode == "stall" or server.sent > 5))
+        assert process.communicate(timeout=PATIENCE)[1] == b""
+        assert process.returncode == 0
+
+
+def test_who_waits_is_let_go_by_stop() -> None:
+    with MjpegServer() as server, capturing(server.url) as capture:
+        picture_of(capture)
+        got: list[Captured | None] = []
+        waiter = threading.Thread(target=lambda: got.append(capture.wait(10**9, 600)))
+        waiter.start()
+        capture.stop()
+        waiter.join(PATIENCE)
+        assert got == [None]
+
+
+def test_a_file_runs_at_its_own_rate_and_from_its_start_again(tmp_path: Path) -> None:
+    path = recording(tmp_path / "film.avi", 6, rate=50)
+    with capturing(str(path)) as capture:
+        seen = [picture_of(capture)]
+        began = seen[0]
+        while seen[-1].number < 20:
+            seen.append(picture_of(capture, seen[-1].number))
+        assert capture.health == "ok"
+        assert capture.opened >= 3
+    # Read no faster than it was recorded.
+    assert seen[-1].time - began.time > 0.9 * (seen[-1].number - began.number) / 50
+    for captured in seen:
+        assert number_of(captured.picture) == (captured.number - 1) % 6 + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("gone.avi", None, "gone.avi can't be opened: No such file or directory"),
+        ("text.avi", b"no video at all\n" * 100, "text.avi can't be opened: it is not a video"),
+        ("empty.avi", b"", "empty.avi can't be opened: it is not a video"),
+        ("film.avi/", None, "No such file or directory"),
+    ],
+)
+def test_files_that_are_none(tmp_path: Path, name: str, content: bytes | None, words: str) -> None:
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with capturing(str(path)) as capture:
+        until(lambda: capture.health != "not open yet")
+        assert words in capture.health
+
+
+def test_a_file_that_appears_later_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "film.avi"
+    with capturing(str(path)) as capture:
+        until(lambda: "No such file" in capture.health)
+        ready = recording(tmp_path / "new.avi", 5, rate=25)
+        ready.rename(path)
+        assert number_of(picture_of(capture).picture) == 1
+
+
+def test_what_can_not_be_a_camera_is_told(tmp_path: Path) -> None:
+    with capturing(str(tmp_path)) as capture:
+        until(lambda: capture.health != "not open yet")
+        assert capture.health.endswith("is not a file")
+    for device in ("/dev/null", "99"):
+        with capturing(device) as capture:
+            until(lambda: capture.health != "not open yet")
+            assert "can't be opened" in capture.health
+
+
+@pytest.mark.parametrize(
+    ("source", "kind"),
+    [
+        ("0", "device"),
+        ("12", "device"),
+        ("/dev/video0", "device"),
+        ("http://camera/video", "url"),
+        ("rtsp://camera:554/1", "url"),
+        ("film.avi", "file"),
+        ("./0", "file"),
+        ("²", "file"),
+        ("", "file"),
+    ],
+)
+def test_what_a_source_is(source: str, kind: str) -> None:
+    assert kind_of(source) == kind
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("rtsp://me:secret@camera:554/1?token=secret", "rtsp://camera:554/1"),
+        ("http://secret@[fe80::1]/video#secret", "http://[fe80::1]/video"),
+        ("http://me:secret@camera:notaport/", "http://..."),
+        ("film secret.avi", "film secret.avi"),
+    ],
+)
+def test_secrets_of_a_url_are_not_told(source: str, told: str) -> None:
+    assert shown(source) == told
+
+
+def test_a_secret_is_not_in_the_words_of_health() -> None:
+    with MjpegServer() as server:
+        server.mode = "404"
+        with capturing(server.url.replace("//", "//me:secret@") + "?secret") as capture:
+            until(lambda: "can't be opened" in capture.health)
+            assert "secret" not in capture.health
+            assert server.url in capture.health

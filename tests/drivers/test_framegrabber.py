@@ -1,0 +1,121 @@
+"""The framegrabber's parts that need no mesh: its pace, grey pictures, what it tells, and its tuning."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.drivers.mjpeg import numbered
+from zscout.drivers.frame_pump import RATE_SPAN, Meter, Pace, encode, is_grey
+from zscout.drivers.framegrabber import FramegrabberDriver
+from zscout.messages import FrameHead
+
+
+@pytest.mark.parametrize("source", [1, 5, 9, 10, 10.2, 11, 14, 15, 20, 25, 29.97, 30, 60, 240])
+def test_a_pace_admits_no_more_than_its_rate_and_little_less(source: float) -> None:
+    pace = Pace(10)
+    admitted = [at for at in (n / source for n in range(int(60 * source))) if pace.admits(at)]
+    expected = 60 * min(10.0, source)
+    assert 0.93 * expected <= len(admitted) <= expected + 1
+    # Never more than two too close to each other, never a hole of more than one picture.
+    gaps = np.diff(admitted)
+    assert gaps.min() >= min(0.05, 1 / source) - 1e-9
+    assert gaps.max() <= 1 / min(10.0, source) + 1 / source + 1e-9
+    span = 10
+    for start in range(len(admitted) - span):
+        assert admitted[start + span] - admitted[start] >= span / 10 - 0.05 - 1e-9
+
+
+def test_uneven_pictures_at_the_very_rate_are_all_admitted() -> None:
+    pace = Pace(10)
+    rng = np.random.default_rng(1)
+    jitter = rng.uniform(-0.02, 0.02, 600)
+    assert all(pace.admits(n / 10 + late) for n, late in enumerate(jitter))
+
+
+def test_after_a_pause_there_is_no_burst() -> None:
+    pace = Pace(10)
+    assert pace.admits(0)
+    admitted = [n for n in range(101) if pace.admits(60 + n / 100)]
+    # 10 in a second, the one at its beginning, and the half interval that one may be early.
+    assert admitted[0] == 0
+    assert 10 <= len(admitted) <= 11
+
+
+def colour() -> NDArray[np.uint8]:
+    return np.asarray(cv2.merge([numbered(7)] * 3), np.uint8)
+
+
+def test_a_picture_without_colour_becomes_a_grey_jpeg() -> None:
+    plain = colour()
+    assert is_grey(plain)
+    grey = cv2.imdecode(np.frombuffer(encode(plain, 80), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert grey is not None
+    assert grey.shape == (120, 160)
+    assert np.abs(grey.astype(int) - plain[:, :, 0]).mean() < 3
+    assert encode(plain, 80) == encode(plain[:, :, 1].copy(), 80)
+    _, coloured = cv2.imencode(".jpg", plain, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    assert len(encode(plain, 80)) < len(coloured)
+
+
+@pytest.mark.parametrize("place", [(0, 0), (5, 9), (119, 159)])
+@pytest.mark.parametrize("plane", [0, 1, 2])
+def test_one_coloured_pixel_makes_a_picture_coloured(place: tuple[int, int], plane: int) -> None:
+    picture = colour()
+    picture[(*place, plane)] += 4
+    assert not is_grey(picture)
+    decoded = cv2.imdecode(np.frombuffer(encode(picture, 80), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded is not None
+    assert decoded.shape == (120, 160, 3)
+
+
+def test_rounding_makes_no_colour() -> None:
+    picture = colour()
+    picture[::2, ::3, 0] += 3
+    assert is_grey(picture)
+    assert is_grey(np.zeros((1, 1, 3), np.uint8))
+
+
+def test_what_a_meter_tells() -> None:
+    meter = Meter()
+    assert (meter.rate(0), meter.latency()) == (0, 0)
+    for number in range(41):
+        head = FrameHead(number=number, time=100 + number / 10, width=160, height=120)
+        meter.count(head, 2_000 + number, head.time + (0.5 if number == 40 else 0.02))
+    assert meter.rate(104.52) == pytest.approx(10, rel=0.2)
+    assert meter.latency() == pytest.approx(0.02)
+    assert (meter.published, meter.width, meter.height, meter.size) == (41, 160, 120, 2_040)
+    assert meter.rate(104.52 + RATE_SPAN) == 0
+
+
+@pytest.mark.parametrize(
+    ("sources", "gang", "tuned", "why"),
+    [
+        ({"": "0"}, ("robot/a",), "", ""),
+        ({"": "0"}, ("robot/a", "video/ch1"), "", ""),
+        ({"video/ch1": "1", "video/ch2": "2"}, ("framegrabber/f", "video/ch2"), "video/ch2", ""),
+        ({"video/ch1": "1", "video/ch2": "2"}, ("video/ch2", "video/ch1"), "video/ch1", ""),
+        ({"video/ch1": "1"}, ("robot/a",), "video/ch1", ""),
+        ({"video/ch1": "1"}, ("video/ch3",), None, "does not receive video/ch3; it receives video/ch1"),
+        ({"video/ch1": "1", "video/ch2": "2"}, ("robot/a",), None, "tune it to one of video/ch1, video/ch2"),
+    ],
+)
+def test_the_gang_settles_the_source(
+    sources: dict[str, str], gang: tuple[str, ...], tuned: str | None, why: str
+) -> None:
+    source, reason = FramegrabberDriver(sources, rate=10, quality=80)._of_gang(list(gang))
+    assert source == tuned
+    assert why in reason
+    assert bool(reason) == (tuned is None)
+
+
+@pytest.mark.parametrize(
+    ("rate", "quality", "sources"),
+    [(0.0, 80, {"": "0"}), (float("nan"), 80, {"": "0"}), (float("inf"), 80, {"": "0"}), (10.0, 0, {"": "0"}),
+     (10.0, 101, {"": "0"}), (10.0, 80, {})],
+)  # fmt: skip
+def test_a_framegrabber_that_can_not_be(rate: float, quality: int, sources: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match="a framegrabber has a source"):
+        FramegrabberDriver(sources, rate=rate, quality=quality)

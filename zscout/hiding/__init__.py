@@ -1,0 +1,1 @@
+"""A Scout's mind: pictures in, wheel commands out. Pure: no clock, no thread, no I/O."""

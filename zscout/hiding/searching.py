@@ -1,0 +1,145 @@
+"""Looking around for a dark place, turning to the best one, and driving elsewhere if there is none."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from zscout.hiding.body import Act
+from zscout.hiding.facing import sheltered, to_light
+from zscout.hiding.memory import MAX_SIGHTINGS, Memory, Opening, Sighting, wrapped
+from zscout.hiding.mind import HOP, Mind, PhaseOf
+from zscout.vision.darkness import View
+
+FULL_TURN: Final = math.tau - math.radians(20)
+MOST_HOPS: Final = 24
+"""Of a scan: turns that the picture does not show do not count for ever."""
+AIMED: Final = math.radians(7)
+LEG: Final = 1.4
+"""Metres to drive at most before the next scan."""
+FORGETS: Final = 6
+"""Scans after which bad spots are forgotten: by then dead reckoning does not know where they are."""
+BAD_NEAR: Final = 0.45
+"""Metres around a spot where hiding failed."""
+
+
+class Scan(PhaseOf):
+    """A full turn in steps; at its end the best dark place is chosen."""
+
+    def begin(self, mind: Mind) -> None:
+        memory = mind.memory
+        memory.turned, memory.hops, memory.opened, memory.faces = 0.0, 0, 1.0, 0
+        memory.sightings, memory.openings = [], []
+        memory.scans += 1
+        if memory.scans % FORGETS == 0:
+            memory.bad = []
+        memory.tries, memory.target, memory.blocked = 0, None, []
+
+    def step(self, mind: Mind, view: View) -> Act:
+        memory = mind.memory
+        mind.sight(view)
+        memory.sightings = memory.sightings[-MAX_SIGHTINGS:]
+        if abs(memory.turned) < FULL_TURN and memory.hops < MOST_HOPS:
+            seen = len(memory.sightings)
+            return mind.hop(
+                HOP, f"looks around, {math.degrees(abs(memory.turned)):.0f} degrees, {seen} dark seen"
+            )
+        if sheltered(memory.openings):
+            memory.faces = 1
+
+            return to_light(mind, view)
+        target = best(memory)
+        if target is None:
+            return mind.then("roam", view)
+        memory.target, memory.seen_target = target, memory.clock
+        memory.goal, memory.next_phase = target.heading, "approach"
+        left = math.degrees(wrapped(target.heading - memory.heading))
+        side = "left" if left > 0 else "right"
+        memory.note = f"{len(memory.sightings)} dark places seen, best {abs(left):.0f} degrees {side}"
+        return mind.then("aim", view)
+
+
+def worth(sighting: Sighting, memory: Memory) -> float:
+    """How promising a dark place is; 0: not at all. Wide, low, dark and near is best."""
+    if sighting.darkness > 0.5 or sighting.width < 0.2:
+        return 0.0
+    for spot in memory.bad:
+        if math.hypot(spot.x - sighting.x, spot.y - sighting.y) < BAD_NEAR + 0.15 * sighting.distance:
+            return 0.0
+    wide = min(sighting.width, 0.8) / 0.8
+    dark = min(1.0, 0.12 / max(sighting.darkness, 0.02))
+    low = 1.0 if 0.07 <= sighting.height <= 0.24 else 0.5
+    return wide * dark * low / (0.8 + sighting.distance)
+
+
+def best(memory: Memory) -> Sighting | None:
+    """The most promising sighting of the scan; one seen in several pictures counts more."""
+    chosen, most = None, 0.04 / (1 + memory.scans)
+    for sighting in memory.sightings:
+        again = sum(
+            math.hypot(other.x - sighting.x, other.y - sighting.y) < 0.3 + 0.15 * sighting.distance
+            for other in memory.sightings
+        )
+        value = worth(sighting, memory) * (1.3 if again > 1 else 1.0)
+        if value > most:
+            chosen, most = sighting, value
+    return chosen
+
+
+class Aim(PhaseOf):
+    """Turns to `goal` in measured hops, then goes on to `next_phase`."""
+
+    def begin(self, mind: Mind) -> None:
+        mind.memory.hops = 0
+
+    def step(self, mind: Mind, view: View) -> Act:
+        memory = mind.memory
+        off = wrapped(memory.goal - memory.heading)
+        if abs(off) > AIMED and memory.hops < 10:
+            return mind.hop(off, memory.note)
+        return mind.then(memory.next_phase, view)
+
+
+class Roam(PhaseOf):
+    """No dark place in view: drives to the most open side. Where that is blocked, to the next."""
+
+    def begin(self, mind: Mind) -> None:
+        memory = mind.memory
+        memory.hops = 0
+        if memory.next_phase == "roam":
+            memory.next_phase = "scan"
+            return
+        side = most_open(mind)
+        memory.goal, memory.next_phase = side.heading, "roam"
+        memory.left_to_go = max(0.5, min(LEG, 1.2 * side.open_for))
+        memory.note = f"no dark place in view, drives {memory.left_to_go:.1f} m to where it is open"
+
+    def step(self, mind: Mind, view: View) -> Act:
+        memory = mind.memory
+        if memory.next_phase == "roam":
+            return mind.then("aim", view)
+        if mind.pace * mind.here_for >= memory.left_to_go:
+            return mind.then("scan", view)
+        return mind.cruise(mind.pace, 0.0, memory.note)
+
+    def stuck(self, mind: Mind, view: View) -> Act:
+        memory = mind.memory
+        memory.blocked = [*memory.blocked, memory.heading]
+        memory.note = "bumped on the way to where it is open"
+        return mind.then("back", view)
+
+
+def most_open(mind: Mind) -> Opening:
+    """One of the scan's sides, none near one that was blocked, by a little luck."""
+    memory = mind.memory
+    best, most = Opening(memory.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -1.0
+    for one in memory.openings:
+        value = min(one.open_for, 2.5) + 0.6 * mind.roll()
+        near = [abs(wrapped(one.heading - other)) < math.radians(50) for other in memory.blocked]
+        for spot in memory.bad:
+            to = math.atan2(spot.y - memory.y, spot.x - memory.x)
+            if abs(wrapped(to - one.heading)) < 0.6:
+                value -= 0.5
+        if value > most and not any(near):
+            best, most = one, value
+    return best

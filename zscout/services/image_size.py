@@ -1,0 +1,46 @@
+"""How large an encoded picture is, read from its head alone: pictures come from outside, and a viewer that
+decodes one makes room for as many pixels as its head says."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_PNG_END: Final = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""JPEG's markers of a frame (ITU-T T.81, table B.1): those with the picture's size."""
+_ALONE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
+"""Markers without a length."""
+
+
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in pixels; None if this does not begin as a JPEG picture does."""
+    if data[:2] != b"\xff\xd8":
+        return None
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # a filling byte
+            at += 1
+        elif marker in _ALONE:
+            at += 2
+        elif marker in _FRAMES:
+            if at + 9 > len(data):
+                return None
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return (width, height) if width and height else None
+        else:
+            (length,) = struct.unpack_from(">H", data, at + 2)
+            if length < 2:
+                return None
+            at += 2 + length
+    return None
+
+
+def png_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in pixels; None if this does not begin and end as a PNG picture does."""
+    if len(data) < 45 or data[:8] != _PNG or data[8:16] != b"\x00\x00\x00\x0dIHDR" or data[-12:] != _PNG_END:
+        return None
+    width, height = struct.unpack_from(">II", data, 16)
+    return (width, height) if width and height else None
