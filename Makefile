@@ -9,7 +9,7 @@ PEERS_READY := $(PEERS)/.ready
 .PHONY: help setup demo test lint bench bench-peers lock clean
 
 help:
-	@echo "make demo   Table 1 of the paper on a live mesh, compared with Table 2"
+	@echo "make demo   four robots in a simulated building hide and watch, on a live mesh"
 	@echo "make test   all tests"
 	@echo "make lint   formatting, linting and strict types"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"

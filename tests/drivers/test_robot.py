@@ -304,7 +304,23 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             )
             replaced = sum(answered.result == {"replaced": True} for answered in done)
             assert replaced + driver.figures()["replaced"] >= 40 - sum(isinstance(p, Drive) for p in last)
-            await client.end(arc)
+            # Handed over, the robot goes on driving: no safe state between, and only the heir is obeyed.
+            heir, since = await lab.client(), len(line.heard)
+            await client.command("robot/r1", grant, TURN)
+            client.pause()
+            heir.expect(client.open_requests())
+            await client.hand_over_all(heir.mesh.me)
+            inherited = await heir.request("hide", GANG, min_runtime=600)
+            under = await heir.granted(inherited)
+            assert under is not None
+            await heir.command("robot/r1", under, TURN | {"left": 1})
+            await line.until(
+                lambda packets: any(isinstance(p, Drive) and p.left == 1 for p in packets), since=since
+            )
+            assert not is_in(Halt)(line.packets[since:])
+            assert await answer(client.command("robot/r1", grant, TURN)) == "ended"
+            client.resume()
+            await heir.end(inherited)
 
             # What a gang must have for a robot to do as it is told.
             for needs, do, word in (

@@ -240,7 +240,7 @@ async def _serve(
             _write_node(node, served, framegrabbers)
             told["node"] = str(node)
         if mesh:
-            from zscout.simulation.on_mesh import tell
+            from zscout.cli.simulate_mesh import tell
 
             client = await stack.enter_async_context(common.connected("building", fleet, need_rcm=False))
             telling = asyncio.create_task(tell(served, client.mesh))

@@ -38,8 +38,8 @@ TAKEOVER: Final = 25.0
 """Seconds from the beginning of the net to the operator's takeover."""
 DRIVES: Final = 6.0
 """Seconds that the operator drives."""
-GUARDS: Final = 15.0
-"""Seconds that the net is watched once all are hidden."""
+GUARDS: Final = (10.0, 40.0)
+"""Seconds that the net is watched once all are hidden: at least, and at most if nobody walks by."""
 WORST: Final = 150.0
 """Seconds after which the demo ends, placed or not."""
 PATROL: Final = (("forward", 1.5), ("left", 1.0), ("forward", 1.5), ("right", 1.0))
@@ -117,7 +117,7 @@ class RobotsDemo:
                     await self._all_hidden()
                     await operator
                     await self._all_hidden()
-                    await asyncio.sleep(GUARDS)
+                    await self._guard()
         finally:
             operator.cancel()
             await asyncio.gather(operator, return_exceptions=True)
@@ -127,6 +127,16 @@ class RobotsDemo:
         while len(self.seen.hidden) < len(self.robots):
             self._news.clear()
             await self._news.wait()
+
+    async def _guard(self) -> None:
+        """For a while, and until something was alerted."""
+        alerts = self.seen.alerts
+        await asyncio.sleep(GUARDS[0])
+        with suppress(TimeoutError):
+            async with asyncio.timeout(GUARDS[1] - GUARDS[0]):
+                while self.seen.alerts == alerts:
+                    self._news.clear()
+                    await self._news.wait()
 
     async def _operator(self, client: Client) -> None:
         """In the middle of it, a human takes one robot, drives it about and gives it back."""
