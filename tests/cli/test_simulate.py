@@ -16,6 +16,7 @@ import pytest
 
 from tests.cli.tools import COMMAND, PATIENCE, Terminal, zscout_here
 from tests.live.lab import START, Lab
+from zscout.cli.simulate import named_plan
 from zscout.config import load_node
 from zscout.config.devices import Framegrabber, Radio, Robot, Video
 from zscout.messages import BuildingPlan, BuildingPoses, PlanAsk
@@ -168,6 +169,19 @@ def test_the_shipped_buildings_are_listed(capsys: pytest.CaptureFixture[str]) ->
     rows = json.loads(capsys.readouterr().out)
     for row in rows:
         assert row["robots"] == ["scout33", "scout35", "scout37", "scout39"]
+
+
+def test_the_building_in_the_docs_is_one(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text()
+    file = tmp_path / "study.toml"
+    file.write_text(text.partition("```toml\n")[2].partition("```")[0])
+    assert named_plan(str(file)).robots[0].id == 33
+
+
+def test_a_building_is_drawn_by_its_seed() -> None:
+    plan = named_plan("random:3")
+    assert plan == named_plan("random:3")
+    assert plan != named_plan("random:4")
 
 
 @pytest.mark.parametrize(

@@ -307,6 +307,20 @@ def test_what_is_said_again_stays_true() -> None:
     assert {packet.channel for packet in told.packets if isinstance(packet, Camera)} == {3}
 
 
+def test_what_is_said_again_keeps_to_the_reserve() -> None:
+    queue = AirQueue(line_rate(9600))
+    for robot in range(20):
+        queue.urge(robot, Halt, 0)
+    told = run(queue, 60 * SECOND)
+    # All are said once before any is said again, however much that is at once.
+    assert [out.packet.robot for out in told.outgoing[:20]] == list(range(20))
+    assert not any(out.echo for out in told.outgoing[:20])
+    assert Counter(out.packet.robot for out in told.outgoing) == dict.fromkeys(range(20), 3)
+    # And then at a tenth of the line, what went out at once paid back first.
+    reserve = line_rate(9600) / 10
+    assert told.written[-1] / SECOND >= (len(told.outgoing) * URGENT - urgent_burst(0)) / reserve
+
+
 def test_the_first_packet_ever_is_said_again_under_a_new_number() -> None:
     queue = AirQueue(line_rate(9600), first_number=255)
     queue.urge(1, Halt, 0)

@@ -155,7 +155,7 @@ def _floor_sky(boxes: Boxes, cell: float, shape: tuple[int, int]) -> Floats:
         cast = [corners - slope * height[:, None, None] for height in (boxes.low, boxes.high)]
         _shade_into(mask, np.concatenate(cast, axis=1), cell)
         total += mask
-    return total / SKY
+    return np.asarray(total / SKY, np.float32)
 
 
 # Faces
@@ -183,8 +183,8 @@ def _face_points(plan: Plan, boxes: Boxes, patches: NDArray[np.int32]) -> tuple[
     room = np.array([[0, 0], [plan.width, 0], [plan.width, plan.depth], [0, plan.depth]], np.float32)
     points, normals = [], []
     for face, (_, rows, columns) in enumerate(patches):
-        u, v = np.meshgrid(np.linspace(0.02, 0.98, columns), np.linspace(0.02, 0.98, rows))
-        u, v = u.ravel()[:, None].astype(np.float32), v.ravel().astype(np.float32)
+        across, along = np.meshgrid(np.linspace(0.02, 0.98, columns), np.linspace(0.02, 0.98, rows))
+        u, v = across.ravel()[:, None].astype(np.float32), along.ravel().astype(np.float32)
         box, side = divmod(face - 4, FACES)
         if face >= 4 and side == 4:
             a, b, _, d = corners[box]
@@ -288,9 +288,10 @@ def _face_sky(
         up = np.sqrt(max(1 - a * a - b * b, 0.0))
         way = (a * other + b * third + up * normals).astype(np.float32)
         # To the floor, or as far as no room is wide.
-        reach = np.where(way[:, 2] < -1e-3, -points[:, 2] / np.minimum(way[:, 2], -1e-3), 30).astype(np.float32)
+        fall = np.minimum(way[:, 2], -1e-3)
+        reach = np.where(way[:, 2] < -1e-3, -points[:, 2] / fall, 30).astype(np.float32)
         end_x, end_y = points[:, 0] + way[:, 0] * reach, points[:, 1] + way[:, 1] * reach
         down = (way[:, 2] < 0) & (end_x > 0) & (end_x < plan.width) & (end_y > 0) & (end_y < plan.depth)
         sky = np.where(down, plan.floor_shade * on_floor(end_x, end_y), ambient[:, None])
         total += np.where(hidden(points, way, reach, boxes), below, sky)
-    return total / FACE_SKY
+    return np.asarray(total / FACE_SKY, np.float32)

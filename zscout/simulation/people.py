@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from zscout.simulation.camera import Cylinder
+from zscout.simulation.casting import Cylinder
 from zscout.simulation.plan import Person
 
 STRIDE: Final = 0.7

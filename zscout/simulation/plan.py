@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -191,8 +192,13 @@ def check_plan(plan: Plan, top: Where) -> None:
     check_name(plan.name, top / "name")
     if not plan.lights:
         raise (top / "light").bad("there is none", "add a [[light]]: cameras see nothing without")
-    named = (("furniture", plan.furniture), ("light", plan.lights), ("person", plan.people))
-    for key, things in (*named, ("robot", plan.robots)):
+    named: tuple[tuple[str, Sequence[Furniture | Light | Person | Robot]], ...] = (
+        ("furniture", plan.furniture),
+        ("light", plan.lights),
+        ("person", plan.people),
+        ("robot", plan.robots),
+    )
+    for key, things in named:
         for number, thing in enumerate(things):
             check_name(thing.name, (top / key).item(number, thing.name) / "name")
         check_unique([thing.name for thing in things], top / key, "name")
@@ -203,7 +209,12 @@ def check_plan(plan: Plan, top: Where) -> None:
         _check_point(wall.end, plan, where / "end")
         if math.dist(wall.start, wall.end) < 0.05:
             raise where.bad("is shorter than 0.05 m", "move its end")
-    for key, flat in (("furniture", plan.furniture), ("rug", plan.rugs), ("robot", plan.robots)):
+    flat_things: tuple[tuple[str, Sequence[Furniture | Rug | Robot]], ...] = (
+        ("furniture", plan.furniture),
+        ("rug", plan.rugs),
+        ("robot", plan.robots),
+    )
+    for key, flat in flat_things:
         for number, placed in enumerate(flat):
             name = getattr(placed, "name", "")
             _check_point((placed.x, placed.y), plan, (top / key).item(number, name))

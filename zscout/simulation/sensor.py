@@ -30,7 +30,8 @@ _TABLE: Final[NDArray[np.uint8]] = np.round(
 
 def _vignette() -> Floats:
     y, x = np.mgrid[-1:1:120j, -1:1:160j]
-    return (1 - 0.18 * (0.64 * x * x + 0.36 * y * y)).astype(np.float32)
+    falls: Floats = (1 - 0.18 * (0.64 * x * x + 0.36 * y * y)).astype(np.float32)
+    return falls
 
 
 _VIGNETTE: Final = _vignette()
@@ -68,4 +69,5 @@ class Sensor:
             spread = np.sqrt((_READ * self.gain) ** 2 + _SHOT * self.gain * np.maximum(level, 0))
             level += self._noise * spread * self._rng.standard_normal(level.shape, np.float32)
         index = np.sqrt(np.clip(level, 0, 1)) * (_STEPS - 1)
-        return _TABLE[index.astype(np.intp)]
+        picture: Picture = _TABLE[index.astype(np.intp)]
+        return picture

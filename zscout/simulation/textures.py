@@ -23,11 +23,11 @@ def grain() -> Floats:
     for size, weight in ((256, 0.5), (64, 0.8), (16, 0.7)):
         noise = rng.standard_normal((size, size), np.float32)
         # Three copies side by side, so that the seams fit.
-        wide = np.tile(noise, (3, 3))
-        wide = cv2.resize(wide, (3 * GRAIN_SIZE, 3 * GRAIN_SIZE), interpolation=cv2.INTER_CUBIC)
+        wide = cv2.resize(np.tile(noise, (3, 3)), (3 * GRAIN_SIZE, 3 * GRAIN_SIZE), interpolation=cv2.INTER_CUBIC)
         total += weight * wide[GRAIN_SIZE : 2 * GRAIN_SIZE, GRAIN_SIZE : 2 * GRAIN_SIZE]
     total -= total.mean()
-    return np.clip(total * (0.13 / total.std()), -0.4, 0.4).astype(np.float32)
+    tiled: Floats = np.clip(total * (0.13 / total.std()), -0.4, 0.4).astype(np.float32)
+    return tiled
 
 
 def floor_albedo(plan: Plan, cell: float, shape: tuple[int, ...]) -> Floats:
@@ -55,4 +55,5 @@ def floor_albedo(plan: Plan, cell: float, shape: tuple[int, ...]) -> Floats:
         across, along = (x - rug.x) * cos + (y - rug.y) * sin, (y - rug.y) * cos - (x - rug.x) * sin
         on = (np.abs(across) < rug.width / 2) & (np.abs(along) < rug.depth / 2)
         albedo = np.where(on, rug.shade * (1 + 0.08 * rng.standard_normal(shape)), albedo)
-    return albedo.astype(np.float32)
+    shares: Floats = albedo.astype(np.float32)
+    return shares

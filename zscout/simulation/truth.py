@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zscout.simulation.bodies import RADIUS
-from zscout.simulation.camera import EYE, VIEW
+from zscout.simulation.casting import EYE, VIEW
 from zscout.simulation.collisions import Obstacles
 from zscout.simulation.light import Lit, hidden
 from zscout.simulation.plan import Plan
@@ -87,7 +87,8 @@ class Truth:
         _, parts = cv2.connectedComponents(self.standing.astype(np.uint8), connectivity=4)
         row = int(np.clip(y / self.cell, 0, parts.shape[0] - 1))
         column = int(np.clip(x / self.cell, 0, parts.shape[1] - 1))
-        return (parts == parts[row, column]) & self.standing
+        reached: NDArray[np.bool_] = (parts == parts[row, column]) & self.standing
+        return reached
 
     def random_open(self, rng: np.random.Generator) -> tuple[float, float]:
         """A place on open, lit floor."""

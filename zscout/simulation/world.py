@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 
 from zscout.simulation.bodies import RADIUS, WHEEL_BASE, Body, Pose
-from zscout.simulation.camera import Camera, Cylinder, Picture
+from zscout.simulation.camera import Camera, Picture
+from zscout.simulation.casting import Cylinder
 from zscout.simulation.collisions import SLACK, Obstacles
 from zscout.simulation.light import light_of
 from zscout.simulation.people import Walker
@@ -42,7 +43,7 @@ class World:
         """Of the floor with nothing above it, linear."""
         unknown = set(starts or {}) - {robot.name for robot in plan.robots}
         if unknown:
-            raise KeyError(f"the plan has no robot {sorted(unknown)[0]}")
+            raise KeyError(f"the plan has no robot {min(unknown)}")
         # Each part draws from a stream of its own, so that a look more or a robot less changes no other.
         streams = np.random.SeedSequence(seed).spawn(3)
         bodies = [np.random.default_rng(one) for one in streams[0].spawn(len(plan.robots))]
@@ -159,8 +160,9 @@ class World:
         shapes = self._moving(robot)
         if not any(shape.person for shape in shapes):
             return 0
-        surface = self._camera.geometry(*self.bodies[robot].pose, shapes).surface
-        first = self._camera.first_moving
+        caster = self._camera.caster
+        surface = caster.cast(*self.bodies[robot].pose, shapes).surface
+        first = caster.first_moving
         return int(
             sum(
                 np.count_nonzero(surface == first + number)

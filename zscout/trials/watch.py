@@ -1,15 +1,22 @@
-"""A hidden robot that watches, under virtual time: what it alerts to, and when it does so for nothing."""
+"""A hidden robot that watches, under virtual time: what it alerts to, and when it does so for nothing.
+
+`watch` is one such watch, `batch` many of them, in several buildings at several levels of noise.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
+import cv2
 import msgspec
 import numpy as np
 
 from zscout.simulation.air import Air
-from zscout.simulation.plan import Plan
+from zscout.simulation.drawn import drawn_plan
+from zscout.simulation.plan import Plan, load_plan, shipped_plans
 from zscout.simulation.world import World
 from zscout.vision.garble import garbled
 from zscout.vision.motion import MotionDetector
@@ -21,6 +28,13 @@ IN_TIME: Final = 1.0
 CLEAR: Final = 2.0
 """Seconds after the last pixel of a person during which a word about motion is no false alarm."""
 STEP: Final = 0.1
+DRAWN: Final = "drawn"
+"""The building of a case that is drawn at random, from the case's seed."""
+NOISES: Final = (0.5, 1.0, 2.0)
+"""Times the usual noise of camera and air."""
+FIRST_WALK: Final = 6.0
+NEXT_WALK: Final = 20.0
+"""Seconds until somebody comes, and from his leaving to his coming again; with the plan's own jitter."""
 
 
 @dataclass(slots=True)
@@ -33,10 +47,21 @@ class Watched:
     late: list[float] = field(default_factory=list)
     """Seconds by which the others were later; what was never alerted is not here."""
     false_alarms: int = 0
+    """Spells of alarm that began with nobody in view, or lasted until CLEAR after the last one was."""
     empty: float = 0.0
     """Seconds in which nobody was in view."""
     garbled: int = 0
     pictures: int = 0
+
+    def add(self, other: Watched) -> None:
+        """Makes it the sum of both."""
+        self.crossings += other.crossings
+        self.alerted += other.alerted
+        self.late += other.late
+        self.false_alarms += other.false_alarms
+        self.empty += other.empty
+        self.garbled += other.garbled
+        self.pictures += other.pictures
 
 
 def watch(plan: Plan, *, seed: int, noise: float, seconds: float, rate: float = 5.0) -> Watched:
@@ -47,7 +72,7 @@ def watch(plan: Plan, *, seed: int, noise: float, seconds: float, rate: float = 
     air, detector, out = Air(seed=seed), MotionDetector(), Watched()
     robot = hide_at_random(world, np.random.default_rng(seed))
     world.bodies[robot].transmit(1, -60.0)
-    due, since, told, moving_before, last_person = 1.0, None, False, False, -60.0
+    due, since, told, wrong, last_person = 1.0, None, False, False, -60.0
     while world.time < seconds:
         world.step(STEP)
         if world.time < due:
@@ -74,8 +99,8 @@ def watch(plan: Plan, *, seed: int, noise: float, seconds: float, rate: float = 
         if now - last_person > CLEAR:
             since = None
             out.empty += 1 / rate
-            out.false_alarms += moving and not moving_before
-        moving_before = moving
+            out.false_alarms += moving and not wrong
+            wrong = moving
     return out
 
 
@@ -93,3 +118,42 @@ def hide_at_random(world: World, rng: np.random.Generator) -> str:
             world.bodies[name].place(x, y, heading)
             return name
     raise ValueError(f"{world.plan.name} has no dark place that faces the light")
+
+
+class Case(NamedTuple):
+    """One watch of a batch."""
+
+    building: str
+    """The name of a shipped plan, or DRAWN."""
+    noise: float
+    seed: int
+
+
+def cases(buildings: Iterable[str], *, seeds: int, noises: Sequence[float] = NOISES) -> list[Case]:
+    """All of them, seed by seed, so that a batch that is cut short is still even."""
+    names = list(buildings)
+    return [Case(name, noise, seed) for seed in range(seeds) for name in names for noise in noises]
+
+
+def batch(
+    cases: Sequence[Case], *, seconds: float = 90.0, rate: float = 5.0, processes: int = 1
+) -> Iterator[tuple[Case, Watched]]:
+    """Watches each case for `seconds` of virtual time in `processes` processes, and gives them back as they are
+    done. People walk often: see FIRST_WALK."""
+    # Spawned: OpenCV's threads do not survive a fork.
+    with multiprocessing.get_context("spawn").Pool(processes, cv2.setNumThreads, (1,)) as pool:
+        jobs = [(case, seconds, rate) for case in cases]
+        yield from pool.imap_unordered(_watch_case, jobs)
+
+
+def plan_of(case: Case) -> Plan:
+    """Its building, with people who walk often. Raises KeyError for an unknown one."""
+    drawn = case.building == DRAWN
+    plan = drawn_plan(case.seed) if drawn else load_plan(shipped_plans()[case.building])
+    people = tuple(msgspec.structs.replace(one, first=FIRST_WALK, every=NEXT_WALK) for one in plan.people)
+    return msgspec.structs.replace(plan, people=people)
+
+
+def _watch_case(job: tuple[Case, float, float]) -> tuple[Case, Watched]:
+    case, seconds, rate = job
+    return case, watch(plan_of(case), seed=case.seed, noise=case.noise, seconds=seconds, rate=rate)

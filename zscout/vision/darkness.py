@@ -139,7 +139,10 @@ def _at_level(light: NDArray[np.float32], lit: float, level: float) -> list[Dark
         distance = RISE / under
         width = (last + 1 - first) / FOCAL * distance
         height = EYE * (1 + over / under)
-        if over >= _BELOW and distance < _CLOSE:
+        if over >= _BELOW - 1:
+            if distance >= _CLOSE:
+                # Dark to the top of the picture: a face.
+                continue
             height = min(height, HIGHEST)
         if width < NARROWEST or not LOWEST <= height <= HIGHEST:
             continue
