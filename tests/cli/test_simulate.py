@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
+import socket
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -207,15 +208,10 @@ def test_what_cannot_be_served_is_said_in_one_line(
     assert said.out == ""
 
 
-def test_a_port_in_use_is_said_so_with_exit_code_2(closet: Path) -> None:
-    with simulating(closet) as (_, told):
-        address = told["http"].removeprefix("http://").rstrip("/")
-        second = subprocess.run(
-            [*COMMAND, "simulate", closet, "--http", address],
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE,
-        )
-    assert second.returncode == 2
-    assert "(in use); choose another" in second.stderr
-    assert second.stderr.count("\n") == 1
+def test_a_port_in_use_is_said_so(closet: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        assert zscout_here("simulate", closet, "--http", address) == 2
+    said = capsys.readouterr().err
+    assert "(in use); choose another" in said
+    assert said.count("\n") == 1

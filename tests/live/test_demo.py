@@ -1,4 +1,4 @@
-"""`zscout demo` as people run it: Table 1 gives Table 2 on a live mesh, and nothing is left behind."""
+"""`zscout demo table1` as people run it: Table 1 gives Table 2 on a live mesh, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATIENCE = 60.0
 def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     (folder / "tmp").mkdir(exist_ok=True)
     return subprocess.Popen(
-        [sys.executable, "-m", "zscout.cli.main", "demo", *arguments],
+        [sys.executable, "-m", "zscout.cli.main", "demo", "table1", *arguments],
         cwd=folder,
         env=os.environ | {"TMPDIR": str(folder / "tmp")},
         stdout=subprocess.PIPE,

@@ -39,7 +39,7 @@ PLAN = Plan(
 
 def play(script: Callable[[Served], Coroutine[Any, Any, None]], plan: Plan = PLAN, **how: Any) -> None:
     async def run() -> None:
-        async with asyncio.timeout(2 * PATIENCE), Served(plan, **{"speed": 4.0, **how}) as served:
+        async with asyncio.timeout(2 * PATIENCE), Served(plan, **{"speed": 8.0, **how}) as served:
             await script(served)
 
     asyncio.run(run())
@@ -206,7 +206,7 @@ def test_who_is_where_and_what_the_building_looks_like() -> None:
         with Driver(served) as driver:
             await served.until(0.5)
             told = await served.poses()
-            assert (told.speed, [one.name for one in told.people]) == (4.0, ["anna"])
+            assert (told.speed, [one.name for one in told.people]) == (2.0, ["anna"])
             assert 0.2 < told.people[0].x < 2.2
             assert [(one.name, one.hidden, one.camera) for one in told.robots] == [
                 ("scout33", True, 0),
@@ -227,7 +227,7 @@ def test_who_is_where_and_what_the_building_looks_like() -> None:
         # Under the bed is darker than the middle of the floor; rows go down.
         assert picture[high // 4, wide // 4].mean() < picture[high // 2, wide * 3 // 4].mean()
 
-    play(script, plan)
+    play(script, plan, speed=2.0)
 
 
 def test_a_large_building_is_drawn_small_enough_for_the_mesh(monkeypatch: pytest.MonkeyPatch) -> None:

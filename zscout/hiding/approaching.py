@@ -111,7 +111,7 @@ class Enter(PhaseOf):
 
     def stuck(self, mind: Mind, view: View) -> Act:
         if still_outside(view):
-            mind.memory.note = "bumped at the edge of the dark"
+            mind.memory.note, mind.memory.at_edge = "bumped at the edge of the dark", True
             return mind.then("back", view)
         return mind.then("face", view)
 

@@ -44,20 +44,23 @@ class Dodge(PhaseOf):
             memory.goal = side_of(mind, view) * math.radians(40 + 20 * mind.roll())
             return mind.hop(memory.goal, "turns aside")
         if memory.hops == 1:
-            return mind.step_straight(0.18, "goes around")
+            return mind.step_straight(0.18 + 0.1 * memory.tries, "goes around")
         if target is not None and memory.tries < 3:
             memory.tries += 1
             memory.goal = math.atan2(target.y - memory.y, target.x - memory.x)
             memory.next_phase = "approach"
             memory.note = "turns back to the dark place"
             return mind.then("aim", view)
+        if target is not None:
+            # There is no way from here.
+            mind.bad_at(target.x, target.y)
         return mind.then("scan", view)
 
 
 def side_of(mind: Mind, view: View) -> int:
-    """1 left, -1 right: where a gap goes on in the picture, if it is clearly one side; else by turns."""
+    """1 left, -1 right: at the edge of the dark where it goes on, else by turns."""
     left, right = view.sides
-    if max(left, right) > 1.5 * min(left, right):
+    if mind.memory.at_edge and max(left, right) > 1.5 * min(left, right):
         return 1 if left < right else -1
     return 1 if mind.memory.bumps % 2 else -1
 

@@ -56,7 +56,7 @@ class Opening(msgspec.Struct, frozen=True):
 
 
 class Spot(msgspec.Struct, frozen=True):
-    """Where hiding failed, or the robot could not get."""
+    """A place to remember: metres."""
 
     x: float
     y: float
@@ -134,10 +134,15 @@ class Memory(msgspec.Struct):
     left_to_go: float = 0.0
     next_phase: Phase = "scan"
     bad: list[Spot] = msgspec.field(default_factory=list)
+    """Where hiding failed, or the robot could not get."""
     scans: int = 0
     bumps: int = 0
     blocked: list[float] = msgspec.field(default_factory=list)
     """Headings in which it bumped since the last scan."""
+    at_edge: bool = False
+    """The last bump was at the edge of a dark place."""
+    visited: list[Spot] = msgspec.field(default_factory=list)
+    """Where it has looked around."""
     tries: int = 0
     """Bumps on the way to this target."""
     faces: int = 0

@@ -68,7 +68,7 @@ class PhaseOf:
 
     def stuck(self, mind: Mind, view: View) -> Act:
         """It drove, and nothing moved."""
-        mind.memory.note = "bumped"
+        mind.memory.note, mind.memory.at_edge = "bumped", False
         return mind.then("back", view)
 
 
@@ -257,7 +257,10 @@ class Mind:
         memory = self.memory
         x = memory.x + ahead * math.cos(memory.heading)
         y = memory.y + ahead * math.sin(memory.heading)
-        memory.bad = [*memory.bad, Spot(x, y)][-MAX_BAD:]
+        self.bad_at(x, y)
+
+    def bad_at(self, x: float, y: float) -> None:
+        self.memory.bad = [*self.memory.bad, Spot(x, y)][-MAX_BAD:]
 
 
 def opening(memory: Memory, view: View) -> Opening:

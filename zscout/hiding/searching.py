@@ -7,7 +7,7 @@ from typing import Final
 
 from zscout.hiding.body import Act
 from zscout.hiding.facing import sheltered, to_light
-from zscout.hiding.memory import MAX_SIGHTINGS, Memory, Opening, Sighting, wrapped
+from zscout.hiding.memory import MAX_SIGHTINGS, Memory, Opening, Sighting, Spot, wrapped
 from zscout.hiding.mind import HOP, Mind, PhaseOf
 from zscout.vision.darkness import View
 
@@ -19,6 +19,7 @@ LEG: Final = 1.4
 """Metres to drive at most before the next scan."""
 FORGETS: Final = 6
 """Scans after which bad spots are forgotten: by then dead reckoning does not know where they are."""
+MAX_VISITED: Final = 24
 BAD_NEAR: Final = 0.45
 """Metres around a spot where hiding failed."""
 
@@ -31,6 +32,7 @@ class Scan(PhaseOf):
         memory.turned, memory.hops, memory.opened, memory.faces = 0.0, 0, 1.0, 0
         memory.sightings, memory.openings = [], []
         memory.scans += 1
+        memory.visited = [*memory.visited, Spot(memory.x, memory.y)][-MAX_VISITED:]
         if memory.scans % FORGETS == 0:
             memory.bad = []
         memory.tries, memory.target, memory.blocked = 0, None, []
@@ -132,7 +134,7 @@ class Roam(PhaseOf):
 def most_open(mind: Mind) -> Opening:
     """One of the scan's sides, none near one that was blocked, by a little luck."""
     memory = mind.memory
-    best, most = Opening(memory.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -1.0
+    best, most = Opening(memory.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -99.0
     for one in memory.openings:
         value = min(one.open_for, 2.5) + 0.6 * mind.roll()
         near = [abs(wrapped(one.heading - other)) < math.radians(50) for other in memory.blocked]
@@ -140,6 +142,8 @@ def most_open(mind: Mind) -> Opening:
             to = math.atan2(spot.y - memory.y, spot.x - memory.x)
             if abs(wrapped(to - one.heading)) < 0.6:
                 value -= 0.5
+        x, y = memory.x + 0.9 * math.cos(one.heading), memory.y + 0.9 * math.sin(one.heading)
+        value -= 0.7 * sum(math.hypot(x - spot.x, y - spot.y) < 0.7 for spot in memory.visited[:-1])
         if value > most and not any(near):
             best, most = one, value
     return best
