@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 import serial
 
 from zscout.packets import Drive, Packet, Stop, encode
-from zscout.simulation.radio_line import SLACK, Pace, RadioLine
+from zscout.simulation.radio_line import HOLDS, SLACK, Pace, RadioLine
 from zscout.strict import BadInput
 
 PATIENCE = 20.0
@@ -104,16 +105,27 @@ def test_a_faster_building_has_a_faster_line() -> None:
 
 
 def test_who_writes_more_than_a_line_holds_must_wait() -> None:
+    async def fill(line: RadioLine, port: serial.Serial) -> None:
+        part = encode(DRIVE) * 50
+        for _ in range(2 * HOLDS // len(part)):
+            await asyncio.to_thread(port.write, part)
+            # The line has looked at what waits since.
+            looked = line.carried + 2 * Pace(960).chunk
+            await until(partial(_carried, line, looked))
+
     async def run() -> None:
-        ear = Ear()
         with (
-            RadioLine(9600, ear) as line,
-            opened(line.port, 9600, write_timeout=0.3) as port,
+            RadioLine(9600, Ear()) as line,
+            opened(line.port, 9600, write_timeout=0.2) as port,
             pytest.raises(serial.SerialTimeoutException),
         ):
-            await asyncio.to_thread(port.write, encode(DRIVE) * 6_000)
+            await fill(line, port)
 
     asyncio.run(run())
+
+
+def _carried(line: RadioLine, least: int) -> bool:
+    return line.carried >= least
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 1.0])

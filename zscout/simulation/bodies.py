@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ WARM_UP: Final = 2.0
 """Seconds until the camera's transmitter gives a picture."""
 LAG: Final = 0.1
 """Time constant of the motors, s."""
+_DRIFTS: Final = 0.5
+"""Time constant of the noise in what the wheels do, s."""
 
 
 class Pose(NamedTuple):
@@ -52,10 +55,10 @@ class Body:
         """Of the wheel itself, m/s, after the motor's lag."""
         self.speed_right = 0.0
         self._until = 0.0
-        self._number: int | None = None
+        self._last: Packet | None = None
         self._slip = robot.slip
-        self._gain = 1 + robot.slip * rng.standard_normal(2).clip(-2, 2)
-        self._wander = np.zeros(2)
+        self._gains = [float(gain) for gain in 1 + robot.slip * rng.standard_normal(2).clip(-2, 2)]
+        self._wander = (0.0, 0.0)
         self._rng = rng
 
     @property
@@ -69,10 +72,11 @@ class Body:
 
     def hear(self, packet: Packet, now: float) -> None:
         """The firmware gets a packet at `now`, the world's time in seconds. One for another robot is passed
-        over, and so is one that repeats the last number: senders repeat what must arrive."""
-        if not self.alive or packet.robot != self.id or packet.number == self._number:
+        over, and so is one that is the last again: senders repeat what must arrive. The number alone does not
+        tell, for another sender may happen to have come to the same."""
+        if not self.alive or packet.robot != self.id or packet == self._last:
             return
-        self._number = packet.number
+        self._last = packet
         match packet:
             case Drive(left=left, right=right, lasts=lasts):
                 self.command(left, right, lasts, now)
@@ -107,18 +111,18 @@ class Body:
             self.camera = None
         if not self.alive or now >= self._until:
             self.left = self.right = 0.0
-        share = 1 - float(np.exp(-dt / LAG))
+        share = 1 - math.exp(-dt / LAG)
         self.speed_left += (self.left * TOP_SPEED - self.speed_left) * share
         self.speed_right += (self.right * TOP_SPEED - self.speed_right) * share
         if self.still:
             self.speed_left = self.speed_right = 0.0
             return 0.0, 0.0
-        # The floor's own say, drifting over about half a second.
-        self._wander += -self._wander * (dt / 0.5) + self._slip * np.sqrt(2 * dt / 0.5) * (
-            self._rng.standard_normal(2)
-        )
-        left, right = self._gain * (1 + self._wander)
-        return self.speed_left * float(left), self.speed_right * float(right)
+        # The floor's own say, which drifts.
+        kept, spread = 1 - dt / _DRIFTS, self._slip * math.sqrt(2 * dt / _DRIFTS)
+        noise = self._rng.standard_normal
+        self._wander = (self._wander[0] * kept + spread * noise(), self._wander[1] * kept + spread * noise())
+        left, right = (gain * (1 + drift) for gain, drift in zip(self._gains, self._wander, strict=True))
+        return self.speed_left * left, self.speed_right * right
 
     @property
     def still(self) -> bool:

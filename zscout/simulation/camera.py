@@ -89,25 +89,14 @@ class Camera:
         depths = seen.depth[HORIZON:]
         at_x = x + depths * seen.ways[0]
         at_y = y + depths * seen.ways[1]
-        light = cv2.remap(
-            self._floor_now,
-            at_x / cell - 0.5,
-            at_y / cell - 0.5,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        light = _between(self._floor_now, at_x / cell - 0.5, at_y / cell - 0.5)
         below = np.arange(_FAR_ROWS)[:, None] + (np.arange(_SUBROWS) + 0.5) / _SUBROWS
         part = (EYE * FOCAL / below).astype(np.float32).reshape(-1, 1)
-        far = cv2.remap(
-            self._floor_now,
-            (x + part * seen.ways[0]) / cell - 0.5,
-            (y + part * seen.ways[1]) / cell - 0.5,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        far_x, far_y = x + part * seen.ways[0], y + part * seen.ways[1]
+        far = _between(self._floor_now, far_x / cell - 0.5, far_y / cell - 0.5)
         light[:_FAR_ROWS] = far.reshape(_FAR_ROWS, _SUBROWS, WIDTH).mean(1)
         # 4 mm to a cell of grain, and the finer the farther: it fades where a pixel covers more.
-        fine = cv2.remap(self._grain, at_x * 250, at_y * 250, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        fine = _between(self._grain, at_x * 250, at_y * 250, tiled=True)
         light *= 1 + fine * _GRAIN_FADE
         for body in moving:
             if body.low > 0.1:
@@ -131,15 +120,9 @@ class Camera:
         count = len(self._boxes)
         standing = np.flatnonzero((number >= FIRST_BOX) & (number < FIRST_BOX + count))
         self._box_maps(x, y, seen, standing, number, column, depth, height, map_x, map_y, run)
-        light = cv2.remap(
-            self._atlas_now, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        ).ravel()
-        texture = cv2.remap(
-            self._grain, run * 40, height * 40, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
-        ).ravel()
-        broad = cv2.remap(
-            self._grain, run * 5, height * 3, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
-        ).ravel()
+        light = _between(self._atlas_now, map_x, map_y).ravel()
+        texture = _between(self._grain, run * 40, height * 40, tiled=True).ravel()
+        broad = _between(self._grain, run * 5, height * 3, tiled=True).ravel()
         light *= 1 + 0.35 * texture + 0.6 * broad
         skirting = (number < FIRST_BOX) & (height < 0.07)
         light[skirting] *= 0.7
@@ -221,14 +204,20 @@ class Camera:
         depth: Floats,
         light: Floats,
     ) -> None:
-        """A cylinder is brightest on one and the same side: where the light comes from matters little for what
-        moves, but that it looks round does."""
+        """A cylinder is brightest on one and the same side: where the light comes from matters little for
+        what moves, but that it looks round does."""
         table = np.array([(b.x, b.y, b.radius, b.shade * b.light) for b in moving], np.float32)[which[bodies]]
         at = column[bodies]
         dx = x + depth[bodies] * seen.ways[0][at] - table[:, 0]
         dy = y + depth[bodies] * seen.ways[1][at] - table[:, 1]
         round_ = (dx * 0.6 + dy * 0.8) / table[:, 2]
         light[bodies] = table[:, 3] * (0.65 + 0.35 * np.clip(round_, -1, 1))
+
+
+def _between(image: Floats, x: Floats, y: Floats, *, tiled: bool = False) -> Floats:
+    """`image` at those columns and rows, between its cells; beyond its edge again, or the edge itself."""
+    border = cv2.BORDER_WRAP if tiled else cv2.BORDER_REPLICATE
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border), np.float32)
 
 
 def _add_windows(plan: Plan, lit: Lit, atlas: Floats) -> None:

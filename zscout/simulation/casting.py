@@ -7,6 +7,7 @@ thing can cover at all. Depths are along the optical axis, which is level; the h
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -20,9 +21,9 @@ WIDTH: Final = 160
 HEIGHT: Final = 120
 EYE: Final = 0.04
 """Height of the camera, m."""
-VIEW: Final = np.deg2rad(65)
+VIEW: Final = math.radians(65)
 """Horizontal field of view, radians."""
-FOCAL: Final = float(WIDTH / 2 / np.tan(VIEW / 2))
+FOCAL: Final = WIDTH / 2 / math.tan(VIEW / 2)
 """Pixels."""
 HORIZON: Final = HEIGHT // 2
 NEAR: Final = 0.01
@@ -36,6 +37,8 @@ SLOPE: Final[Floats] = ((HORIZON - 0.5 - np.arange(HEIGHT)) / FOCAL).astype(np.f
 _STEEPEST: Final = float(SLOPE[0])
 FLOOR_DEPTH: Final[Floats] = (-EYE / SLOPE[HORIZON:]).astype(np.float32)
 """Depth of the floor by row below the horizon, m."""
+ALL: Final = slice(0, WIDTH)
+"""All columns of a picture."""
 
 
 class Cylinder(NamedTuple):
@@ -51,18 +54,35 @@ class Cylinder(NamedTuple):
     person: bool
 
 
+def columns_of(x: float, y: float, heading: float, body: Cylinder) -> slice | None:
+    """The columns of a picture taken from (x, y) along `heading` that the cylinder may cover; None if it is
+    out of view."""
+    away_x, away_y = body.x - x, body.y - y
+    away = math.hypot(away_x, away_y)
+    if away <= body.radius:
+        return ALL
+    middle = math.remainder(math.atan2(away_y, away_x) - heading, math.tau)
+    spread = math.asin(body.radius / away)
+    left, right = min(middle + spread, VIEW / 2), max(middle - spread, -VIEW / 2)
+    if left < right:
+        return None
+    # Column c looks along the tangent (WIDTH / 2 - 0.5 - c) / FOCAL; one more at each side for rounding.
+    first, last = (WIDTH / 2 - 0.5 - FOCAL * math.tan(angle) for angle in (left, right))
+    return slice(max(0, math.floor(first) - 1), min(WIDTH, math.ceil(last) + 2))
+
+
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Which surface each pixel shows, and how deep."""
+    """Which surface each pixel shows, and how deep, for 120 rows and the columns that were cast."""
 
     surface: NDArray[np.int16]
-    """Shape (120, 160)."""
+    """Shape (120, columns)."""
     depth: Floats
-    """Metres along the optical axis, shape (120, 160)."""
+    """Metres along the optical axis, shape (120, columns)."""
     ways: Floats
-    """Plan direction of each column per metre of depth, shape (2, 160)."""
+    """Plan direction of each column per metre of depth, shape (2, columns)."""
     entry: Floats
-    """Depth at which each column meets the sides of each box and cylinder, shape (n, 160)."""
+    """Depth at which each column meets the sides of each box and cylinder, shape (n, columns)."""
     side: NDArray[np.int8]
     """Which side of a box that is, as `Lit.patches` has it."""
     along: Floats
@@ -78,11 +98,14 @@ class Caster:
         self.first_moving = FIRST_BOX + len(boxes)
         """Number of the surface of the first thing that moves."""
 
-    def cast(self, x: float, y: float, heading: float, moving: list[Cylinder]) -> Geometry:
-        """What is seen from (x, y) along `heading`, with what moves beside the plan's own boxes."""
+    def cast(
+        self, x: float, y: float, heading: float, moving: list[Cylinder], columns: slice = ALL
+    ) -> Geometry:
+        """What is seen from (x, y) along `heading`, with what moves beside the plan's own boxes; `columns`
+        limits it, and all shapes of the answer, to a part of the picture."""
         forward = np.array([np.cos(heading), np.sin(heading)], np.float32)
         left = np.array([-forward[1], forward[0]], np.float32)
-        ways = forward[:, None] + left[:, None] * LATERAL
+        ways = forward[:, None] + left[:, None] * LATERAL[columns]
         wall, wall_depth = self._walls(x, y, ways)
         entry, leave, side, along = self._meet(x, y, ways)
         boxes = self._boxes
@@ -100,8 +123,8 @@ class Caster:
         stop = np.minimum(np.where(tall & (entry < leave), entry, np.inf).min(0, initial=np.inf), wall_depth)
         seen = (entry < leave) & (entry <= stop)
         ceiling = (self._plan.height - EYE) / SLOPE[:HORIZON]
-        depth = np.concatenate((ceiling, FLOOR_DEPTH))[:, None] * np.ones((1, WIDTH), np.float32)
-        surface = np.zeros((HEIGHT, WIDTH), np.int16)
+        depth = np.concatenate((ceiling, FLOOR_DEPTH))[:, None] * np.ones_like(wall_depth)
+        surface = np.zeros(depth.shape, np.int16)
         surface[:HORIZON] = 1
         behind = wall_depth < depth
         np.copyto(depth, wall_depth, where=behind)
@@ -120,7 +143,7 @@ class Caster:
             to = np.stack((-y / ways[1], east, (plan.depth - y) / ways[1], west))
         to[to <= 0] = np.inf
         nearest = to.argmin(0)
-        return nearest, to[nearest, np.arange(WIDTH)].astype(np.float32)
+        return nearest, to[nearest, np.arange(len(nearest))].astype(np.float32)
 
     def _meet(self, x: float, y: float, ways: Floats) -> tuple[Floats, Floats, NDArray[np.int8], Floats]:
         boxes = self._boxes

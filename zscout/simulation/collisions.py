@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,25 +49,23 @@ class Obstacles:
 
     def push_out(
         self, x: float, y: float, radius: float, others: list[tuple[float, float, float]]
-    ) -> tuple[float, float, bool]:
-        """The nearest place for a circle that overlaps nothing, found by pushing it out of one thing after
-        the other, and whether it touched any. `others` are circles (x, y, radius). In a corner too narrow the
-        place may still overlap: ask `gap`."""
-        touched = False
+    ) -> tuple[float, float]:
+        """A place nearby for a circle that overlaps nothing, found by pushing it out of one thing after the
+        other. `others` are circles (x, y, radius). In a corner too narrow the place may still overlap: ask
+        `gap`."""
         for _ in range(_ROUNDS):
             before = (x, y)
             x, y = self._into_room(x, y, radius)
             x, y = self._out_of_boxes(x, y, radius)
             for other_x, other_y, other_radius in others:
                 away_x, away_y = x - other_x, y - other_y
-                apart, least = float(np.hypot(away_x, away_y)), radius + other_radius
+                apart, least = math.hypot(away_x, away_y), radius + other_radius
                 if apart < least:
                     scale = least / apart if apart > 1e-6 else 1.0
                     x, y = other_x + away_x * scale, other_y + away_y * scale
             if (x, y) == before:
                 break
-            touched = True
-        return x, y, touched
+        return x, y
 
     def _into_room(self, x: float, y: float, radius: float) -> tuple[float, float]:
         return min(max(x, radius), self.width - radius), min(max(y, radius), self.depth - radius)

@@ -42,14 +42,14 @@ class Lit:
     """Light by kind of source: index 0 lamps, 1 windows. All linear; 0.5 is usual."""
 
     cell: float
-    """Metres of a floor cell; cell [row, column] has its middle at ((column + 0.5) cell, (row + 0.5) cell)."""
+    """Metres of a floor cell; [row, column] has its middle at ((column + 0.5) cell, (row + 0.5) cell)."""
     floor: Floats
     """Light on the floor, shape (2, rows, columns)."""
     atlas: Floats
     """Light on faces, shape (2, rows, ATLAS_WIDTH): the patches of all faces, one below the other."""
     patches: NDArray[np.int32]
-    """Per face: first row, rows, columns of its patch; shape (faces, 3). 0 to 3: the outer walls y=0, x=width,
-    y=depth, x=0; then five for each box: its sides -y, +x, +y, -x in its own axes, and its underside."""
+    """Per face: first row, rows, columns of its patch; shape (faces, 3). 0 to 3: the outer walls y=0,
+    x=width, y=depth, x=0; then five for each box: its sides -y, +x, +y, -x in its own axes, its underside."""
     ambient: NDArray[np.float32]
     """Light from the sky of walls and ceiling, shape (2,)."""
 

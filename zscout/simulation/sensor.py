@@ -23,9 +23,8 @@ _SHOT: Final = 0.00016
 """Variance per linear light and gain: photons come by chance."""
 _STEPS: Final = 4096
 # The first steps of linear light make many grey levels: the table is indexed by the square root.
-_TABLE: Final[NDArray[np.uint8]] = np.round(
-    255 * (np.arange(_STEPS) / (_STEPS - 1)) ** (2 / GAMMA)
-).astype(np.uint8)
+_SHARES: Final = np.arange(_STEPS) / (_STEPS - 1)
+_TABLE: Final[NDArray[np.uint8]] = np.round(255 * _SHARES ** (2 / GAMMA)).astype(np.uint8)
 
 
 def _vignette() -> Floats:
@@ -69,5 +68,4 @@ class Sensor:
             spread = np.sqrt((_READ * self.gain) ** 2 + _SHOT * self.gain * np.maximum(level, 0))
             level += self._noise * spread * self._rng.standard_normal(level.shape, np.float32)
         index = np.sqrt(np.clip(level, 0, 1)) * (_STEPS - 1)
-        picture: Picture = _TABLE[index.astype(np.intp)]
-        return picture
+        return np.asarray(_TABLE[index.astype(np.intp)], np.uint8)

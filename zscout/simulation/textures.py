@@ -23,7 +23,7 @@ def grain() -> Floats:
     for size, weight in ((256, 0.5), (64, 0.8), (16, 0.7)):
         noise = rng.standard_normal((size, size), np.float32)
         # Three copies side by side, so that the seams fit.
-        wide = cv2.resize(np.tile(noise, (3, 3)), (3 * GRAIN_SIZE, 3 * GRAIN_SIZE), interpolation=cv2.INTER_CUBIC)
+        wide = cv2.resize(np.tile(noise, (3, 3)), (3 * GRAIN_SIZE,) * 2, interpolation=cv2.INTER_CUBIC)
         total += weight * wide[GRAIN_SIZE : 2 * GRAIN_SIZE, GRAIN_SIZE : 2 * GRAIN_SIZE]
     total -= total.mean()
     tiled: Floats = np.clip(total * (0.13 / total.std()), -0.4, 0.4).astype(np.float32)

@@ -56,8 +56,8 @@ class Truth:
         v = min(max(y / self.cell - 0.5, 0), rows - 1.001)
         a, b = int(u), int(v)
         u, v = u - a, v - b
-        four = self.light[b : b + 2, a : a + 2]
-        return float((four[0, 0] * (1 - u) + four[0, 1] * u) * (1 - v) + (four[1, 0] * (1 - u) + four[1, 1] * u) * v)
+        low, high = self.light[b : b + 2, a : a + 2] @ np.array([1 - u, u])
+        return float(low * (1 - v) + high * v)
 
     def faces_light(self, x: float, y: float, heading: float) -> bool:
         """Whether a camera there looks at the lit part: in 40 % of the columns of its field of view or more,

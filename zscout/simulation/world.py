@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Final
 
@@ -9,14 +10,14 @@ import numpy as np
 
 from zscout.simulation.bodies import RADIUS, WHEEL_BASE, Body, Pose
 from zscout.simulation.camera import Camera, Picture
-from zscout.simulation.casting import Cylinder
+from zscout.simulation.casting import Cylinder, columns_of
 from zscout.simulation.collisions import SLACK, Obstacles
 from zscout.simulation.light import light_of
 from zscout.simulation.people import Walker
 from zscout.simulation.plan import ROBOT_HEIGHT, Plan
 from zscout.simulation.sensor import Sensor
 from zscout.simulation.solids import boxes_of
-from zscout.simulation.truth import Truth
+from zscout.simulation.truth import DARK, Truth
 
 MAX_STEP: Final = 0.1
 """Seconds."""
@@ -30,7 +31,7 @@ class World:
     """A plan in motion. The same plan, seed, starts and calls give the same world, bit for bit."""
 
     def __init__(self, plan: Plan, *, seed: int = 0, starts: Mapping[str, Pose] | None = None) -> None:
-        """`starts` overrides where the named robots begin. Raises KeyError for a robot that the plan lacks."""
+        """`starts` overrides where the named robots begin. Raises KeyError for one that the plan lacks."""
         self.plan = plan
         self.time = 0.0
         """Seconds since the beginning."""
@@ -56,6 +57,9 @@ class World:
             start = (starts or {}).get(robot.name, Pose(robot.x, robot.y, robot.heading))
             self.bodies[robot.name] = Body(robot, start, rng)
             self._sensors[robot.name] = Sensor(plan.noise.sensor, sensor_rng)
+        self._room = dict.fromkeys(self.bodies, (0.0, 0.0, 0.0))
+        """Where a robot was when it was last measured, and how far from there it is from touching furniture
+        or a wall: most steps are shorter and need no measuring."""
         self.walkers = [Walker(person, rng) for person, rng in zip(plan.people, walkers, strict=False)]
         self._phase = float(walkers[-1].uniform(0, 2 * np.pi))
 
@@ -68,8 +72,8 @@ class World:
             self._move(dt / parts)
 
     def picture(self, robot: str) -> Picture:
-        """What a robot's camera gives now, before the air: uint8 (120, 160). Its exposure follows the pictures
-        that are taken, so a look is part of what must be repeated for the same world."""
+        """What a robot's camera gives now, before the air: uint8 (120, 160). Its exposure follows the
+        pictures that are taken, so a look is part of what must be repeated for the same world."""
         body = self.bodies[robot]
         sensor = self._sensors[robot]
         noise = self.plan.noise
@@ -97,27 +101,36 @@ class World:
         turn = (right - left) / WHEEL_BASE * dt
         forward = (left + right) / 2 * dt
         middle = body.heading + turn / 2
-        wanted = body.x + forward * np.cos(middle), body.y + forward * np.sin(middle)
-        others = [(one.x, one.y, RADIUS) for one in self.bodies.values() if one is not body]
-        x, y, touched = self.obstacles.push_out(float(wanted[0]), float(wanted[1]), RADIUS, others + feet)
-        body.heading = float((body.heading + turn + np.pi) % (2 * np.pi) - np.pi)
-        body.bumped = touched
-        if touched:
+        x, y = body.x + forward * math.cos(middle), body.y + forward * math.sin(middle)
+        others = [(one.x, one.y, RADIUS) for one in self.bodies.values() if one is not body] + feet
+        body.heading = math.remainder(body.heading + turn, math.tau)
+        body.bumped = not self._is_free(body, x, y, others)
+        if body.bumped:
+            x, y = self.obstacles.push_out(x, y, RADIUS, others)
             # Rubbing along costs way; the wheels turn on in place.
-            moved = np.hypot(x - body.x, y - body.y)
-            if moved > 1e-9 and not feet:
+            if not feet:
                 x, y = body.x + (x - body.x) * _GRIP, body.y + (y - body.y) * _GRIP
             if not self._fits(body, x, y):
                 return
-        body.travelled += float(np.hypot(x - body.x, y - body.y))
-        body.x, body.y = float(x), float(y)
+        body.travelled += math.hypot(x - body.x, y - body.y)
+        body.x, body.y = x, y
+
+    def _is_free(self, body: Body, x: float, y: float, others: list[tuple[float, float, float]]) -> bool:
+        """Whether a robot there touches nothing; `others` are circles (x, y, radius)."""
+        at_x, at_y, room = self._room[body.name]
+        if math.hypot(x - at_x, y - at_y) >= room:
+            room = self.obstacles.gap(x, y) - RADIUS
+            self._room[body.name] = (x, y, room)
+        return room > 0 and all(
+            math.hypot(x - other_x, y - other_y) >= RADIUS + radius for other_x, other_y, radius in others
+        )
 
     def _fits(self, body: Body, x: float, y: float) -> bool:
         if self.obstacles.gap(x, y) < RADIUS - SLACK:
             return False
         return all(
-            np.hypot(x - one.x, y - one.y) >= 2 * RADIUS - SLACK
-            or np.hypot(x - one.x, y - one.y) >= np.hypot(body.x - one.x, body.y - one.y)
+            (apart := math.hypot(x - one.x, y - one.y)) >= 2 * RADIUS - SLACK
+            or apart >= math.hypot(body.x - one.x, body.y - one.y)
             for one in self.bodies.values()
             if one is not body
         )
@@ -129,7 +142,9 @@ class World:
         shapes: list[Cylinder] = []
         for walker in self.walkers:
             if walker.here:
-                shapes += walker.shapes(self.floor_light(walker.x, walker.y))
+                # In a doorway there is no floor to be lit, and yet nobody is black there.
+                light = max(self.floor_light(walker.x, walker.y), self.median_light * DARK)
+                shapes += walker.shapes(light)
         for body in self.bodies.values():
             if body.name != robot:
                 light = self.floor_light(body.x, body.y)
@@ -147,9 +162,9 @@ class World:
         return self.truth.floor_light(x, y)
 
     def is_dark(self, robot: str) -> bool:
-        """Whether the robot stands in a truly dark place: light below a quarter of the open floor's median."""
+        """Whether the robot is in a truly dark place: light below a quarter of the open floor's median."""
         body = self.bodies[robot]
-        return self.floor_light(body.x, body.y) < self.median_light / 4
+        return self.floor_light(body.x, body.y) < self.median_light * DARK
 
     def faces_light(self, robot: str) -> bool:
         """Whether its camera looks at the lit part of the room; the rule is `Truth.faces_light`'s."""
@@ -157,19 +172,19 @@ class World:
 
     def people_in_view(self, robot: str) -> int:
         """Pixels of the robot's picture that show somebody walking, unhidden."""
-        shapes = self._moving(robot)
-        if not any(shape.person for shape in shapes):
+        if not any(walker.here for walker in self.walkers):
             return 0
+        pose, shapes = self.bodies[robot].pose, self._moving(robot)
+        parts = [columns_of(*pose, shape) for shape in shapes if shape.person]
+        within = [part for part in parts if part is not None]
+        if not within:
+            return 0
+        columns = slice(min(part.start for part in within), max(part.stop for part in within))
         caster = self._camera.caster
-        surface = caster.cast(*self.bodies[robot].pose, shapes).surface
-        first = caster.first_moving
-        return int(
-            sum(
-                np.count_nonzero(surface == first + number)
-                for number, shape in enumerate(shapes)
-                if shape.person
-            )
-        )
+        surface = caster.cast(*pose, shapes, columns).surface
+        people = np.array([shape.person for shape in shapes])
+        moving = surface[surface >= caster.first_moving] - caster.first_moving
+        return int(np.count_nonzero(people[moving]))
 
     def crossing(self, robot: str, least: int = 60) -> bool:
         """Whether people who walk cover `least` pixels or more of the robot's picture now."""
