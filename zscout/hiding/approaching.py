@@ -19,6 +19,9 @@ DEEP: Final = 0.30
 """Metres to go beyond the edge of the dark."""
 OUTSIDE: Final = 3.0
 """How many times brighter than the median of the picture the floor ahead is, outside."""
+DARK_AHEAD: Final = 0.3
+"""Share of the lit floor's light, below which a place that was lost must lie ahead."""
+TO_MIDDLE: Final = 0.15
 LOST: Final = 1.6
 """Seconds without sight of the place."""
 
@@ -39,8 +42,12 @@ class Approach(PhaseOf):
         place = match(view, expected, rough)
         if place is None:
             unseen = memory.clock - memory.seen_target
-            if rough < 0.3 or target.distance < 0.45:
-                # So near that the place fills the picture, or its edge is below it.
+            if (
+                rough < 0.3
+                or target.distance < 0.45
+                or (target.distance < 1 and view.ahead < DARK_AHEAD * view.lit)
+            ):
+                # So near that the place fills the picture, or its edge is below it, or in its own half-light.
                 return mind.then("enter", view)
             if unseen > LOST:
                 memory.note = "lost sight of the dark place"
@@ -92,7 +99,9 @@ def aim_at(place: DarkPlace, expected: float) -> float:
     right = place.width / 2 - (margin if place.right < COLUMNS - 2 else 0.05)
     most = place.bearing + math.atan2(left, place.distance)
     least = place.bearing - math.atan2(right, place.distance)
-    return max(least, min(most, expected))
+    kept = max(least, min(most, expected))
+    # A little towards the middle each time, or a wheel that slips more leads to the end in the end.
+    return kept + TO_MIDDLE * (place.bearing - kept)
 
 
 class Enter(PhaseOf):
@@ -101,12 +110,12 @@ class Enter(PhaseOf):
     def begin(self, mind: Mind) -> None:
         memory = mind.memory
         ahead = memory.target.distance if memory.target is not None else AT_EDGE
-        memory.left_to_go, memory.faces = min(ahead, 0.4) + DEEP, 0
+        memory.left_to_go, memory.faces = min(ahead, 0.8) + DEEP, 0
 
     def step(self, mind: Mind, view: View) -> Act:
         gone = mind.pace * mind.here_for
         if gone >= mind.memory.left_to_go:
-            return mind.then("back" if still_outside(view) else "face", view)
+            return self.stuck(mind, view)
         return mind.cruise(mind.pace, 0.0, "drives in")
 
     def stuck(self, mind: Mind, view: View) -> Act:

@@ -52,6 +52,8 @@ class View(NamedTuple):
     """The floor just ahead of the robot, 8 to 10 cm."""
     middling: float
     """The median of the whole picture."""
+    ahead: float
+    """Straight ahead at the horizon, and what stands there up to a hand's width above."""
     sides: tuple[float, float]
     """The left and the right half of the band around the horizon."""
     places: tuple[DarkPlace, ...]
@@ -93,6 +95,7 @@ def look(picture: Picture) -> View:
         lit=lit,
         near=near,
         middling=_middle(light[::3, ::3]),
+        ahead=_middle(band[:, 60:100]),
         sides=sides,
         places=_places(light, lit),
         contrast=contrast,

@@ -10,6 +10,8 @@ Canny's hysteresis), with what a real camera needs beside it:
 - Each picture is first brought to the background's brightness: gain and offset by least squares over blocks,
   from which those that do not fit are left out. So flicker, exposure and slow light changes move nothing.
 - A pixel counts by how many standard deviations of its own noise it is off, never by grey levels: no tuning.
+- What the background has two pixels further on is no motion (Elgammal et al., "Non-parametric model for
+  background subtraction", 2000): leaves that sway, a camera that shakes.
 - A change of most of the picture at once is a switched light or a moved camera: it is learned at once.
 - Something moves once it was seen in two of three pictures, in about the same place.
 
@@ -43,8 +45,16 @@ WEAK: Final = 3.2
 """That go on with one."""
 FLOOR: Final = 1.3
 """Grey levels that the noise of a smoothed picture has at least: quantisation and compression."""
+TOL=0
+SWAY: Final = 5
+"""Pixels: brightness that the background has within a square of this side is background that sways."""
 SMALLEST: Final = 0.0012
 """Share of the picture that a region has at least."""
+BAND: Final = 5.0
+THIN: Final = 0.07
+"""A region BAND times as wide as it is high, and no higher than this share of the picture, is torn lines."""
+ASIDE: Final = 32
+"""Columns by which torn lines are sought aside."""
 UPHEAVAL: Final = 0.55
 """Share of the picture that changes where it is not something in it that moves."""
 SURE: Final = 2
@@ -103,11 +113,7 @@ class MotionDetector:
         if self._pictures < WARM_PICTURES or time - self._begun < WARM:
             self._learn(away, None, 1.0 / self._pictures, 1.0)
             return Seen(False, learning=True)
-        spread = np.sqrt(np.maximum(self._variance, self._noise**2))
-        score = np.abs(cv2.GaussianBlur(away, (3, 3), 0)) / spread
-        # Smoothing leaves about 0.4 of independent noise; what is left of it is judged by its own measure.
-        score /= max(1e-3, float(np.median(score)) / 0.674) if np.median(score) > 0.3 else 0.45
-        mask = self._regions(score)
+        mask = self._regions(self._score(level, self._mean), level, self._mean)
         share = float(np.count_nonzero(mask)) / mask.size
         if share > UPHEAVAL:
             return self._begin(time, grey)
@@ -123,6 +129,18 @@ class MotionDetector:
         self._sightings.clear()
         return Seen(False, learning=True)
 
+    def _score(self, level: _Plane, mean: _Plane) -> _Plane:
+        """By how many standard deviations of its noise each pixel is off, smoothed; 0 where it is not."""
+        spread = np.sqrt(np.maximum(self._variance, self._noise**2))
+        score = np.abs(cv2.GaussianBlur(level - mean, (3, 3), 0)) / spread
+        # Smoothing leaves about 0.4 of independent noise; what is left of it is judged by its own measure.
+        middle = float(np.median(score))
+        score /= middle / 0.674 if middle > 0.3 else 0.45
+        near, soft = np.ones((int(SWAY), int(SWAY)), np.uint8), cv2.GaussianBlur(level, (3, 3), 0)
+        slack = np.float32(TOL) * spread
+        sways = (soft <= cv2.dilate(mean, near) + slack) & (soft >= cv2.erode(mean, near) - slack)
+        return np.where(sways, np.float32(0), score).astype(np.float32)
+
     def _learn(self, away: _Plane, mask: NDArray[np.uint8] | None, still: float, moved: float) -> None:
         """Follows the picture, by `still` and where something moves by `moved` (shares, 0 to 1)."""
         if self._mean is None:
@@ -137,27 +155,28 @@ class MotionDetector:
         noise = float(np.median(np.abs(away))) / 0.674
         self._noise += min(1.0, still) * (max(FLOOR, noise) - self._noise)
 
-    def _regions(self, score: _Plane) -> NDArray[np.uint8]:
+    def _regions(self, score: _Plane, level: _Plane, mean: _Plane) -> NDArray[np.uint8]:
         """Where the score is above WEAK, connected, and somewhere in it above STRONG: 255, elsewhere 0."""
         weak = (score > WEAK).astype(np.uint8)
         # A line that is torn, or a single hot pixel, is thinner than anything that moves.
-        weak = cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8))
-        weak = cv2.morphologyEx(weak, cv2.MORPH_CLOSE, np.ones((7, 5), np.uint8))
+        thick = cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8))
+        weak = np.asarray(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, np.ones((7, 5), np.uint8)), np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
         strong = np.bincount(labels.ravel(), weights=(score > STRONG).ravel(), minlength=count)
         area = stats[:, cv2.CC_STAT_AREA]
         keep = (area >= SMALLEST * score.size) & (strong >= 0.15 * area)
-        # A band across the whole picture is a fault of the transmission.
-        keep &= ~((stats[:, cv2.CC_STAT_WIDTH] > 0.9 * score.shape[1]) & (stats[:, cv2.CC_STAT_HEIGHT] < 8))
+        # A thin band along the lines is a fault of the transmission.
+        for region in np.flatnonzero(keep & (stats[:, cv2.CC_STAT_HEIGHT] <= THIN * score.shape[0])):
+            top, high = stats[region, cv2.CC_STAT_TOP], stats[region, cv2.CC_STAT_HEIGHT]
+            wide = stats[region, cv2.CC_STAT_WIDTH] > BAND * high
+            keep[region] = not (wide or _torn(level[top : top + high], mean[top : top + high]))
         keep[0] = False
         return np.where(keep[labels], np.uint8(255), np.uint8(0))
 
     def _sure(self, time: float, mask: NDArray[np.uint8]) -> bool:
         """Whether what is seen was seen lately, near there."""
-        near = cv2.dilate(mask, np.ones((15, 25), np.uint8))
-        agree = sum(
-            1 for at, earlier in self._sightings if time - at <= MEMORY and bool(np.any(earlier & near))
-        )
+        near = np.asarray(cv2.dilate(mask, np.ones((15, 25), np.uint8)), np.uint8)
+        agree = sum(time - at <= MEMORY and bool(np.any(earlier & near)) for at, earlier in self._sightings)
         self._sightings.append((time, mask))
         return bool(np.any(mask)) and 1 + agree >= SURE
 
@@ -202,6 +221,15 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
         off = np.abs(now - gain * was - offset)
         fits = (now > 4) & (now < 250) & (off <= max(1.5, 2.5 * float(np.median(off[fits]))))
     return ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
+
+
+def _torn(lines: _Plane, mean: _Plane) -> bool:
+    """Whether some lines of a picture look like the background's, but stand aside."""
+    aside = [((lines - mean) ** 2).mean(axis=1)]
+    for by in range(2, min(ASIDE, lines.shape[1] // 2)):
+        aside.append(((lines[:, by:] - mean[:, :-by]) ** 2).mean(axis=1))
+        aside.append(((lines[:, :-by] - mean[:, by:]) ** 2).mean(axis=1))
+    return bool(np.min(aside, axis=0).sum() < 0.5 * aside[0].sum())
 
 
 def _boxes(mask: NDArray[np.uint8], across: float, down: float, width: int, height: int) -> tuple[Box, ...]:
