@@ -117,8 +117,8 @@ class Teleop:
             self._be("driving", "")
             # The wheels go first: whoever takes over in a hurry does not wait for the camera.
             await self._steer(robot)
-            await robot.camera(True)
             while True:
+                await robot.camera(True)
                 with suppress(TimeoutError):
                     async with asyncio.timeout(PERIOD):
                         await self._wake.wait()

@@ -73,12 +73,12 @@ class RcName(click.ParamType[str]):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         text = str(value)
         rc = text if "/" in text else f"{self._kind}/{text}"
+        if rc.partition("/")[0] != self._kind or (is_pattern(rc) and not self._pattern):
+            raise BadInput(f"{quoted(text)} is no {self._kind}; name one, as in {self._kind}/NAME")
         try:
             check_need(rc)
         except BadName as error:
             raise BadInput(str(error)) from None
-        if rc.partition("/")[0] != self._kind or (is_pattern(rc) and not self._pattern):
-            raise BadInput(f"{quoted(text)} is no {self._kind}; name one, as in {self._kind}/NAME")
         return rc
 
     def shell_complete(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -56,7 +57,7 @@ HELP: Final = "arrows or wasd drive · space stops · + - speed · g gives back 
     "--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="A game pad's left stick as well."
 )
 @click.option("--no-picture", is_flag=True, help="Drive without looking.")
-@click.option("--no-view", is_flag=True, help="Open no viewer; its address is printed.")
+@click.option("--no-view", is_flag=True, help="Open no viewer; the picture's address is printed.")
 @click.option(
     "--record",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -67,9 +68,10 @@ HELP: Final = "arrows or wasd drive · space stops · + - speed · g gives back 
 def drive(robot: str, as_json: bool, **options: Any) -> int:
     """Take ROBOT with radio, video channel and framegrabber, and drive it.
 
-    Asks at the fleet's operator priority: who holds them is preempted, and goes on when
-    you give back: with g or q, or when this terminal dies. The robot stops whenever
-    you let go of the keys. The picture is shown in the Rerun viewer.
+    Asks at the fleet's operator priority, without a question: who holds them is preempted,
+    and goes on when you give back: with g or q, or when this terminal dies. The robot
+    stops whenever you let go of the keys. The picture is shown in the Rerun viewer; its
+    address is printed, for a host without a display.
 
     Keys: arrows or w a s d drive, space stops, + and - change the speed, g gives the
     robot back and the next key that drives takes it again, q ends. On a pad the left
@@ -83,7 +85,25 @@ def drive(robot: str, as_json: bool, **options: Any) -> int:
     """
     if not sys.stdin.isatty():
         raise BadInput("zscout drive reads keys: run it at a terminal, its standard input is none")
+    _check_file(options["record"])
     return common.run(_drive(robot, as_json=as_json, **options))
+
+
+def _check_file(path: Path | None) -> None:
+    """Nobody is preempted for a recording that can't be written. Raises BadInput."""
+    if path is None:
+        return
+    if path.suffix != ".rrd":
+        raise BadInput(f"--record {path}: viewers know a recording by its name; let it end in .rrd")
+    there = path.exists()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()
+    except OSError as error:
+        why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise BadInput(f"--record {path}: can't be written ({why}); give another file") from None
+    if not there:
+        path.unlink()
 
 
 async def _drive(
@@ -124,12 +144,16 @@ async def _drive(
         stack.enter_context(hands.at_the_terminal())
         if pad is not None:
             stack.enter_context(hands.at_the_pad(pad))
-        tasks = [asyncio.create_task(teleop.run()), asyncio.create_task(console.keep_drawing(teleop))]
-        if not no_picture:
-            stream = await _stream(stack, robot, record, console, view=not no_view)
-            tasks.append(asyncio.create_task(show_pictures(client, teleop, stream, console)))
         if not stand_by:
             teleop.take()
+
+        async def look() -> None:
+            stream = await _stream(stack, robot, record, console, view=not no_view)
+            await show_pictures(client, teleop, stream, console)
+
+        tasks = [asyncio.create_task(teleop.run()), asyncio.create_task(console.keep_drawing(teleop))]
+        if not no_picture:
+            tasks.append(asyncio.create_task(look()))
         ending = asyncio.create_task(end.wait())
         try:
             done, _ = await asyncio.wait([ending, *tasks], return_when=asyncio.FIRST_COMPLETED)
@@ -149,11 +173,16 @@ async def _stream(
     """The picture's stream, and a window onto it where there is a display."""
     from zscout.cli.children import child, viewer_binary
     from zscout.cli.view import free_port
+
+    # Rerun takes seconds to load on a busy machine, and the operator may be in a hurry.
+    await asyncio.to_thread(importlib.import_module, "zscout.services.picture_stream")
     from zscout.services.picture_stream import PictureStream
 
     stream = stack.enter_context(PictureStream(robot, free_port("127.0.0.1", 0), record))
-    console.event("picture", f"picture at {stream.url}", url=stream.url)
-    if view and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    window = view and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    words = f"picture at {stream.url}" if window else f"see the picture with: rerun {stream.url}"
+    console.event("picture", words, url=stream.url)
+    if window:
         command = [str(viewer_binary()), "--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen"]
         await stack.enter_async_context(
             child("the viewer", [*command, "--connect", stream.url], {"RUST_LOG": "error"})
@@ -258,14 +287,17 @@ class _Console:
 
     def __exit__(self, *exc: object) -> None:
         if self._live is not None:
-            self._live.stop()
+            # A terminal that is gone need not be tidied.
+            with suppress(OSError):
+                self._live.stop()
             self._live = None
 
     def event(self, event: str, words: str, **more: Any) -> None:
         if self._as_json:
             common.print_json({"event": event, "robot": self._robot, **more})
         elif self._live is not None:
-            self._live.console.print(common.clean(words), soft_wrap=True)
+            with suppress(OSError):
+                self._live.console.print(common.clean(words), soft_wrap=True)
         else:
             common.print_line(common.clean(words))
 
@@ -275,7 +307,7 @@ class _Console:
         if now == self._told:
             return
         before, self._told = self._told, now
-        if teleop.takeover is not None:
+        if teleop.state == "driving" and teleop.takeover is not None:
             self.event(
                 "driving",
                 f"{self._robot} obeys, {1000 * teleop.takeover:.0f} ms after you took it",
@@ -286,7 +318,7 @@ class _Console:
                 "taken", f"{self._robot} is yours: {', '.join(teleop.held.rcs if teleop.held else [])}"
             )
         elif teleop.state == "waiting":
-            self.event("waiting", f"{self._robot}: {teleop.why}", why=teleop.why)
+            self.event("waiting", f"{self._robot} waits: {teleop.why}", why=teleop.why)
         elif before is not None:
             self.event("free", f"{self._robot} is given back")
 
@@ -318,4 +350,6 @@ class _Console:
             if teleop.robot.refused:
                 line.append(f", {teleop.robot.refused} refused", style="red")
         line.append(f"\n{HELP}", style="dim")
-        self._live.update(line, refresh=True)
+        # Where the terminal is gone, its keys' end says so and ends all.
+        with suppress(OSError):
+            self._live.update(line, refresh=True)

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from typing import Any, Final
 
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.net import Net
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot, Slots
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
-from zscout.behaviors.tree import Behavior, Scene
+from zscout.behaviors.tree import Behavior, Saying, Scene
 from zscout.behaviors.voice import Voice
 from zscout.components.component import Component, Stage
 from zscout.components.shipped import check_known, figure
-from zscout.keyexpr import BadName, check_need, check_rc
+from zscout.keyexpr import BadName, check_name, check_need, check_rc
 from zscout.messages import ComponentSpec
 
 MAX_ROBOTS: Final = 64
 MAX_SPEED: Final = 100.0
 MAX_RATE: Final = 50.0
 MAX_SLOT: Final = 3_600.0
+MAX_PATH: Final = 100
 _NEEDS: Final = ("radio", "video", "framegrabber")
 _SHARED: Final[tuple[str, ...]] = (
     *_NEEDS,
@@ -34,16 +36,23 @@ _SHARED: Final[tuple[str, ...]] = (
 
 
 class TreeComponent(Component):
-    """A component that plays a tree of behaviors, `root`, and keeps its memories."""
+    """A component that plays a tree of behaviors, `root`, and keeps its memories. What a behavior says goes
+    out on the mesh; each new word of it and each alert is printed, for `zscout logs`."""
 
     root: Behavior
     speed: float
 
     async def run(self, stage: Stage) -> None:
         voice = Voice(stage.client)
+        diary = Diary()
+
+        def say(saying: Saying) -> None:
+            voice(saying)
+            diary(saying)
+
         telling = asyncio.create_task(voice.keep_telling())
         try:
-            await self.root.play(Scene(stage.client, stage.safe_point, voice, speed=self.speed))
+            await self.root.play(Scene(stage.client, stage.safe_point, say, speed=self.speed))
         finally:
             telling.cancel()
             voice.close()
@@ -53,6 +62,24 @@ class TreeComponent(Component):
 
     def restore(self, state: bytes) -> None:
         self.root.restore(json.loads(state))
+
+
+class Diary:
+    """Prints what behaviors say, without what changes with every picture of a robot."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[str, str]] = {}
+
+    def __call__(self, saying: Saying) -> None:
+        # "dark place 1.3 m ahead" is no news after "dark place 1.4 m ahead".
+        detail = re.sub(r"[0-9.]+", "", saying.detail) if saying.robot else saying.detail
+        news = saying.doing, detail
+        if news == self._last.get(saying.path, ("", "")) and not saying.alert:
+            return
+        self._last[saying.path] = news
+        if saying.doing:
+            words = "ALERT" if saying.alert else saying.doing
+            print(f"{saying.path} {words}" + (f": {saying.detail}" if saying.detail else ""))  # noqa: T201
 
 
 class PlaceRobotComponent(TreeComponent):
@@ -66,12 +93,14 @@ class PlaceRobotComponent(TreeComponent):
 
     def __init__(self, params: dict[str, Any]) -> None:
         check_known(params, "robot", "above", *_SHARED)
-        robot = _rc(params, "robot")
+        robot = _robot(params)
         self.speed = figure(params, "speed", 1.0, low=0.01, high=MAX_SPEED)
         self.root = PlaceRobot(robot.partition("/")[2], _needs(params, robot), _slots(params))
         above = params.get("above", "")
-        if not isinstance(above, str) or len(above) > 100:
-            raise ValueError(f"above is {above!r:.60}; write the path of a behavior")
+        if not isinstance(above, str) or len(above) > MAX_PATH:
+            raise ValueError(
+                f"above is {above!r:.60}; write the path of a behavior, {MAX_PATH} letters at most"
+            )
         self.root.above = above
 
 
@@ -79,24 +108,20 @@ class PlaceSensorNetComponent(TreeComponent):
     """Has robots hide and watch, each by a component `place_robot` of its own.
 
     Parameters: `robots`, a list of them; `wanted`, how many are to be placed (all), the others stand in for
-    those that are lost; and those of `place_robot`."""
+    those that are lost; `name`, of its behavior and before the names of its components (place_sensor_net): a
+    second net needs another one; and those of `place_robot`, but for `robot` and `above`."""
 
     def __init__(self, params: dict[str, Any]) -> None:
         check_known(params, "robots", "wanted", "name", *_SHARED)
-        robots = params.get("robots")
-        if not isinstance(robots, list) or not 1 <= len(robots) <= MAX_ROBOTS:
-            raise ValueError(f"robots is {robots!r:.60}; write a list of 1 to {MAX_ROBOTS}, as robot/scout33")
-        for robot in robots:
-            _rc({"robots": robot}, "robots")
-        wanted = params.get("wanted")
-        if wanted is not None and (isinstance(wanted, bool) or not isinstance(wanted, int)):
-            raise ValueError(f"wanted is {wanted!r:.60}; write a whole number")
+        robots = _robots(params)
+        wanted = _whole(params, "wanted", len(robots), low=1, high=len(robots))
         self.speed = figure(params, "speed", 1.0, low=0.01, high=MAX_SPEED)
         # Wrong ones are told here and now, not by each robot's component.
         _needs(params, robots[0])
         _slots(params)
         self._shared: dict[str, Any] = {name: params[name] for name in _SHARED if name in params}
-        name = str(params.get("name", "place_sensor_net"))
+        name = params.get("name", "place_sensor_net")
+        check_name(name if isinstance(name, str) else repr(name), "name")
         self.root = PlaceSensorNet(name, Net(robots, wanted), self._spec_for)
 
     def _spec_for(self, robot: str, path: str) -> ComponentSpec:
@@ -117,24 +142,54 @@ def _needs(params: dict[str, Any], robot: str) -> RobotNeeds:
 
 def _slots(params: dict[str, Any]) -> Slots:
     return Slots(
-        hide_priority=int(figure(params, "hide_priority", 2, low=-1000, high=1000)),
-        watch_priority=int(figure(params, "watch_priority", 1, low=-1000, high=1000)),
+        hide_priority=_whole(params, "hide_priority", 2, low=-1000, high=1000),
+        watch_priority=_whole(params, "watch_priority", 1, low=-1000, high=1000),
         hide=figure(params, "hide_slot", 30.0, low=1.0, high=MAX_SLOT),
         watch=figure(params, "watch_slot", 20.0, low=1.0, high=MAX_SLOT),
     )
 
 
+def _whole(params: dict[str, Any], name: str, default: int, *, low: int, high: int) -> int:
+    value = params.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise ValueError(f"{name} is {value!r:.60}; write a whole number from {low} to {high}")
+    return value
+
+
+def _robots(params: dict[str, Any]) -> list[str]:
+    robots = params.get("robots")
+    if not isinstance(robots, list) or not 1 <= len(robots) <= MAX_ROBOTS:
+        found = f"is {robots!r:.60}" if "robots" in params else "is missing"
+        raise ValueError(f'robots {found}; write a list of 1 to {MAX_ROBOTS}, as in ["robot/scout33"]')
+    for number, robot in enumerate(robots):
+        _check_robot(robot, f"robots[{number}]")
+        if robot in robots[:number]:
+            raise ValueError(f"robots: {robot} is named twice; name each robot once")
+    return robots
+
+
+def _robot(params: dict[str, Any]) -> str:
+    if "robot" not in params:
+        raise ValueError("robot is missing; write one, as in robot/scout33")
+    robot = params["robot"]
+    _check_robot(robot, "robot")
+    return str(robot)
+
+
+def _check_robot(robot: Any, what: str) -> None:
+    if not isinstance(robot, str) or not robot.startswith("robot/"):
+        raise ValueError(f"{what} is {robot!r:.60}; write a robot, as in robot/scout33")
+    try:
+        check_rc(robot)
+    except BadName as error:
+        raise ValueError(f"{what}: {error}") from None
+
+
 def _need(params: dict[str, Any], kind: str) -> str:
     need = params.get(kind, f"{kind}/*")
+    if not isinstance(need, str) or not need.startswith(f"{kind}/"):
+        raise ValueError(f"{kind} is {need!r:.60}; write {kind}/NAME or a pattern, as in {kind}/*")
     try:
-        return check_need(need if isinstance(need, str) else repr(need))
+        return check_need(need)
     except BadName as error:
         raise ValueError(f"{kind}: {error}") from None
-
-
-def _rc(params: dict[str, Any], name: str) -> str:
-    rc = params.get(name)
-    try:
-        return check_rc(rc if isinstance(rc, str) else repr(rc))
-    except BadName as error:
-        raise ValueError(f"{name}: {error}") from None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,12 @@ from zscout.simulation.serve import Served
 
 P = TypeVar("P", bound=Packet)
 
+RULES = """
+[placement]
+start_timeout = 20
+[timing]
+hold_lease = 2.0
+"""
 ROLLS = 0.01
 """Metres a second from which on a wheel turns."""
 CLOSET = Plan(
@@ -74,7 +80,8 @@ class Building(Served):
         for number in range(steps):
             super()._step(1, [] if number else packets)
             for name, body in self.world.bodies.items():
-                turns = bool(body.left or body.right) or max(abs(body.speed_left), abs(body.speed_right)) > ROLLS
+                rolls = max(abs(body.speed_left), abs(body.speed_right)) > ROLLS
+                turns = rolls or bool(body.left or body.right)
                 if turns != self.turns(name):
                     self.turned.append(Turned(self.world.time, name, turns))
 
@@ -86,28 +93,17 @@ class Building(Served):
         """What was heard of one kind, from number `since` of all on."""
         number = self.world.bodies[robot].id
         return [
-            one
-            for one in self.heard[since:]
-            if isinstance(one.packet, kind) and one.packet.robot == number
+            one for one in self.heard[since:] if isinstance(one.packet, kind) and one.packet.robot == number
         ]
 
     async def drives(self, robot: str, *, since: int = 0, **fields: float) -> Heard:
         """Waits for a drive packet, heard from number `since` on, with these fields; returns it."""
 
-        def found() -> Heard | None:
-            return next(
-                (
-                    one
-                    for one in self.packets(Drive, robot, since=since)
-                    if all(abs(getattr(one.packet, name) - value) < 0.01 for name, value in fields.items())
-                ),
-                None,
-            )
+        def found() -> list[Heard]:
+            return like(self.packets(Drive, robot, since=since), **fields)
 
-        await comes_true(lambda: found() is not None, f"{robot} to drive with {fields}")
-        heard = found()
-        assert heard is not None
-        return heard
+        await comes_true(lambda: bool(found()), f"{robot} to drive with {fields}")
+        return found()[0]
 
     async def halts(self, robot: str, *, since: int) -> None:
         await comes_true(lambda: bool(self.packets(Halt, robot, since=since)), f"{robot} to be halted")
@@ -118,11 +114,23 @@ class Building(Served):
         return next(one.time for one in reversed(self.turned) if one.robot == robot)
 
 
+def like(heard: Iterable[Heard], **fields: float) -> list[Heard]:
+    """The drive packets with these fields, as far as a packet carries them."""
+    return [
+        one
+        for one in heard
+        if isinstance(one.packet, Drive)
+        and all(abs(getattr(one.packet, name) - value) < 0.01 for name, value in fields.items())
+    ]
+
+
 class RobotLab(Lab):
     """A lab with a building of its own in the test's process. Give it a plan, and `Served`'s arguments."""
 
-    def __init__(self, folder: Path, plan: Plan = CLOSET, *, candidates: Sequence[str] = (), **how: Any) -> None:
-        super().__init__(folder, candidates=candidates, extra="[placement]\nstart_timeout = 20\n")
+    def __init__(
+        self, folder: Path, plan: Plan = CLOSET, *, candidates: Sequence[str] = (), **how: Any
+    ) -> None:
+        super().__init__(folder, candidates=candidates, extra=RULES)
         self.env["PYTHONPATH"] = str(ROOT)
         self.building = Building(plan, radio_link=folder / "radio0", **how)
         self._stack = AsyncExitStack()
@@ -134,13 +142,13 @@ class RobotLab(Lab):
         chosen = [table for table in tables if table.partition('name = "')[2].partition("/")[0] in kinds]
         self.node(host, extra=extra + "\n" + "".join(f"[[rc]]{table}" for table in chosen))
 
-    def scene(self, client: Client, heard: Callable[[Saying], None]) -> Scene:
-        """What a behavior in the test's own loop runs on."""
+    def scene(self, client: Client, heard: Callable[[Saying], None], *, speed: float | None = None) -> Scene:
+        """What a behavior in the test's own loop runs on. `speed` is the building's unless told otherwise."""
 
         async def safe_point() -> None:
             pass
 
-        return Scene(client, safe_point, heard, speed=self.building.speed)
+        return Scene(client, safe_point, heard, speed=speed or self.building.speed)
 
     async def __aenter__(self) -> Self:
         await self._stack.enter_async_context(self.building)
@@ -158,7 +166,7 @@ async def comes_true(condition: Callable[[], bool], what: str, *, within: float 
     """Waits for it, however busy the machine is."""
     try:
         async with asyncio.timeout(within):
-            while not condition():
+            while not condition():  # noqa: ASYNC110 - what changes lies in other threads and processes
                 await asyncio.sleep(0.005)
     except TimeoutError:
         raise AssertionError(f"waited in vain for {what}") from None

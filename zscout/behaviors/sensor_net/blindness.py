@@ -3,7 +3,8 @@
 A robot whose transmitter was switched on shows a picture within seconds. If none comes for `patience`, the
 channel may be jammed, its receiver dead, or the robot. So another channel is tried where there is one: a
 robot that is not seen on `SUSPECTS` in a row is dead, and one that is, had a bad channel, which is left alone
-for a while.
+for a while. A channel without any picture, not even snow, has no receiver that works: its framegrabber gives
+up, the hold ends before `patience` is over, and the robot is not to blame.
 """
 
 from __future__ import annotations
@@ -15,6 +16,13 @@ SUSPECTS: Final = 2
 """Holds in a row without a picture that prove a robot dead."""
 BAD_FOR: Final = 60.0
 """Seconds for which a channel that showed nothing is avoided."""
+SILENT: Final = 4.0
+"""Seconds without any picture at the end of a hold that prove a receiver dead: framegrabbers give up after
+five."""
+
+REMIND: Final = 4.0
+"""Seconds without a good picture, above any warm-up, after which a robot may not have heard that it is to
+transmit."""
 
 
 class Blindness:
@@ -27,13 +35,21 @@ class Blindness:
         self._bad: dict[str, float] = {}
         """Channels on which this robot was not seen, and when."""
         self._in_row = 0
+        self._reminded = 0.0
+        self._channel = ""
+        self._silent_since: float | None = None
 
     def begin(self, now: float) -> None:
         """A hold has begun: the transmitter is being switched on."""
         self._dark_since = now
+        self._channel, self._silent_since = "", now
 
-    def see(self, now: float, good: bool, channel: str) -> bool:
-        """Takes what a look showed. True: no picture for too long on this channel."""
+    def see(self, now: float, good: bool, channel: str, *, came: bool | None = None) -> bool:
+        """Takes what a look showed; `came`: any picture, if not a good one. True: no good picture for too
+        long on this channel."""
+        self._channel = channel
+        if good or came:
+            self._silent_since = now
         if good:
             self._dark_since = None
             self._in_row = 0
@@ -46,6 +62,22 @@ class Blindness:
         self._bad[channel] = now
         self._in_row += 1
         self._dark_since = None
+        return True
+
+    def remind(self, now: float) -> bool:
+        """Whether the robot is to be told once more to transmit: its radio goes one way."""
+        since = self._dark_since
+        if since is None or now - max(since, min(self._reminded, now)) < REMIND:
+            return False
+        self._reminded = now
+        return True
+
+    def end(self, now: float) -> bool:
+        """The hold is over. True: its channel gave nothing at all, and is to be left."""
+        since, self._silent_since = self._silent_since, None
+        if since is None or not self._channel or now - since < SILENT:
+            return False
+        self._bad[self._channel] = now
         return True
 
     @property

@@ -49,11 +49,16 @@ class HeldRobot:
         self._next: Ns = 0
         self._still = False
         """Whether the last that was sent is a stop."""
+        self._transmits: bool | None = None
+        """As it was last told; None: it was told nothing yet, or may not have heard."""
         self.sent = self.refused = 0
 
-    async def camera(self, on: bool) -> None:
-        """Switches its transmitter on, to the channel that is held, or off."""
-        await self._command({"name": "camera", "on": on})
+    async def camera(self, on: bool, *, remind: bool = False) -> bool:
+        """Switches its transmitter on, to the channel that is held, or off. It is told once, unless `remind`:
+        call this again until it is True."""
+        if on != self._transmits or remind:
+            self._transmits = on if await self._command({"name": "camera", "on": on}) else None
+        return on == self._transmits
 
     async def drive(self, left: float, right: float, lasts: float) -> bool:
         """Turns the wheels (-1 to 1 of top speed) for `lasts` seconds at most, unless the next command comes

@@ -110,9 +110,15 @@ class PlaceRobot(Behavior):
             keep=True,
         ):
             async with attempt as held:
+                channel = held.rc(video or self.needs.video)
                 # Whoever waited for the hold may be about to be moved: nothing changes before that is over.
                 await scene.safe_point()
                 await self._play(scene, task, held, video)
+            if self.scout.silent and attempt.arc is not None and attempt.arc.open:
+                # It was taken away because the receiver is dead: the same needs would be given the same one.
+                await scene.client.end(attempt.arc)
+                self.scout.silent = False
+                raise Blind(f"{channel} shows nothing at all")
 
     async def _play(self, scene: Scene, task: RobotTask, held: Held, video: str | None) -> None:
         robot = HeldRobot(held, self.needs, video=video)
@@ -123,6 +129,7 @@ class PlaceRobot(Behavior):
                 await robot.camera(True)
                 while await self._look(scene, task, robot, await sight.look(LOOK / scene.speed)):
                     await scene.safe_point()
+                    await robot.camera(True, remind=self.scout.blindness.remind(self._now(scene)))
         finally:
             self.scout.released(self._now(scene))
             self._holding = False

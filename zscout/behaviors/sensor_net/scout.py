@@ -58,6 +58,8 @@ class Scout:
         self._task: Task = "hide"
         """Of the present hold."""
         self._held = False
+        self.silent = False
+        """Whether the last hold ended without any picture: its channel is to be left."""
 
     @property
     def task(self) -> Task:
@@ -77,13 +79,14 @@ class Scout:
     def released(self, now: float) -> None:
         """The hold is over, for whatever reason: the robot stands, and somebody else may move it."""
         self._held = False
+        self.silent = self.blindness.end(now)
         self.hider.interrupted(now)
         self.alerts.rest()
 
     def see(self, now: float, picture: Picture | None, channel: str) -> Step:
         """Takes the newest picture, or None if none came, from the robot on this video channel."""
         good = picture is not None and not garbled(picture)
-        blind = self.blindness.see(now, good, channel)
+        blind = self.blindness.see(now, good, channel, came=picture is not None)
         act = self.hider.see(now, picture)
         step = Step(
             act.left, act.right, act.lasts, act.doing, act.why, blind=blind, over=self.task != self._task

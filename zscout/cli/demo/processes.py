@@ -21,6 +21,8 @@ RECORDS: Final = "crucible"
 """The host whose node records."""
 RECORDINGS: Final = "recordings"
 """The folder of its recording, below the demo's."""
+BUILDING: Final = "building"
+"""The process that simulates one, where there is one."""
 GRACE: Final = 12.0
 """Seconds for the processes to end in order."""
 MAX_LINE: Final = 65_536
@@ -146,7 +148,8 @@ class Processes:
         self.failed.cancel()
 
     async def _end(self) -> None:
-        """The node that records goes first: that the others go is no part of the story."""
+        """The node that records goes first: that the others go is no part of the story. The building of their
+        devices, which does not end with its input, is told last."""
         for process in self._processes.values():
             if process.stdin is not None:
                 process.stdin.close()
@@ -157,6 +160,9 @@ class Processes:
                 process.terminate()
             if process is recording:
                 await process.wait()
+        building = self._processes.get(BUILDING)
+        if building is not None and building.returncode is None:
+            building.terminate()
         await asyncio.gather(*(process.wait() for process in self._processes.values()))
 
 

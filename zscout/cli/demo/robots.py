@@ -13,7 +13,9 @@ import click
 from zscout import clock
 from zscout.cli import common
 from zscout.cli.demo.recording import keep, look_at, recording, recording_option
+from zscout.cli.simulate import Building, named_plan
 from zscout.scheduling.model import SECOND
+from zscout.strict import BadInput
 
 if TYPE_CHECKING:
     from zscout.cli.demo.robots_run import RobotsDemo, Seen
@@ -21,7 +23,10 @@ if TYPE_CHECKING:
 FRAMES: Final = 4
 """Drawings a second at a terminal."""
 LINES: Final = 12
-"""Events shown below the table."""
+"""Events shown below the table at most."""
+ABOVE: Final = 7
+"""Lines of the picture that are neither robots nor events."""
+HARDWARE: Final = "2 framegrabbers, 1 radio, 3 nodes"
 STYLES: Final = {
     "search": "yellow",
     "approach": "bright_yellow",
@@ -38,7 +43,14 @@ STYLES: Final = {
 
 
 @click.command()
-@click.option("--building", default="living_room", show_default=True, help="As zscout simulate knows it.")
+@click.option(
+    "--building",
+    type=Building(),
+    metavar="BUILDING",
+    default="living_room",
+    show_default=True,
+    help="As in zscout simulate: a name, a TOML file, or random:SEED.",
+)
 @click.option(
     "--seed", type=click.IntRange(0), default=1, show_default=True, help="Of noise, slip and people."
 )
@@ -52,12 +64,15 @@ STYLES: Final = {
 @recording_option
 @common.json_option("Print the summary as one JSON object.")
 def robots(building: str, seed: int, speed: float, out: Path | None, as_json: bool) -> int:
-    """Hide four robots in the dark and have them watch, with two framegrabbers and one radio.
+    """Hide the robots of a building in the dark, and have them watch.
 
-    It serves a simulated building, starts three nodes with its devices on this machine, apart from every
-    other fleet, and has the component placer place a sensor net. In the middle an operator takes one robot,
-    drives it and gives it back. It ends some seconds after all robots are hidden, at the latest after two
-    and a half minutes, and leaves nothing but a recording. Exit code 1: not all robots came to be hidden.
+    There are four of them, two framegrabbers and one radio. It serves a simulated building, starts three
+    nodes with its devices on this machine, apart from every other fleet, and has the component placer place
+    a sensor net. In the middle an operator takes one robot, drives it and gives it back. It ends when all
+    robots are hidden and somebody has walked by, or a minute of the building later, at the latest after two
+    and a half minutes of ours. It leaves nothing but a recording; so does Ctrl-C.
+
+    Exit code: 0 all robots came to be hidden; 1 not all of them did.
 
     \b
     Examples:
@@ -68,6 +83,10 @@ def robots(building: str, seed: int, speed: float, out: Path | None, as_json: bo
 
 
 async def _demo(building: str, seed: int, speed: float, out: Path | None, *, as_json: bool) -> int:
+    # Known to be good before anything is started.
+    ids = {f"robot/{robot.name}": robot.id for robot in named_plan(building).robots}
+    if not ids:
+        raise BadInput(f"--building {building}: there is no robot in it; add a [[robot]]")
     # Zenoh is loaded here: the help needs none of it.
     from zscout.cli.demo.robots_run import RobotsDemo
 
@@ -81,12 +100,13 @@ async def _demo(building: str, seed: int, speed: float, out: Path | None, *, as_
 
     began = clock.now()
     if plain:
-        common.print_line(_title(building, speed) + "; starting")
+        common.print_line(f"{_title(building, speed, len(ids))}; {HARDWARE}; starting")
     with recording(out) as path, tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
-        demo = RobotsDemo(Path(folder), building, seed=seed, speed=speed, tell=tell)
+        demo = RobotsDemo(Path(folder), building, ids, seed=seed, speed=speed, tell=tell)
         try:
-            async with demo:
-                with _picture(demo, events, hidden=plain or as_json):
+            # The picture stays until all processes have ended: that takes some seconds.
+            with _picture(demo, events, hidden=plain or as_json):
+                async with demo:
                     await demo.run()
         except BaseException:
             if keep(Path(folder), path):
@@ -101,9 +121,13 @@ async def _demo(building: str, seed: int, speed: float, out: Path | None, *, as_
     return 0 if demo.seen.placed_at is not None else 1
 
 
-def _title(building: str, speed: float) -> str:
+def _title(building: str, speed: float, robots: int) -> str:
     pace = "in real time" if speed == 1 else f"{speed:g} times as fast as real time"
-    return f"Place Sensor Net, four robots in {building}, {pace}; 2 framegrabbers, 1 radio, 3 nodes"
+    return f"Place Sensor Net, {_many(robots, 'robot')} in {building}, {pace}"
+
+
+def _many(number: int, what: str) -> str:
+    return f"{number} {what}" + ("s" if number != 1 else "")
 
 
 def summary(seen: Seen) -> dict[str, Any]:
@@ -171,8 +195,12 @@ def _picture(demo: RobotsDemo, events: list[tuple[float, str]], *, hidden: bool)
     def draw() -> Group:
         seen = demo.seen
         elapsed = (clock.now() - demo.zero) / SECOND if demo.zero is not None else None
-        head = Text(_title(demo.building, demo.speed), style="bold")
-        clock_line = "starting" if elapsed is None else f"{elapsed:5.1f} s, building {seen.simulated:5.0f} s"
+        console = common.console()
+        title = _title(demo.building, demo.speed, len(demo.robots))
+        head = Text(title, style="bold", overflow="ellipsis", no_wrap=True)
+        # A picture that is higher than the terminal can't be drawn over.
+        shown = max(1, min(LINES, console.height - ABOVE - len(seen.robots)))
+        at = "starting" if elapsed is None else f"{elapsed:5.1f} s, building {seen.simulated:5.0f} s"
         table = Table(box=None, padding=(0, 2, 0, 0))
         for column in ("robot", "does", "truly dark"):
             table.add_column(column, header_style="bold")
@@ -180,13 +208,13 @@ def _picture(demo: RobotsDemo, events: list[tuple[float, str]], *, hidden: bool)
             doing = "operator" if robot == demo.driven else seen.doing.get(robot, "")
             style = "bold magenta" if doing == "operator" else STYLES.get(doing, "")
             table.add_row(robot, Text(doing, style=style), "yes" if robot in seen.truly else "")
-        counts = f"{len(seen.hidden)} hidden, {len(seen.watching)} watching, {seen.alerts} alerts, "
-        counts += f"{seen.preemptions} preemptions"
+        counts = f"{len(seen.hidden)} hidden, {len(seen.watching)} watching, "
+        counts += f"{_many(seen.alerts, 'alert')}, {_many(seen.preemptions, 'preemption')}"
         latest = [
             Text(f"{at:6.1f} s  {common.clean(text)}", overflow="ellipsis", no_wrap=True)
-            for at, text in events[-LINES:]
+            for at, text in events[-shown:]
         ]
-        return Group(head, Text(clock_line), Text(""), table, Text(counts), Text(""), *latest)
+        return Group(head, Text(f"{HARDWARE}; {at}"), Text(""), table, Text(counts), Text(""), *latest)
 
     with Live(get_renderable=draw, console=common.console(), refresh_per_second=FRAMES, transient=True):
         yield

@@ -7,7 +7,7 @@ the building is a simulated one, where its robots truly stand.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,10 +17,10 @@ from typing import Final, Self
 from zscout import clock
 from zscout.behaviors import placing
 from zscout.behaviors.client import Client
-from zscout.behaviors.piloting import Pilot
+from zscout.behaviors.piloting import Pilot, Way
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.teleop import Teleop
-from zscout.cli.demo.processes import HOSTS, Processes, free_ports
+from zscout.cli.demo.processes import BUILDING, HOSTS, Processes, free_ports
 from zscout.config import load_fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declared
@@ -34,16 +34,22 @@ BAUD: Final = 1_200
 FRAMEGRABBERS: Final = 2
 START: Final = 40.0
 """Seconds within which everything must be there."""
-TAKEOVER: Final = 25.0
-"""Seconds from the beginning of the net to the operator's takeover."""
-DRIVES: Final = 6.0
-"""Seconds that the operator drives."""
-GUARDS: Final = (10.0, 40.0)
-"""Seconds that the net is watched once all are hidden: at least, and at most if nobody walks by."""
+TAKEOVER: Final = 37.5
+"""Seconds of the building from the beginning of the net to the operator's takeover."""
+DRIVES: Final = 9.0
+"""Seconds of the building that the operator drives."""
+GUARDS: Final = (15.0, 60.0)
+"""Seconds of the building that the net is watched once all are hidden: at least, and at most if nobody
+walks by."""
 WORST: Final = 150.0
-"""Seconds after which the demo ends, placed or not."""
-PATROL: Final = (("forward", 1.5), ("left", 1.0), ("forward", 1.5), ("right", 1.0))
-"""What the operator does, in seconds."""
+"""Seconds of ours after which the demo ends, placed or not."""
+PATROL: Final[tuple[tuple[Way, float], ...]] = (
+    ("forward", 2.25),
+    ("left", 1.5),
+    ("forward", 2.25),
+    ("right", 1.5),
+)
+"""What the operator does, in seconds of the building."""
 
 
 @dataclass(slots=True)
@@ -82,9 +88,18 @@ class RobotsDemo:
     `tell(at, text)` gets each event in words, `at` in seconds since the net began."""
 
     def __init__(
-        self, folder: Path, building: str, *, seed: int, speed: float, tell: Callable[[float, str], None]
+        self,
+        folder: Path,
+        building: str,
+        ids: Mapping[str, int],
+        *,
+        seed: int,
+        speed: float,
+        tell: Callable[[float, str], None],
     ) -> None:
-        self.robots = [f"robot/scout{number}" for number in (33, 35, 37, 39)]
+        """`building` as `zscout simulate` knows it, `ids` of the robots in it, on the air, by RC."""
+        self._ids = ids
+        self.robots = list(ids)
         self.seen = Seen(self.robots)
         self.building, self.seed, self.speed = building, seed, speed
         self.zero: Ns | None = None
@@ -121,6 +136,7 @@ class RobotsDemo:
         finally:
             operator.cancel()
             await asyncio.gather(operator, return_exceptions=True)
+        self._say("the net is ended, and all nodes with it")
         await placing.stop(client, NET, wait=5.0)
 
     async def _all_hidden(self) -> None:
@@ -131,16 +147,17 @@ class RobotsDemo:
     async def _guard(self) -> None:
         """For a while, and until something was alerted."""
         alerts = self.seen.alerts
-        await asyncio.sleep(GUARDS[0])
+        least, most = (seconds / self.speed for seconds in GUARDS)
+        await asyncio.sleep(least)
         with suppress(TimeoutError):
-            async with asyncio.timeout(GUARDS[1] - GUARDS[0]):
+            async with asyncio.timeout(most - least):
                 while self.seen.alerts == alerts:
                     self._news.clear()
                     await self._news.wait()
 
     async def _operator(self, client: Client) -> None:
         """In the middle of it, a human takes one robot, drives it about and gives it back."""
-        await asyncio.sleep(TAKEOVER)
+        await asyncio.sleep(TAKEOVER / self.speed)
         robot = next(
             (one for one in self.robots if self.seen.doing.get(one) not in (None, "wait")), self.robots[0]
         )
@@ -150,13 +167,13 @@ class RobotsDemo:
         self.seen.taken = self.driven = robot
         self._say(f"an operator takes {robot}")
         try:
-            end = clock.now() + round(DRIVES * SECOND)
+            end = clock.now() + round(DRIVES / self.speed * SECOND)
             while clock.now() < end:
                 for way, seconds in PATROL:
-                    until = clock.now() + round(seconds * SECOND)
+                    until = clock.now() + round(seconds / self.speed * SECOND)
                     while clock.now() < min(until, end):
                         # As a terminal repeats a key that is held down.
-                        pilot.press(clock.now() / SECOND, way)  # type: ignore[arg-type]
+                        pilot.press(clock.now() / SECOND, way)
                         teleop.take()
                         await asyncio.sleep(0.05)
             self.seen.takeover = teleop.takeover
@@ -177,7 +194,7 @@ class RobotsDemo:
         (port,) = free_ports(1)
         line = self._folder / "radio0"
         await processes.start(
-            "building",
+            BUILDING,
             [
                 *("-m", "zscout.cli.main", "simulate", self.building, "--mesh", "--json"),
                 *("--seed", str(self.seed), "--speed", f"{self.speed:g}", "--baud", str(BAUD)),
@@ -220,7 +237,7 @@ class RobotsDemo:
             _rc(
                 robot,
                 "robot",
-                id=robot.removeprefix("robot/scout"),
+                id=str(self._ids[robot]),
                 radio=f'"{RADIO}"',
                 channels=channels,
                 warm_up=f"{2 / self.speed:g}",
@@ -261,7 +278,8 @@ class RobotsDemo:
         (seen.watching.add if said.doing in ("watch", "alert") else seen.watching.discard)(robot)
         if said.doing in ("hidden", "watch", "alert") and robot not in seen.hidden:
             seen.hidden.add(robot)
-            self._say(f"{robot} is hidden: {said.detail}" if said.doing == "hidden" else f"{robot} is hidden")
+            found = said.detail.removeprefix("hidden: ") if said.doing == "hidden" else ""
+            self._say(f"{robot} is hidden" + (f": {found}" if found else ""))
         elif said.doing not in ("hidden", "watch", "alert", "blind", "wait", "") and robot in seen.hidden:
             seen.hidden.discard(robot)
             self._say(f"{robot} is not hidden any more")
@@ -272,7 +290,7 @@ class RobotsDemo:
             seen.alerts += 1
             self._say(f"ALERT: {robot} sees {said.detail}")
         elif said.doing != before and said.doing not in ("", "wait", "watch", "alert", "hidden"):
-            self._say(f"{robot} {said.doing}: {said.detail}")
+            self._say(f"{robot} {said.doing}" + (f": {said.detail}" if said.detail else ""))
         self._news.set()
 
     def _on_grants(self, _key: str, said: Grants) -> None:
