@@ -16,6 +16,7 @@ from zscout import clock
 from zscout.behaviors.arc import Held, Revoked, hold
 from zscout.behaviors.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.piloting import Pilot
+from zscout.behaviors.request import OpenArc
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 from zscout.scheduling.model import SECOND, Ns
 
@@ -25,6 +26,9 @@ LONGEST: Final = 0.6
 """Seconds that one command drives at most: a robot whose operator is cut off stops after that."""
 AGAIN: Final = 1.0
 """Seconds before it is asked for again after a refusal."""
+
+ASKS_AGAIN: Final = frozenset({"preempted", "lost"})
+"""Ends of a hold after which the robot is still wanted; others mean that somebody said so."""
 
 State: TypeAlias = Literal["free", "waiting", "driving"]
 
@@ -54,6 +58,9 @@ class Teleop:
         self._wanted, self._unwanted = asyncio.Event(), asyncio.Event()
         self._wake = asyncio.Event()
         self._asked_at: Ns = 0
+        self._name = f"operator-{needs.robot.partition('/')[2]}"
+        self._arc: OpenArc | None = None
+        """Of the last hold."""
 
     def take(self) -> None:
         """The robot is wanted from now on."""
@@ -76,20 +83,38 @@ class Teleop:
 
     async def run(self) -> None:
         """Takes, drives and gives back, until it is cancelled. Then the robot is given back, too."""
+        self.client.watch(self._on_word)
         while True:
             await self._wanted.wait()
             self._be("waiting", "for the RCM")
+            why = ""
             try:
                 await self._while_wanted(self._drive())
+                if self._wanted.is_set():
+                    # To ask again would take it back from an operator of the same rank, and so on in turns.
+                    why = f"it was taken by {self._successor() or 'another'}"
+                    self.give_back()
             except Revoked as revoked:
                 self._be("waiting", f"it was taken away: {revoked}")
+                if revoked.outcome not in ASKS_AGAIN:
+                    why = str(revoked)
+                    self.give_back()
             except (CommandRefused, RequestRefused) as refused:
                 self._be("waiting", str(refused))
                 await asyncio.sleep(AGAIN)
             finally:
                 self.robot = self.held = None
             if not self._wanted.is_set():
-                self._be("free", "")
+                self._be("free", why)
+
+    def _successor(self) -> str:
+        """The ARC that has it now, as the last word about ours said."""
+        ending = self._arc.ending if self._arc is not None else None
+        return ending.by or ending.reason if ending is not None else ""
+
+    def _on_word(self, arc: OpenArc) -> None:
+        if arc.name == self._name and arc.state == "queued" and self.state == "waiting" and arc.reason:
+            self._be("waiting", arc.reason)
 
     async def _while_wanted(self, work: Coroutine[Any, Any, None]) -> None:
         """Does `work`, and ends it when the robot is not wanted any more."""
@@ -106,14 +131,14 @@ class Teleop:
     async def _drive(self) -> None:
         async with hold(
             self.client,
-            f"operator-{self.needs.robot.partition('/')[2]}",
+            self._name,
             self.needs.needs(),
             priority=self.priority,
             min_runtime=1.0,
             keep=True,
         ) as held:
             robot = self.robot = HeldRobot(held, self.needs)
-            self.held = held
+            self.held, self._arc = held, held.arc
             self._be("driving", "")
             # The wheels go first: whoever takes over in a hurry does not wait for the camera.
             await self._steer(robot)

@@ -24,6 +24,7 @@ from zscout.simulation.casting import (
     Caster,
     Cylinder,
     Geometry,
+    columns_of,
 )
 from zscout.simulation.light import FACES, Lit
 from zscout.simulation.plan import Plan
@@ -36,6 +37,8 @@ Picture = NDArray[np.uint8]
 _FAR_ROWS: Final = 14
 """Rows below the horizon that cover so much floor that it is taken at several depths and averaged."""
 _SUBROWS: Final = 4
+_SHADE: Final = 5.0
+"""Radii from the middle of what moves to where nothing is left of its shadow."""
 _GRAIN_FADE: Final = (1 / (1 + (FLOOR_DEPTH**2 / (EYE * FOCAL) / 0.008) ** 2)).astype(np.float32)[:, None]
 """What is left of the floor's grain, by row: a pixel that covers much of it shows its mean."""
 
@@ -75,7 +78,7 @@ class Camera:
             self._atlas_now = cv2.addWeighted(self._atlas[0], lamps, self._atlas[1], windows, 0)
         seen = self.caster.cast(x, y, heading, moving)
         picture = np.empty((HEIGHT, WIDTH), np.float32)
-        self._paint_floor(x, y, seen, moving, picture)
+        self._paint_floor(x, y, heading, seen, moving, picture)
         picture[:HORIZON] = 0.8 * float(self._lit.ambient @ now)
         self._paint_upright(x, y, seen, moving, picture)
         return picture
@@ -83,7 +86,13 @@ class Camera:
     # Light
 
     def _paint_floor(
-        self, x: float, y: float, seen: Geometry, moving: list[Cylinder], picture: Floats
+        self,
+        x: float,
+        y: float,
+        heading: float,
+        seen: Geometry,
+        moving: list[Cylinder],
+        picture: Floats,
     ) -> None:
         cell = self._lit.cell
         depths = seen.depth[HORIZON:]
@@ -99,10 +108,11 @@ class Camera:
         fine = _between(self._grain, at_x * 250, at_y * 250, tiled=True)
         light *= 1 + fine * _GRAIN_FADE
         for body in moving:
-            if body.low > 0.1:
+            shaded = columns_of(x, y, heading, body._replace(radius=_SHADE * body.radius))
+            if body.low > 0.1 or shaded is None:
                 continue
-            square = (at_x - body.x) ** 2 + (at_y - body.y) ** 2
-            light *= 1 - 0.6 * np.exp(square * (-0.5 / (body.radius * 1.3) ** 2))
+            square = (at_x[:, shaded] - body.x) ** 2 + (at_y[:, shaded] - body.y) ** 2
+            light[:, shaded] *= 1 - 0.6 * np.exp(square * (-0.5 / (body.radius * 1.3) ** 2))
         picture[HORIZON:] = light
 
     def _paint_upright(

@@ -7,14 +7,32 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from zscout.simulation.bodies import RADIUS
 from zscout.simulation.plan import ROBOT_HEIGHT, Plan
-from zscout.simulation.solids import Boxes
+from zscout.simulation.solids import Boxes, boxes_of
+from zscout.strict import Where
 
 Grid = NDArray[np.float64]
 
 _ROUNDS = 4
 SLACK = 1e-4
 """Metres by which a robot may seem to reach into what it touches."""
+
+
+def check_starts(plan: Plan, top: Where) -> None:
+    """Refuses robots that start within a wall, furniture or each other: they would never move. Raises
+    BadInput."""
+    obstacles = Obstacles(plan, boxes_of(plan))
+    for number, robot in enumerate(plan.robots):
+        where = (top / "robot").item(number, robot.name)
+        if obstacles.gap(robot.x, robot.y) < RADIUS:
+            raise where.bad(
+                f"({robot.x:g}, {robot.y:g}) is in a wall or furniture, or touches it",
+                f"leave {RADIUS:g} m around its middle",
+            )
+        for other in plan.robots[:number]:
+            if math.dist((robot.x, robot.y), (other.x, other.y)) < 2 * RADIUS:
+                raise where.bad(f"stands in {other.name}", f"leave {2 * RADIUS:g} m between their middles")
 
 
 class Obstacles:
@@ -36,16 +54,23 @@ class Obstacles:
         outside = np.hypot(np.maximum(across, 0), np.maximum(along, 0))
         return min(room, float((outside + np.minimum(np.maximum(across, along), 0)).min()))
 
-    def gaps(self, x: Grid, y: Grid) -> Grid:
-        """`gap` at many points."""
-        gaps = np.minimum(np.minimum(x, self.width - x), np.minimum(y, self.depth - y))
+    def room_for(self, radius: float, cell: float, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """Where a circle can be without touching anything: a grid of `shape` (rows, columns) over the floor,
+        `cell` metres each, asked at the middles of its cells."""
+        x, y = (np.arange(shape[1]) + 0.5) * cell, (np.arange(shape[0]) + 0.5) * cell
+        across, along = np.minimum(x, self.width - x) >= radius, np.minimum(y, self.depth - y) >= radius
+        free: NDArray[np.bool_] = along[:, None] & across
         for box in range(len(self._x)):
-            dx, dy = x - self._x[box], y - self._y[box]
-            across = np.abs(dx * self._cos[box] + dy * self._sin[box]) - self._half_width[box]
-            along = np.abs(dy * self._cos[box] - dx * self._sin[box]) - self._half_depth[box]
-            outside = np.hypot(np.maximum(across, 0), np.maximum(along, 0))
-            gaps = np.minimum(gaps, outside + np.minimum(np.maximum(across, along), 0))
-        return gaps
+            # Only the cells around the box are asked.
+            reach = float(np.hypot(self._half_width[box], self._half_depth[box])) + radius
+            left, right = np.searchsorted(x, (self._x[box] - reach, self._x[box] + reach))
+            low, high = np.searchsorted(y, (self._y[box] - reach, self._y[box] + reach))
+            dx, dy = x[left:right] - self._x[box], y[low:high, None] - self._y[box]
+            cos, sin = self._cos[box], self._sin[box]
+            off = np.maximum(np.abs(dx * cos + dy * sin) - self._half_width[box], 0)
+            beside = np.maximum(np.abs(dy * cos - dx * sin) - self._half_depth[box], 0)
+            free[low:high, left:right] &= np.hypot(off, beside) >= radius
+        return free
 
     def push_out(
         self, x: float, y: float, radius: float, others: list[tuple[float, float, float]]

@@ -15,10 +15,11 @@ from functools import lru_cache
 from typing import Final
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from zscout.simulation.plan import Light, Plan
+from zscout.simulation.plan import Light, Noise, Plan, Receiver
 from zscout.simulation.solids import Boxes, Floats, boxes_of
 
 FINEST: Final = 0.025
@@ -58,9 +59,17 @@ FACES: Final = 5
 """Faces of a box that can be seen from just above the floor, by `Lit.patches`."""
 
 
-@lru_cache(maxsize=16)
 def light_of(plan: Plan) -> Lit:
-    """The light of a plan; remembered for the last few plans of this process."""
+    """The light of a plan; remembered for the last few plans of this process, whoever moves in them."""
+    return _bake(
+        msgspec.structs.replace(
+            plan, name="", people=(), robots=(), rugs=(), covering="plain", noise=Noise(), receiver=Receiver()
+        )
+    )
+
+
+@lru_cache(maxsize=16)
+def _bake(plan: Plan) -> Lit:
     boxes = boxes_of(plan)
     cell = max(FINEST, float(np.sqrt(plan.width * plan.depth / MAX_CELLS)))
     shape = (round(plan.depth / cell), round(plan.width / cell))

@@ -176,8 +176,13 @@ class Plan(Struct, frozen=True, forbid_unknown_fields=True):
 
 def load_plan(path: Path) -> Plan:
     """Reads a building. Raises BadInput, which names file, key and remedy."""
+    # Here, since what stands where is made of plans.
+    from zscout.simulation.collisions import check_starts
+
     plan = read_toml(path, Plan, max_bytes=MAX_BYTES)
-    check_plan(plan, Where(str(path)))
+    top = Where(str(path))
+    check_plan(plan, top)
+    check_starts(plan, top)
     return plan
 
 
@@ -227,7 +232,7 @@ def check_plan(plan: Plan, top: Where) -> None:
         if len(person.path) < 2:
             raise where.bad(f"has {len(person.path)} point(s)", "write two or more, as in [[0.5, 1], [3, 1]]")
         for corner, point in enumerate(person.path):
-            _check_point(point, plan, where.item(corner), PORCH)
+            _check_point(point, plan, where.item(corner, person.name), PORCH)
         if all(math.dist(person.path[0], point) < 0.1 for point in person.path):
             raise where.bad("leads nowhere", "move one of its points by 0.1 m or more")
 
@@ -239,7 +244,7 @@ def _check_point(point: tuple[float, ...], plan: Plan, where: Where, beyond: flo
     if not (-beyond <= x <= plan.width + beyond and -beyond <= y <= plan.depth + beyond):
         raise where.bad(
             f"({x:g}, {y:g}) is outside",
-            f"write x from {-beyond:g} to {plan.width + beyond:g}, y from {-beyond:g} to "
+            f"write x from {0 - beyond:g} to {plan.width + beyond:g}, y from {0 - beyond:g} to "
             f"{plan.depth + beyond:g}",
         )
 

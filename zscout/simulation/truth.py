@@ -31,18 +31,21 @@ class Truth:
     def __init__(self, plan: Plan, boxes: Boxes, lit: Lit, obstacles: Obstacles) -> None:
         self._plan = plan
         self._boxes = boxes
-        self._obstacles = obstacles
         self.cell = lit.cell
         self.light: Floats = lit.floor.sum(0)
         """Light on the floor by cell, shape (rows, columns)."""
-        self.standing = self._standing()
+        self.standing = obstacles.room_for(RADIUS, lit.cell, self.light.shape)
         """Cells where a robot's middle can be, shape (rows, columns)."""
         self.open = self.standing & ~self._covered()
         """Of these, those with nothing above."""
         bare = self.light[self.open]
         self.median_light = float(np.median(bare)) if len(bare) else float(np.median(self.light))
-        lit_floor = self.open & (self.light >= self.median_light * 0.4)
-        self._lit_cells = np.argwhere(lit_floor if lit_floor.any() else self.open)
+        # Walled in by furniture a robot could go nowhere: starts are on the largest piece of floor.
+        _, parts = cv2.connectedComponents(self.standing.astype(np.uint8), connectivity=4)
+        counts = np.bincount(parts[self.open])
+        start = self.open & (parts == counts.argmax()) if len(counts) else self.open
+        lit_floor = start & (self.light >= self.median_light * 0.4)
+        self._lit_cells = np.argwhere(lit_floor if lit_floor.any() else start)
 
     @property
     def dark(self) -> NDArray[np.bool_]:
@@ -91,16 +94,11 @@ class Truth:
         return reached
 
     def random_open(self, rng: np.random.Generator) -> tuple[float, float]:
-        """A place on open, lit floor."""
+        """A place on open, lit floor, of the largest piece that hangs together."""
         if not len(self._lit_cells):
             raise ValueError(f"{self._plan.name} has no open floor")
         row, column = self._lit_cells[rng.integers(len(self._lit_cells))]
         return (float(column) + 0.5) * self.cell, (float(row) + 0.5) * self.cell
-
-    def _standing(self) -> NDArray[np.bool_]:
-        rows, columns = self.light.shape
-        y, x = np.mgrid[:rows, :columns]
-        return self._obstacles.gaps((x + 0.5) * self.cell, (y + 0.5) * self.cell) >= RADIUS
 
     def _covered(self) -> NDArray[np.bool_]:
         mask = np.zeros(self.light.shape, np.uint8)
