@@ -52,11 +52,14 @@ class Scene:
         voice: Callable[[Saying], None],
         *,
         speed: float = 1.0,
+        name: str = "",
     ) -> None:
         self.client = client
         self.safe_point = safe_point
         """Await it wherever the state of the whole tree is sound: the tree may be moved to another host."""
         self.voice = voice
+        self.name = name
+        """Of the component that the tree runs as, if it is one."""
         self.speed = speed
         """How many seconds of the robots' world pass in one of ours: 1, but for a simulated one."""
 

@@ -52,7 +52,9 @@ class TreeComponent(Component):
 
         telling = asyncio.create_task(voice.keep_telling())
         try:
-            await self.root.play(Scene(stage.client, stage.safe_point, say, speed=self.speed))
+            await self.root.play(
+                Scene(stage.client, stage.safe_point, say, speed=self.speed, name=stage.component)
+            )
         finally:
             telling.cancel()
             voice.close()

@@ -1,4 +1,4 @@
-"""Two operators and one robot: the later one has it and the earlier one is told, rather than both in turns."""
+"""Two operators and one robot: the later one has it and the earlier one is told; they do not take turns."""
 
 from __future__ import annotations
 

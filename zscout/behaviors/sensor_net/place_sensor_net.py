@@ -7,6 +7,7 @@ lets `Net` decide who begins and who stands in for one that is lost.
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from collections.abc import Callable, Coroutine, Iterable
 from contextlib import suppress
 from typing import Any, Final
@@ -17,7 +18,7 @@ from zscout.behaviors.client import RequestRefused
 from zscout.behaviors.sensor_net.net import Effect, Net, Start
 from zscout.behaviors.tree import Behavior, Scene
 from zscout.keyexpr import Role, Token
-from zscout.messages import BehaviorSaid, ComponentSpec, Placement, Placements
+from zscout.messages import MAX_COMPONENT_NAME, BehaviorSaid, ComponentSpec, Placement, Placements
 from zscout.scheduling.model import SECOND
 
 PERIOD: Final = 0.5
@@ -35,7 +36,10 @@ class PlaceSensorNet(Behavior):
         self.net = net
         self._spec_for = spec_for
         self._there: dict[str, set[Token]] = {}
-        self._components = {f"{name}-{robot.partition('/')[2]}"[:48]: robot for robot in net.members}
+        self._components: dict[str, str] = {}
+        """Robots by the names of their components: named after the net's own, which is the only one."""
+        self._placed: set[str] = set()
+        """Of these components, those that this net has had placed: what others placed is not its to stop."""
         self._clock = 0.0
         self._clock_at = 0
         self._tasks: set[asyncio.Task[None]] = set()
@@ -43,6 +47,7 @@ class PlaceSensorNet(Behavior):
     async def run(self, scene: Scene) -> None:
         client, keys = scene.client, scene.client.mesh.keys
         self._clock_at = clock.now()
+        self._components = {component_of(scene.name or self.name, robot): robot for robot in self.net.members}
         declared = [
             client.mesh.watch(keys.alive_any(Role.RC), self._on_token),
             client.mesh.subscribe(
@@ -89,8 +94,11 @@ class PlaceSensorNet(Behavior):
     def _on_placements(self, scene: Scene, placements: Iterable[Placement]) -> None:
         for placement in placements:
             robot = self._components.get(placement.component)
-            if robot is not None and placement.state == "given_up":
-                self._apply(scene, self.net.failed(self._now(scene), robot, placement.reason))
+            if robot is None or placement.component not in self._placed:
+                continue
+            if placement.state in ("given_up", "ended"):
+                why = placement.reason or "it was stopped"
+                self._apply(scene, self.net.failed(self._now(scene), robot, why))
 
     # What is done
 
@@ -109,9 +117,13 @@ class PlaceSensorNet(Behavior):
         except RequestRefused as refused:
             self._apply(scene, self.net.failed(self._now(scene), robot, str(refused)))
         else:
+            self._placed.add(component)
             self._on_placements(scene, [placed])
 
     async def _stop(self, scene: Scene, component: str) -> None:
+        if component not in self._placed:
+            return
+        self._placed.discard(component)
         with suppress(RequestRefused):
             await placing.stop(scene.client, component)
 
@@ -140,11 +152,22 @@ class PlaceSensorNet(Behavior):
     # What outlives a move
 
     def memory(self) -> dict[str, Any]:
-        return {"net": self.net.memory(), "clock": self._clock}
+        return {"net": self.net.memory(), "clock": self._clock, "placed": sorted(self._placed)}
 
     def recall(self, memory: dict[str, Any]) -> None:
         self.net.recall(memory["net"])
         self._clock = float(memory["clock"])
+        self._placed = {str(component) for component in memory["placed"]}
+
+
+def component_of(net: str, robot: str) -> str:
+    """The name of the component that places one robot of the net that runs as component `net`."""
+    name = f"{net}-{robot.partition('/')[2]}"
+    if len(name) <= MAX_COMPONENT_NAME:
+        return name
+    # Cut names could be alike.
+    mark = hashlib.sha256(name.encode()).hexdigest()[:8]
+    return f"{name[: MAX_COMPONENT_NAME - len(mark) - 1]}-{mark}"
 
 
 def _named(before: str, names: list[str]) -> str:
