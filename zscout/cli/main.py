@@ -26,6 +26,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "request": ("zscout.cli.request", "Wait for devices; hold them, or run a command that needs them."),
     "take": ("zscout.cli.take", "Take devices at an operator's priority, preempting who holds them."),
     "drive": ("zscout.cli.drive", "Take a robot and drive it from the keyboard, seeing what it sees."),
+    "watch": ("zscout.cli.watch", "Tell when something moves in the pictures of a camera or video."),
     "release": ("zscout.cli.give_back", "End the hold of a running ARC."),
     "cancel": ("zscout.cli.give_back", "End an ARC, running or waiting."),
     "status": ("zscout.cli.status", "Show devices, holders, the queue and the hosts."),

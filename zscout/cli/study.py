@@ -16,6 +16,7 @@ import click
 from zscout.cli import common
 from zscout.cli.groups import DefaultGroup
 from zscout.cli.study_placement import placement
+from zscout.cli.study_robots import robots
 from zscout.scheduling.study.families import FAMILIES
 from zscout.scheduling.study.trial import STRATEGIES, Job
 from zscout.strict import BadInput, quoted
@@ -44,11 +45,13 @@ def study() -> None:
       zscout study
       zscout study schedule --family paper --seeds 100
       zscout study placement --seeds 20
+      zscout study robots --starts 40
       zscout study schedule --help
     """
 
 
 study.add_command(placement)
+study.add_command(robots)
 
 
 @study.command()

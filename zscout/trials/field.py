@@ -1,164 +1,209 @@
 """A sensor net in a building under virtual time: many robots, few framegrabbers and channels, one radio.
 
 Everything that decides is what decides live: the scheduling core, the radio's and the channels' votes, each
-robot's `Scout`. Only the mesh between them is left out. One run gives when each robot was placed, and how
-much of what moved was seen.
+robot's `Scout`. Only the mesh between them is left out: a command takes LATENCY and then its time on the
+radio's line. One run tells when each robot was placed, and how much of what moved was seen.
 """
 
 from __future__ import annotations
 
-from collections import deque
+import heapq
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Final
 
+import msgspec
 import numpy as np
 
-from zscout.behaviors.sensor_net.place_robot import Slots
+from zscout.behaviors.sensor_net.place_robot import AGAIN, GIVEN_UP, Slots
 from zscout.behaviors.sensor_net.scout import Scout, Step
-from zscout.drivers.airtime import Share, line_rate, objection
-from zscout.packets import MAX_PACKET
+from zscout.drivers.airtime import BITS_PER_BYTE, Share, line_rate, objection
+from zscout.packets import MAX_PACKET, OVERHEAD
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked, WakeAt
 from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
 from zscout.scheduling.model import SECOND, ArcId, Ns, Request
 from zscout.simulation.air import Air
-from zscout.simulation.plan import Plan
-from zscout.simulation.world import World
+from zscout.simulation.drawn import with_robots
+from zscout.simulation.plan import MAX_ROBOTS, Plan
+from zscout.simulation.world import MAX_STEP, World
+from zscout.trials.field_figures import Judge, Outcomes
 
-STEP: Final = 0.05
-"""Seconds of one step of the building."""
+MAX_CHANNELS: Final = 16
 LATENCY: Final = 0.1
-"""Seconds from a picture to the wheels: transmission, thinking, radio."""
+"""Seconds from a picture to the command's coming to the radio: transmission, thinking, the mesh."""
+REPEAT: Final = 0.2
+"""Seconds after which a stop, halt or camera command that was lost is sent again."""
 BOUND: Final = Fraction(1, 4)
-"""Seconds that a packet may wait at the radio."""
-SETTLED: Final = 120.0
-"""Seconds in which all should be placed: walks that begin later count in any case."""
-NOTICED: Final = 1.0
-"""Seconds within which motion in view is to be alerted."""
+"""Seconds that a packet may wait at the radio ..."""
+BOUND_BYTES: Final = 60
+"""... or as long as so many bytes take, as in the node file of `zscout simulate`."""
+RADIO: Final = "radio/rf0"
+_SOON: Final = 1e-6
+"""Seconds that are no difference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What there is to work with."""
+    """What there is to work with. Raises ValueError for what can't be."""
 
     robots: int = 4
     channels: int = 2
     """Video channels, and as many framegrabbers."""
     baud: int = 9_600
     command_rate: float = 5.0
-    frame_rate: float = 5.0
-    """Pictures a second that a framegrabber gives."""
+    """Drive packets a second that each robot's behavior asks for."""
+    frame_rate: float = 4.0
+    """Pictures a second that a framegrabber gives: few, as they are most of the work."""
     loss: float = 0.02
     """Share of radio packets that are lost."""
     slots: Slots = field(default_factory=Slots)
 
+    def __post_init__(self) -> None:
+        if not 1 <= self.robots <= MAX_ROBOTS or not 1 <= self.channels <= MAX_CHANNELS:
+            raise ValueError(f"1 to {MAX_ROBOTS} robots and 1 to {MAX_CHANNELS} channels are taken")
+        if self.baud < 1 or self.command_rate <= 0 or self.frame_rate <= 0 or not 0 <= self.loss < 1:
+            raise ValueError("rates are above 0, the loss is 0 or more and below 1")
 
-@dataclass(slots=True)
-class Outcomes:
-    """What came of one run."""
-
-    placed: dict[str, float | None] = field(default_factory=dict)
-    """By robot: when it said that it was hidden, seconds, and None for never."""
-    truly: dict[str, bool] = field(default_factory=dict)
-    """By robot: whether it then stood in a truly dark place."""
-    walks: int = 0
-    """Walks of people through the room, once all that would be placed were."""
-    noticed: int = 0
-    """Of these: during which some robot alerted."""
-    in_view: int = 0
-    """Crossings of a watching robot's picture."""
-    alerted: int = 0
-    """Of these: alerted within a second."""
-    false_alarms: int = 0
-    watched: float = 0.0
-    """Seconds of watching, all robots together."""
-    preemptions: int = 0
-    moved_unheld: float = 0.0
-    """Seconds that any robot's wheels turned while nobody held it: the time to stop, at most one drive."""
-    seconds: float = 0.0
+    @property
+    def bound(self) -> Fraction:
+        """Seconds that a packet may wait at the radio."""
+        return max(BOUND, Fraction(BOUND_BYTES * BITS_PER_BYTE, self.baud))
 
 
-class _Player:
+def crewed(plan: Plan, robots: int, *, seed: int = 0) -> Plan:
+    """The same building with so many robots: its own first ones, or as `with_robots` draws them."""
+    if robots <= len(plan.robots):
+        return msgspec.structs.replace(plan, robots=plan.robots[:robots])
+    return with_robots(plan, robots, seed=seed)
+
+
+class Player:
     """One robot's side of the queue."""
 
     def __init__(self, name: str, seed: int) -> None:
         self.name, self.scout = name, Scout(seed=seed)
         self.asked: ArcId | None = None
         self.held: Granted | None = None
+        self.transmits: Granted | None = None
+        """The last hold whose command to transmit the robot has heard."""
+        self.video: str | None = None
+        """The channel that it asked for by name."""
         self.turns = 0
+        self.asks_at: float | None = 0.0
+        """When it asks anew; None while it waits or holds."""
         self.next_picture = 0.0
-        self.crossing_since: float | None = None
-        self.crossing_done = False
+        self.next_drive = 0.0
+        self.stood = False
+        """Whether the last command of this hold is a stop."""
 
     def rc(self, kind: str) -> str:
+        """What it holds of this kind. Raises RuntimeError where it holds nothing."""
         if self.held is None:
             raise RuntimeError(f"{self.name} holds nothing")
         return next(rc for rc in self.held.rcs if rc.startswith(f"{kind}/"))
+
+    @property
+    def channel(self) -> int:
+        """The number of the video channel that it holds."""
+        return int(self.rc("video").removeprefix("video/ch"))
 
 
 class FieldRun:
     """One net in one building. `run` it once."""
 
     def __init__(self, plan: Plan, field: Field, *, seed: int = 0) -> None:
-        """Uses the plan's first `field.robots` robots; raises ValueError where it has fewer."""
-        names = [robot.name for robot in plan.robots][: field.robots]
-        if len(names) < field.robots:
-            raise ValueError(f"{plan.name} has {len(names)} robots, fewer than {field.robots}")
+        """Puts the plan's robots on random places; raises ValueError where it has not `field.robots`."""
+        names = [robot.name for robot in plan.robots]
+        if len(names) != field.robots:
+            raise ValueError(f"{plan.name} has {len(names)} robots, not {field.robots}: see crewed()")
         self.field = field
-        rng = np.random.default_rng(seed)
         self.world = World(plan, seed=seed)
+        self._rng = np.random.default_rng((seed, 0xF1E))
         for name in names:
-            self.world.bodies[name].place(*self.world.random_start(rng))
-        self.air = Air(seed=seed)
-        self._rng = rng
+            self.world.bodies[name].place(*self.world.random_start(self._rng))
+        self._air = Air(seed=seed)
         self._core = Core(Adaptive())
-        self._players = {name: _Player(name, seed * 100 + number) for number, name in enumerate(names)}
-        self._by_arc: dict[ArcId, _Player] = {}
-        self._on_the_way: deque[tuple[float, Callable[[], None]]] = deque()
-        self._walks: dict[int, bool] = {}
-        """By person who walks now: whether that was noticed, or doesn't count."""
-        self.outcomes = Outcomes(placed=dict.fromkeys(names), truly=dict.fromkeys(names, False))
+        self.players = {name: Player(name, seed * 100 + number) for number, name in enumerate(names)}
+        self._by_arc: dict[ArcId, Player] = {}
+        self._under_way: list[tuple[float, int, Callable[[], None]]] = []
+        """Commands on their way: a heap by the time of their arrival."""
+        self._numbers = itertools.count()
+        self._line_free = 0.0
+        self._wake: Ns = 0
+        self.channels = [f"video/ch{number + 1}" for number in range(field.channels)]
+        self.outcomes = Outcomes(placed=dict.fromkeys(names))
+        self._judge = Judge(self.world, self.outcomes)
         self._handle(
             *(RcJoined(f"robot/{name}", sharable=False) for name in names),
-            *(RcJoined(f"framegrabber/f{n + 1}", sharable=False) for n in range(field.channels)),
-            *(RcJoined(f"video/ch{n + 1}", sharable=True) for n in range(field.channels)),
-            RcJoined("radio/rf0", sharable=True),
+            *(RcJoined(f"framegrabber/f{number + 1}", sharable=False) for number in range(field.channels)),
+            *(RcJoined(channel, sharable=True) for channel in self.channels),
+            RcJoined(RADIO, sharable=True),
         )
 
     def run(self, seconds: float, *, watch: Callable[[FieldRun], None] | None = None) -> Outcomes:
         """Plays so many seconds of the building. `watch` is called after each step."""
-        for player in self._players.values():
-            self._ask(player)
-        while self.world.time < seconds:
-            self.world.step(STEP)
-            while self._on_the_way and self._on_the_way[0][0] <= self.world.time:
-                self._on_the_way.popleft()[1]()
-            self._handle(Tick())
-            for player in self._players.values():
-                self._turn(player)
-            self._follow_walks()
+        while self.world.time < seconds - _SOON:
+            now = self.world.time
+            dt = min(self._next() - now, MAX_STEP, seconds - now)
+            if dt > _SOON:
+                self.world.step(dt)
+            else:
+                dt = 0.0
+            self._play()
+            alarm = any(one.scout.alerts.moving and one.held for one in self.players.values())
+            self._judge.stepped(dt, alarm=alarm)
             if watch is not None:
                 watch(self)
         self.outcomes.seconds = self.world.time
         return self.outcomes
 
+    def _next(self) -> float:
+        """When something happens next, beside the building's own doing."""
+        times = [self._wake / SECOND]
+        times += [self._under_way[0][0]] if self._under_way else []
+        for player in self.players.values():
+            if player.held is not None:
+                times.append(player.next_picture)
+            elif player.asks_at is not None:
+                times.append(player.asks_at)
+        return min(times)
+
+    def _play(self) -> None:
+        """All that is due."""
+        now = self.world.time
+        while self._under_way and self._under_way[0][0] <= now + _SOON:
+            heapq.heappop(self._under_way)[2]()
+        for player in self.players.values():
+            if player.asks_at is not None and player.asks_at <= now + _SOON:
+                self._ask(player)
+        if self._wake / SECOND <= now + _SOON:
+            self._handle(Tick())
+        for player in self.players.values():
+            if player.held is not None and player.next_picture <= now + _SOON:
+                player.next_picture += 1 / self.field.frame_rate
+                self._look(player)
+
     # The queue
 
-    def _ask(self, player: _Player) -> None:
+    def _ask(self, player: Player) -> None:
         player.turns += 1
-        player.asked = f"{player.name}-{player.scout.task}.{player.turns}"
+        player.asks_at = None
+        task = player.scout.task
+        player.asked = f"{player.name}-{task}.{player.turns}"
         self._by_arc[player.asked] = player
-        priority, slot = self.field.slots.of(player.scout.task)
+        player.video = player.scout.blindness.choose(self.world.time, self.channels)
+        priority, slot = self.field.slots.of(task)
         needs = {
             f"robot/{player.name}": {},
-            "radio/rf0": {
+            RADIO: {
                 "command_rate": Fraction(str(self.field.command_rate)),
                 "packet_size": Fraction(MAX_PACKET),
             },
-            "video/*": {"transmitters": Fraction(1)},
+            player.video or "video/*": {"transmitters": Fraction(1)},
             "framegrabber/*": {},
         }
         request = Request(player.asked, player.name, needs, priority, round(slot * SECOND), keep=True)
@@ -168,20 +213,20 @@ class FieldRun:
         """One instant at the RCM, with every vote that it takes."""
         batch: list[Event] = list(events)
         now: Ns = round(self.world.time * SECOND)
-        over: list[_Player] = []
         while batch:
             votes: list[Event] = []
             again = False
             for effect in self._core.handle(now, *batch):
-                again |= isinstance(effect, WakeAt) and effect.at == now
-                if isinstance(effect, Propose):
-                    votes.append(self._vote(effect))
-                else:
-                    over += self._heed(effect)
+                match effect:
+                    case Propose():
+                        votes.append(self._vote(effect))
+                    case WakeAt(at=at):
+                        # Nothing to wake for: a day from now.
+                        self._wake = now + 86_400 * SECOND if at is None else at
+                        again = at is not None and at <= now
+                    case _:
+                        self._heed(effect)
             batch = votes or ([Tick()] if again else [])
-        for player in over:
-            # Its hold had its time: whoever wants more asks anew, behind those who wait.
-            self._ask(player)
 
     def _vote(self, asked: Propose) -> Vote:
         holders = asked.holders.values()
@@ -189,104 +234,87 @@ class FieldRun:
             reason = "" if sum(params["transmitters"] for params in holders) <= 1 else "two would jam"
         else:
             shares = [Share(params["command_rate"], params["packet_size"]) for params in holders]
-            reason = objection(line_rate(self.field.baud), BOUND, shares)
+            reason = objection(line_rate(self.field.baud), self.field.bound, shares)
         return Vote(asked.proposal, accept=not reason, reason=reason)
 
-    def _heed(self, effect: Effect) -> list[_Player]:
-        """Carries out a grant or its end; who has to ask anew."""
+    def _heed(self, effect: Effect) -> None:
+        """Carries out a grant or its end."""
+        now = self.world.time
         match effect:
             case Granted(arc=arc):
                 player = self._by_arc[arc]
                 player.held = effect
-                player.next_picture = self.world.time
-                player.scout.held(self.world.time)
-                channel = int(player.rc("video").removeprefix("video/ch"))
-                body = self.world.bodies[player.name]
-                self._send(player, lambda: body.transmit(channel, self.world.time), sure=True)
+                player.next_picture, player.next_drive, player.stood = now, now, False
+                player.scout.held(now)
+                self._judge.held(player.name)
+                self._transmit(player, effect, player.channel)
             case Revoked(arc=arc, outcome=outcome, requeued=requeued):
                 player = self._by_arc[arc]
                 player.held = None
-                player.crossing_since = None
-                player.scout.released(self.world.time)
+                player.scout.released(now)
+                self._judge.ended(player.name, preempted=outcome is Outcome.PREEMPTED)
                 self._halt(player)
-                self.outcomes.preemptions += outcome is Outcome.PREEMPTED
                 if not requeued:
+                    # It had its time, or gave back: who wants more asks anew, behind those who wait.
                     del self._by_arc[arc]
-                    player.asked = None
-                    return [player]
+                    player.asks_at = now
             case _:
                 pass
-        return []
 
     # The robot
 
-    def _turn(self, player: _Player) -> None:
-        body = self.world.bodies[player.name]
-        if player.held is None:
-            self.outcomes.moved_unheld += 0.0 if body.still else STEP
-            return
-        if self.world.time < player.next_picture:
-            return
-        player.next_picture += 1 / self.field.frame_rate
-        channel = int(player.rc("video").removeprefix("video/ch"))
-        picture = self.air.receive(self.world, channel)
-        step = player.scout.see(self.world.time, picture, f"video/ch{channel}")
+    def _look(self, player: Player) -> None:
+        picture = self._air.receive(self.world, player.channel)
         now = self.world.time
-        self._send(player, lambda: body.command(step.left, step.right, step.lasts, self.world.time))
-        if player.scout.task == "watch" and self.outcomes.placed[player.name] is None:
-            self.outcomes.placed[player.name] = now
-            self.outcomes.truly[player.name] = self.world.is_dark(player.name)
-        self._judge(player, step)
+        step = player.scout.see(now, picture, f"video/ch{player.channel}")
+        if player.scout.task == "watch":
+            self._judge.placed(player.name)
+        self._judge.looked(player.name, step, 1 / self.field.frame_rate)
+        if step.blind:
+            self.outcomes.blind += 1
+        else:
+            self._drive(player, step)
         if (step.over or step.blind) and player.asked is not None:
             self._handle(Released(player.asked))
+            if step.blind:
+                player.asks_at = now + (GIVEN_UP if player.scout.blindness.dead else AGAIN)
 
-    def _judge(self, player: _Player, step: Step) -> None:
-        """Compares a look of a watching robot with what truly was in its view."""
-        if step.doing not in ("watch", "alert"):
-            player.crossing_since = None
-            return
-        now, out = self.world.time, self.outcomes
-        out.watched += 1 / self.field.frame_rate
-        crossing = self.world.crossing(player.name)
-        if crossing and player.crossing_since is None:
-            player.crossing_since, player.crossing_done = now, False
-            out.in_view += 1
-        elif not crossing:
-            player.crossing_since = None
-        since = player.crossing_since
-        if step.doing == "alert" and since is not None and not player.crossing_done:
-            player.crossing_done = True
-            out.alerted += now - since <= NOTICED
-        out.false_alarms += step.alert and since is None
+    def _drive(self, player: Player, step: Step) -> None:
+        """At the rate that was asked for; wheels that are to stand are told so once."""
+        body, now = self.world.bodies[player.name], self.world.time
+        if step.left == 0 and step.right == 0:
+            if not player.stood:
+                player.stood = True
+                self.send(OVERHEAD, lambda: body.command(0, 0, 0, self.world.time), sure=True)
+        elif now >= player.next_drive - _SOON:
+            player.next_drive = max(player.next_drive + 1 / self.field.command_rate, now)
+            player.stood = False
+            self.send(MAX_PACKET, lambda: body.command(step.left, step.right, step.lasts, self.world.time))
 
-    def _follow_walks(self) -> None:
-        """Counts the walks that began once all were placed, or had time enough for it."""
-        out = self.outcomes
-        ready = self.world.time >= SETTLED or all(at is not None for at in out.placed.values())
-        alarm = any(player.scout.alerts.moving and player.held for player in self._players.values())
-        for number, walker in enumerate(self.world.walkers):
-            if not walker.here:
-                self._walks.pop(number, None)
-                continue
-            if number not in self._walks:
-                self._walks[number] = not ready
-                out.walks += ready
-            if alarm and not self._walks[number]:
-                self._walks[number] = True
-                out.noticed += 1
+    def _transmit(self, player: Player, hold: Granted, channel: int) -> None:
+        def switch() -> None:
+            if player.held is hold:
+                player.transmits = hold
+                self.world.bodies[player.name].transmit(channel, self.world.time)
 
-    def _halt(self, player: _Player) -> None:
-        body = self.world.bodies[player.name]
+        self.send(OVERHEAD + 1, switch, sure=True)
 
+    def _halt(self, player: Player) -> None:
         def halt() -> None:
-            # Unless it has been held anew meanwhile.
-            if player.held is None:
+            # A newer command to the same robot ends the repeats of an older one.
+            if player.held is None or player.transmits is not player.held:
+                body = self.world.bodies[player.name]
                 body.command(0, 0, 0, self.world.time)
                 body.transmit(None, self.world.time)
 
-        self._send(player, halt, sure=True)
+        self.send(OVERHEAD, halt, sure=True)
 
-    def _send(self, player: _Player, act: Callable[[], None], *, sure: bool = False) -> None:
-        """Does something at the robot when it arrives there; `sure`: it is sent until it does."""
-        if sure or self._rng.random() >= self.field.loss:
-            self._on_the_way.append((self.world.time + LATENCY, act))
+    def send(self, size: int, act: Callable[[], None], *, sure: bool = False) -> None:
+        """Does something at the robot when its packet arrives there; `sure`: it is sent until it does."""
+        begins = max(self.world.time + LATENCY, self._line_free)
+        self._line_free = at = begins + size * BITS_PER_BYTE / self.field.baud
+        while self._rng.random() < self.field.loss:
+            if not sure:
+                return
+            at += REPEAT
+        heapq.heappush(self._under_way, (at, next(self._numbers), act))

@@ -138,8 +138,8 @@ def cases(buildings: Iterable[str], *, seeds: int, noises: Sequence[float] = NOI
 def batch(
     cases: Sequence[Case], *, seconds: float = 90.0, rate: float = 5.0, processes: int = 1
 ) -> Iterator[tuple[Case, Watched]]:
-    """Watches each case for `seconds` of virtual time in `processes` processes, and gives them back as they are
-    done. People walk often: see FIRST_WALK."""
+    """Watches each case for `seconds` of virtual time in `processes` processes, and gives them back as they
+    are done. People walk often: see FIRST_WALK."""
     # Spawned: OpenCV's threads do not survive a fork.
     with multiprocessing.get_context("spawn").Pool(processes, cv2.setNumThreads, (1,)) as pool:
         jobs = [(case, seconds, rate) for case in cases]

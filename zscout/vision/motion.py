@@ -10,12 +10,13 @@ Canny's hysteresis), with what a real camera needs beside it:
 - Each picture is first brought to the background's brightness: gain and offset by least squares over blocks,
   from which those that do not fit are left out. So flicker, exposure and slow light changes move nothing.
 - A pixel counts by how many standard deviations of its own noise it is off, never by grey levels: no tuning.
-- What the background has two pixels further on is no motion (Elgammal et al., "Non-parametric model for
+- What the background has next to a pixel is no motion in it (Elgammal et al., "Non-parametric model for
   background subtraction", 2000): leaves that sway, a camera that shakes.
 - A change of most of the picture at once is a switched light or a moved camera: it is learned at once.
 - Something moves once it was seen in two of three pictures, in about the same place.
 
-Whoever stops is learned slowly, and is background after about half a minute.
+What stays is learned as that pixel's noise: whoever stops is no motion any more after a second or two, and
+leaves no ghost behind when he goes. The background itself follows within half a minute.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ BLOCKS: Final = 20
 LEARN: Final = 6.0
 """Seconds in which the background follows what is no motion."""
 ABSORB: Final = 30.0
-"""Seconds in which it follows what is."""
+"""Seconds in which it follows what is. The variance is fed by the square of it, and so
+follows much sooner."""
 WARM: Final = 1.0
 """Seconds of the first look: all is background, and nothing is told."""
 WARM_PICTURES: Final = 4
@@ -45,8 +47,7 @@ WEAK: Final = 3.2
 """That go on with one."""
 FLOOR: Final = 1.3
 """Grey levels that the noise of a smoothed picture has at least: quantisation and compression."""
-TOL=0
-SWAY: Final = 5
+SWAY: Final = 3
 """Pixels: brightness that the background has within a square of this side is background that sways."""
 SMALLEST: Final = 0.0012
 """Share of the picture that a region has at least."""
@@ -57,6 +58,8 @@ ASIDE: Final = 32
 """Columns by which torn lines are sought aside."""
 UPHEAVAL: Final = 0.55
 """Share of the picture that changes where it is not something in it that moves."""
+ALL_OFF: Final = 4.0
+"""Standard deviations by which the median pixel is off in a picture of something else."""
 SURE: Final = 2
 """Pictures of the last RECENT in which something is seen in one place."""
 RECENT: Final = 3
@@ -96,7 +99,6 @@ class MotionDetector:
         self._begun = 0.0
         self._pictures = 0
         self._last = 0.0
-        self._noise = FLOOR
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
@@ -113,7 +115,10 @@ class MotionDetector:
         if self._pictures < WARM_PICTURES or time - self._begun < WARM:
             self._learn(away, None, 1.0 / self._pictures, 1.0)
             return Seen(False, learning=True)
-        mask = self._regions(self._score(level, self._mean), level, self._mean)
+        score, middle = self._score(level, self._mean)
+        if middle > ALL_OFF:
+            return self._begin(time, grey)
+        mask = self._regions(score, level, self._mean)
         share = float(np.count_nonzero(mask)) / mask.size
         if share > UPHEAVAL:
             return self._begin(time, grey)
@@ -129,17 +134,18 @@ class MotionDetector:
         self._sightings.clear()
         return Seen(False, learning=True)
 
-    def _score(self, level: _Plane, mean: _Plane) -> _Plane:
-        """By how many standard deviations of its noise each pixel is off, smoothed; 0 where it is not."""
-        spread = np.sqrt(np.maximum(self._variance, self._noise**2))
+    def _score(self, level: _Plane, mean: _Plane) -> tuple[_Plane, float]:
+        """By how many standard deviations of its noise each pixel is off, smoothed, in terms of what this
+        picture's pixels are off in general; 0 where it is not. And that median."""
+        # Neighbours are alike noisy: their mean is a floor under what few pictures tell of one pixel.
+        spread = np.sqrt(np.maximum(np.maximum(self._variance, cv2.blur(self._variance, (5, 5))), FLOOR**2))
         score = np.abs(cv2.GaussianBlur(level - mean, (3, 3), 0)) / spread
         # Smoothing leaves about 0.4 of independent noise; what is left of it is judged by its own measure.
         middle = float(np.median(score))
         score /= middle / 0.674 if middle > 0.3 else 0.45
-        near, soft = np.ones((int(SWAY), int(SWAY)), np.uint8), cv2.GaussianBlur(level, (3, 3), 0)
-        slack = np.float32(TOL) * spread
-        sways = (soft <= cv2.dilate(mean, near) + slack) & (soft >= cv2.erode(mean, near) - slack)
-        return np.where(sways, np.float32(0), score).astype(np.float32)
+        near, soft = np.ones((SWAY, SWAY), np.uint8), cv2.GaussianBlur(level, (3, 3), 0)
+        sways = (soft <= cv2.dilate(mean, near) + spread) & (soft >= cv2.erode(mean, near) - spread)
+        return np.where(sways, np.float32(0), score).astype(np.float32), middle
 
     def _learn(self, away: _Plane, mask: NDArray[np.uint8] | None, still: float, moved: float) -> None:
         """Follows the picture, by `still` and where something moves by `moved` (shares, 0 to 1)."""
@@ -152,8 +158,6 @@ class MotionDetector:
             rate = np.where(around > 0, np.float32(min(1.0, moved)), np.float32(min(1.0, still)))
         self._mean += rate * away
         self._variance += rate * (away * away - self._variance)
-        noise = float(np.median(np.abs(away))) / 0.674
-        self._noise += min(1.0, still) * (max(FLOOR, noise) - self._noise)
 
     def _regions(self, score: _Plane, level: _Plane, mean: _Plane) -> NDArray[np.uint8]:
         """Where the score is above WEAK, connected, and somewhere in it above STRONG: 255, elsewhere 0."""
