@@ -24,7 +24,7 @@ from zscout.hiding.compass import BANDS, Strip, Tones, strip, tones
 from zscout.hiding.facing import Check, Face, Hidden, Settle
 from zscout.hiding.freeing import Back, Dodge, Leave
 from zscout.hiding.memory import FORM, MAX_CHECKPOINT, Memory, Phase
-from zscout.hiding.mind import WORDS, Mind, PhaseOf, print_of, thumb_of
+from zscout.hiding.mind import Mind, PhaseOf, print_of, thumb_of
 from zscout.hiding.searching import Aim, Roam, Scan
 from zscout.vision.darkness import look
 from zscout.vision.garble import garbled
@@ -70,7 +70,7 @@ class Hider:
     @property
     def state(self) -> str:
         """search, approach, unstick, enter, turn or hidden."""
-        return WORDS[self._mind.memory.phase]
+        return self._mind.word
 
     def see(self, now: float, picture: Picture | None) -> Act:
         """What to do now. `now` in seconds of any clock that runs; `picture` of shape (120, 160), or None if

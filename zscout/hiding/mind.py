@@ -99,7 +99,14 @@ class Mind:
             lasts = 0.0
         memory.left, memory.right, memory.ends = left, right, memory.clock + lasts
         memory.why = why
-        return Act(left, right, lasts, WORDS[memory.phase], why, memory.phase == "hidden")
+        return Act(left, right, lasts, self.word, why, memory.phase == "hidden")
+
+    @property
+    def word(self) -> str:
+        """What it is doing, for people."""
+        # To aim is part of what follows.
+        facing = self.memory.phase == "aim" and self.memory.next_phase == "settle"
+        return WORDS["settle" if facing else self.memory.phase]
 
     def stand(self, why: str) -> Act:
         return self.act(0.0, 0.0, 0.0, why)
@@ -113,7 +120,7 @@ class Mind:
             memory.left if moving else 0.0,
             memory.right if moving else 0.0,
             rest if moving else 0.0,
-            WORDS[memory.phase],
+            self.word,
             why,
         )
 

@@ -47,6 +47,7 @@ WEAK: Final = 3.2
 """That go on with one."""
 FLOOR: Final = 1.3
 """Grey levels that the noise of a smoothed picture has at least: quantisation and compression."""
+TOL = 1.0
 SWAY: Final = 3
 """Pixels: brightness that the background has within a square of this side is background that sways."""
 SMALLEST: Final = 0.0012
@@ -144,7 +145,7 @@ class MotionDetector:
         middle = float(np.median(score))
         score /= middle / 0.674 if middle > 0.3 else 0.45
         near, soft = np.ones((SWAY, SWAY), np.uint8), cv2.GaussianBlur(level, (3, 3), 0)
-        sways = (soft <= cv2.dilate(mean, near) + spread) & (soft >= cv2.erode(mean, near) - spread)
+        sways = (soft <= cv2.dilate(mean, near) + np.float32(TOL) * spread) & (soft >= cv2.erode(mean, near) - np.float32(TOL) * spread)
         return np.where(sways, np.float32(0), score).astype(np.float32), middle
 
     def _learn(self, away: _Plane, mask: NDArray[np.uint8] | None, still: float, moved: float) -> None:
