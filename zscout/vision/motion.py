@@ -10,8 +10,7 @@ Canny's hysteresis), with what a real camera needs beside it:
 - Each picture is first brought to the background's brightness: gain and offset by least squares over blocks,
   from which those that do not fit are left out. So flicker, exposure and slow light changes move nothing.
 - A pixel counts by how many standard deviations of its own noise it is off, never by grey levels: no tuning.
-- What the background has next to a pixel is no motion in it (Elgammal et al., "Non-parametric model for
-  background subtraction", 2000): leaves that sway, a camera that shakes.
+- Lines that fit the background when moved aside are torn by the transmission.
 - A change of most of the picture at once is a switched light or a moved camera: it is learned at once.
 - Something moves once it was seen in two of three pictures, in about the same place.
 
@@ -47,9 +46,6 @@ WEAK: Final = 3.2
 """That go on with one."""
 FLOOR: Final = 1.3
 """Grey levels that the noise of a smoothed picture has at least: quantisation and compression."""
-TOL = 1.0
-SWAY: Final = 3
-"""Pixels: brightness that the background has within a square of this side is background that sways."""
 SMALLEST: Final = 0.0012
 """Share of the picture that a region has at least."""
 BAND: Final = 5.0
@@ -137,16 +133,14 @@ class MotionDetector:
 
     def _score(self, level: _Plane, mean: _Plane) -> tuple[_Plane, float]:
         """By how many standard deviations of its noise each pixel is off, smoothed, in terms of what this
-        picture's pixels are off in general; 0 where it is not. And that median."""
+        picture's pixels are off in general. And that median."""
         # Neighbours are alike noisy: their mean is a floor under what few pictures tell of one pixel.
         spread = np.sqrt(np.maximum(np.maximum(self._variance, cv2.blur(self._variance, (5, 5))), FLOOR**2))
         score = np.abs(cv2.GaussianBlur(level - mean, (3, 3), 0)) / spread
         # Smoothing leaves about 0.4 of independent noise; what is left of it is judged by its own measure.
         middle = float(np.median(score))
         score /= middle / 0.674 if middle > 0.3 else 0.45
-        near, soft = np.ones((SWAY, SWAY), np.uint8), cv2.GaussianBlur(level, (3, 3), 0)
-        sways = (soft <= cv2.dilate(mean, near) + np.float32(TOL) * spread) & (soft >= cv2.erode(mean, near) - np.float32(TOL) * spread)
-        return np.where(sways, np.float32(0), score).astype(np.float32), middle
+        return np.asarray(score, np.float32), middle
 
     def _learn(self, away: _Plane, mask: NDArray[np.uint8] | None, still: float, moved: float) -> None:
         """Follows the picture, by `still` and where something moves by `moved` (shares, 0 to 1)."""
