@@ -89,7 +89,8 @@ def test_who_ends_before_it_has_answered_is_not_waited_for(tmp_path: Path) -> No
         asking = asyncio.create_task(process.checkpoint())
         await asyncio.sleep(0)
         await process.stop(5)
-        with pytest.raises(Refused, match="it has ended, stopped"):
+        # Its process may still have said so itself, on its way out.
+        with pytest.raises(Refused, match=r"it has ended, stopped|it does not run"):
             await asking
         with pytest.raises(Refused, match="it must run for that"):
             await process.checkpoint()
