@@ -21,6 +21,7 @@ from zscout.keyexpr import Sender
 from zscout.mesh import Mesh
 from zscout.messages import Amounts, HandOver, Notice, OpenRequest, Problem
 from zscout.messages.scheduling import MAX_OTHERS
+from zscout.scheduling.model import SECOND
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +29,8 @@ HAND_OVER = 10.0
 """Seconds within which the outcome of a hand-over must be known."""
 COME = 2.0
 """Seconds for which a request waits for the ARC that is expected in its stead."""
+JUST_COME = 1.0
+"""Seconds within which the RCM sees the token of a client that sees the RCM."""
 CLAIM = 10.0
 """Seconds after which an ARC that came and that nobody asked for is given back."""
 
@@ -164,6 +167,7 @@ class Moving:
         """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
         term = self.hearing.term
         pause, longest = BACKOFF
+        known_by = clock.now() + round(JUST_COME * SECOND)
         while arcs := [arc for arc in arcs if arc.open]:
             first, *others = arcs
             operation = HandOver(id=first.id, to=str(to), others=[arc.id for arc in others])
@@ -182,6 +186,9 @@ class Moving:
             if problem is not None and problem.code == "not_running":
                 # It is over, or an RCM that has just taken the lead has not heard of it: this settles which.
                 await self.asking.ask(first)
+            elif problem is not None and problem.code == "unknown_client" and clock.now() < known_by:
+                # It sees the RCM; the RCM may not have seen its token yet.
+                pause = BACKOFF[0]
             elif problem is not None and problem.code not in TRY_AGAIN:
                 raise RequestRefused(problem)
             if not await self.hearing.leader_within(pause):
