@@ -6,12 +6,13 @@ READY := $(VENV)/.ready
 PEERS := .venv-peers
 PEERS_READY := $(PEERS)/.ready
 
-.PHONY: help setup demo test lint bench bench-peers lock clean
+.PHONY: help setup demo test docs lint bench bench-peers lock clean
 
 help:
 	@echo "make demo   four robots in a simulated building hide and watch, on a live mesh"
 	@echo "make test   all tests"
-	@echo "make lint   formatting, linting and strict types"
+	@echo "make docs   the documentation as a site, in site/"
+	@echo "make lint   formatting, linting, strict types, the rooms' contracts, links of the docs"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"
 	@echo "make bench-peers   the same work done by Dask, Redis, etcd, labgrid and Ray"
 
@@ -30,10 +31,16 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
-lint: $(READY)
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "site/index.html"
+
+# Strict: a link or anchor that leads nowhere fails it.
+lint: $(READY) docs
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks

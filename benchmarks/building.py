@@ -23,9 +23,10 @@ import psutil
 import serial
 
 from benchmarks.stats import Row, table
-from zscout.packets import Camera, Drive, encode
-from zscout.simulation.plan import Plan, load_plan, shipped_plans
-from zscout.simulation.world import World
+from zscout.drivers.packets import CameraPacket, DrivePacket, encode
+from zscout.lab.building.plan import Plan
+from zscout.lab.building.plan_file import load_plan, shipped_plans
+from zscout.lab.building.world import World
 
 AIM = 50.0
 """Percent of one core for four robots at 10 frames/s."""
@@ -82,7 +83,7 @@ def measure(building: str, robots: int, seconds: float) -> list[Row]:
         port = stack.enter_context(serial.Serial(told["radio"]["port"], BAUD, timeout=1, write_timeout=5))
         idle = spent(process, 3.0)
         for number, robot in enumerate(plan_robots):
-            port.write(encode(Camera(robot.id, 0, number + 1)))
+            port.write(encode(CameraPacket(robot.id, 0, number + 1)))
         readers = [Reader(channel["url"]) for channel in told["channels"]]
         for reader in readers:
             reader.start()
@@ -115,7 +116,7 @@ def keep_moving(port: serial.Serial, plan: Plan, robots: int, number: int) -> No
     """Each robot turns on its place, now left, now right, so that no picture is like the last."""
     for robot in plan.robots[:robots]:
         wheel = 0.2 if number // 10 % 2 else -0.2
-        port.write(encode(Drive(robot.id, number % 256, wheel, -wheel, 1.0)))
+        port.write(encode(DrivePacket(robot.id, number % 256, wheel, -wheel, 1.0)))
 
 
 def spent(process: psutil.Process, seconds: float, meanwhile: Any = None) -> float:

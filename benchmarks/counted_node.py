@@ -18,9 +18,9 @@ import psutil
 
 from benchmarks.child import ready
 from benchmarks.loop import run
-from zscout.balancing.balancer import Balancer
-from zscout.config import load_node
+from zscout.config.node import load_node
 from zscout.node import run_node
+from zscout.placement.balancer import Balancer
 
 
 class Count:

@@ -23,11 +23,11 @@ from benchmarks.loop import run
 from benchmarks.stats import Row
 from tests.live.lab import Lab
 from zscout import messages
-from zscout.behaviors.client import Client
-from zscout.config import load_fleet
+from zscout.behaviors.client.client import Client
+from zscout.config.fleet import load_fleet
 from zscout.keyexpr import Keys
 from zscout.messages import Notice
-from zscout.scheduling.model import Grant, Place, Term
+from zscout.types import Grant, Place, Term
 
 BEHAVIORS = 20
 PROGRAMS = 4

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from benchmarks.child import ready
 from benchmarks.loop import run
-from zscout.config import load_fleet
+from zscout.config.fleet import load_fleet
 from zscout.keyexpr import Keys, Sender
-from zscout.mesh import Mesh, Request
+from zscout.mesh import IncomingQuery, ZenohMesh
 from zscout.messages import Notice, StateAsk
-from zscout.scheduling.model import Grant, Place, Term
+from zscout.types import Grant, Place, Term
 
 RC = "bench/face"
 TERM = Term(1, "0123456789ab")
@@ -42,10 +42,10 @@ def key(keys: Keys) -> str:
 async def serve(fleet_file: Path) -> None:
     fleet = load_fleet(fleet_file)
 
-    def answer(request: Request[StateAsk]) -> None:
+    def answer(request: IncomingQuery[StateAsk]) -> None:
         request.answer(NOTICE)
 
-    async with await Mesh.open(fleet.name, Sender("bench", "face"), fleet.mesh) as mesh:
+    async with await ZenohMesh.open(fleet.name, Sender("bench", "face"), fleet.mesh) as mesh:
         mesh.serve(key(mesh.keys), StateAsk, answer)
         ready()
         await asyncio.to_thread(sys.stdin.read)

@@ -30,11 +30,11 @@ from benchmarks.loop import run
 from benchmarks.stats import Row, Samples, table
 from tests.live.lab import START, Lab
 from tests.live.placing import Placing
-from zscout import clock
-from zscout.behaviors.client import Client
+from zscout.behaviors.client.client import Client
+from zscout.drivers.packets import DrivePacket, PacketDecoder
+from zscout.mesh import clock
 from zscout.messages import ComponentList, ListComponents
-from zscout.packets import Decoder, Drive
-from zscout.scheduling.model import SECOND
+from zscout.types import SECOND
 
 BUILDING: Final = "living_room"
 ROBOTS: Final = (33, 35, 37, 39)
@@ -55,14 +55,14 @@ class Tap:
         tty.setraw(slave)
         self._slave = slave
         self._building = os.open(port, os.O_WRONLY | os.O_NOCTTY)
-        self._decoder = Decoder()
+        self._decoder = PacketDecoder()
         self.port = os.ttyname(slave)
         self.drives: list[tuple[float, int]] = []
         """When, in seconds, and to which robot."""
 
     def _read(self) -> None:
         now, data = clock.now() / SECOND, os.read(self._master, 4_096)
-        self.drives += [(now, one.robot) for one in self._decoder.feed(data) if isinstance(one, Drive)]
+        self.drives += [(now, one.robot) for one in self._decoder.feed(data) if isinstance(one, DrivePacket)]
         os.write(self._building, data)
 
     def __enter__(self) -> Self:

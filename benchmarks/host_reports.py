@@ -15,9 +15,9 @@ from pathlib import Path
 
 from benchmarks.child import ready
 from benchmarks.loop import run
-from zscout.config import load_fleet
+from zscout.config.fleet import load_fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
-from zscout.mesh import Mesh, Publisher
+from zscout.mesh import Publisher, ZenohMesh
 from zscout.messages import ComponentUse, LoadReport
 
 SESSIONS = 4
@@ -82,7 +82,7 @@ async def main(fleet_file: Path, count: int) -> None:
     async with AsyncExitStack() as stack:
         meshes = [
             await stack.enter_async_context(
-                await Mesh.open(fleet.name, Sender("crowd", f"s{number}"), fleet.mesh)
+                await ZenohMesh.open(fleet.name, Sender("crowd", f"s{number}"), fleet.mesh)
             )
             for number in range(SESSIONS)
         ]

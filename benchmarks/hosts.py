@@ -29,9 +29,9 @@ from benchmarks.loop import run
 from benchmarks.stats import Row, Samples
 from tests.live.lab import START, Lab
 from zscout import messages
-from zscout.balancing.balancer import MAX_HOSTS
-from zscout.behaviors.client import Client
+from zscout.behaviors.client.client import Client
 from zscout.messages import HostRanking, RankAsk, RankedHost
+from zscout.placement.balancer import MAX_HOSTS
 
 HOT = 3
 """Times that each thing is done in a row, of which the last counts, as in latency.py."""

@@ -14,10 +14,10 @@ from benchmarks.child import child
 from benchmarks.stats import Row, Samples, of_latency
 from tests.live.lab import Lab
 from zscout import messages
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import Needs, OpenArc
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import Needs, OpenArc
+from zscout.config.scheduling_policy import StrategyName
 from zscout.messages import Ask, HostRanking, Notice, RankAsk, StateAsk
-from zscout.scheduling.policy import StrategyName
 
 EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
 SHARABLE = ["radio/rf0", "video/ch1"]

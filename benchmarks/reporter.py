@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable
 
 from benchmarks.stats import Row, Samples
-from zscout.services.load_reporter import Gauge
-from zscout.services.process_use import TreeMeter
+from zscout.services.node.load_reporter import Gauge
+from zscout.services.node.process_use import TreeMeter
 
 
 def costs(node: int, rounds: int = 200) -> list[Row]:

@@ -21,10 +21,11 @@ from typing import Any
 from zscout.scheduling import cpsat
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import WakeAt
-from zscout.scheduling.events import Asked, Event, RcJoined, Tick
-from zscout.scheduling.model import SECOND, Request
-from zscout.scheduling.packing import Item, Problem, numbers, pack
+from zscout.scheduling.events import Event, RcJoined, Requested, Tick
+from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.packing import PackingItem, PackingProblem, numbers, pack
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.types import SECOND
 
 PAPER = {"optimal": 39.3, "priority": 0.59}
 """Seconds, in the paper: its optimal strategy and its heuristic."""
@@ -54,27 +55,27 @@ class Decided:
     """The longest single pass, in seconds: for so long the RCM would not answer."""
 
 
-def experiment(seed: int, rcs: int, arcs: int) -> list[Request]:
+def experiment(seed: int, rcs: int, arcs: int) -> list[ArcRequest]:
     """ARCs of one priority that need 1 to 5 RCs each, and run as long as each other."""
     draw = random.Random(seed)  # noqa: S311
     return [
-        Request(f"a{number}", "host/a", {f"rc/{rc}": {} for rc in needs}, 1, SECOND)
+        ArcRequest(f"a{number}", "host/a", {f"rc/{rc}": {} for rc in needs}, 1, SECOND)
         for number in range(arcs)
         for needs in [draw.sample(range(rcs), draw.randint(1, 5))]
     ]
 
 
-def problem(requests: list[Request]) -> Problem:
+def problem(requests: list[ArcRequest]) -> PackingProblem:
     """The same as the packer sees it."""
     masks = [sum(1 << int(rc.split("/")[1]) for rc in request.needs) for request in requests]
-    return Problem([Item(mask, mask.bit_count(), 0) for mask in masks])
+    return PackingProblem([PackingItem(mask, mask.bit_count(), 0) for mask in masks])
 
 
-def decide(strategy: str, rcs: int, requests: list[Request]) -> Decided:
+def decide(strategy: str, rcs: int, requests: list[ArcRequest]) -> Decided:
     """Lets a strategy share out free RCs."""
     core = Core(STRATEGIES[strategy]())  # type: ignore[index]
     core.handle(0, *(RcJoined(f"rc/{number}", False) for number in range(rcs)))
-    batch: list[Event] = [Asked(request) for request in requests]
+    batch: list[Event] = [Requested(request) for request in requests]
     took: list[float] = []
     while batch:
         begin = time.process_time()
@@ -82,7 +83,7 @@ def decide(strategy: str, rcs: int, requests: list[Request]) -> Decided:
         took.append(time.process_time() - begin)
         again = any(isinstance(effect, WakeAt) and effect.at == 0 for effect in effects)
         batch = [Tick()] if again else []
-    return Decided(core.floor.busy.bit_count(), sum(took), max(took))
+    return Decided(sum(len(arc.needs) for arc in core.status().running), sum(took), max(took))
 
 
 def rows(
@@ -116,7 +117,7 @@ def solved(rcs: int, arcs: int, seeds: int, seconds: float) -> list[float]:
     return [float(reference(problem(experiment(seed, rcs, arcs)), seconds)) for seed in range(seeds)]
 
 
-def reference(packing: Problem, seconds: float) -> int:
+def reference(packing: PackingProblem, seconds: float) -> int:
     """Pairs in use of the best set that CP-SAT finds by itself, without our hint."""
     from ortools.sat.python import cp_model
 

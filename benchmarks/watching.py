@@ -8,20 +8,36 @@ and the detector looks at what its receiver gives, at 5 pictures a second and th
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import os
 import sys
 from collections.abc import Iterator
+from contextlib import aclosing
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from benchmarks.stats import Row, table
-from tests.vision.recordings import EMPTY_LAWN, GARDEN, HAND, PASSERS_BY, PEOPLE, covered, pictures
-from zscout.simulation.plan import shipped_plans
-from zscout.trials.watch import DRAWN, Watched, batch, cases
-from zscout.vision.motion import MotionDetector
+from tests.behaviors.perception.recordings import (
+    EMPTY_LAWN,
+    GARDEN,
+    HAND,
+    PASSERS_BY,
+    PEOPLE,
+    covered,
+    pictures,
+)
+from zscout.behaviors.perception.motion import MotionDetector
+from zscout.lab.building.plan_file import shipped_plans
+from zscout.lab.study.process_pool import answers
+from zscout.lab.trials.watch import (
+    DRAWN,
+    Watched,
+    cases,
+    watch_case,
+)
 
 AIM = 95.0
 """Percent of the crossings alerted within a second."""
@@ -35,11 +51,19 @@ def simulated(
     buildings: list[str], seeds: int, seconds: float, processes: int
 ) -> dict[tuple[str, float], Watched]:
     """By building and level of noise."""
-    todo = cases(buildings, seeds=seeds)
+    todo = cases(buildings, seeds=seeds, seconds=seconds)
     sums: dict[tuple[str, float], Watched] = {}
-    for number, (case, watched) in enumerate(batch(todo, seconds=seconds, processes=processes), 1):
-        sums.setdefault((case.building, case.noise), Watched()).add(watched)
-        print(f"{number} of {len(todo)}", end="\r", file=sys.stderr, flush=True)
+
+    async def carry_out() -> None:
+        async with aclosing(answers(watch_case, todo, processes)) as found:
+            number = 0
+            async for watched in found:
+                case = todo[number]
+                number += 1
+                sums.setdefault((case.building, case.noise), Watched()).add(watched)
+                print(f"{number} of {len(todo)}", end="\r", file=sys.stderr, flush=True)
+
+    asyncio.run(carry_out())
     return dict(sorted(sums.items()))
 
 

@@ -13,7 +13,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
 
-from zscout.scheduling.model import SECOND, Ns
+from zscout.types import SECOND, Ns
 
 INDENT = "    "
 REWRITE = "ZSCOUT_REWRITE"

@@ -15,29 +15,36 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from zscout.behaviors.arc import Held, Revoked, hold, holds
-    from zscout.behaviors.blocking import Lab, connect
-    from zscout.behaviors.client import Client, CommandRefused, RequestRefused
-    from zscout.components.component import Component, Stage
+    from zscout.behaviors.client.arc import (
+        Held,
+        Revoked,
+        hold,
+        holds,
+    )
+    from zscout.behaviors.client.blocking import Lab, connect
+    from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+    from zscout.behaviors.components.component import Component, ComponentContext, Stage
 
 _HOME = {
-    "Client": "zscout.behaviors.client",
-    "CommandRefused": "zscout.behaviors.client",
-    "Component": "zscout.components.component",
-    "Held": "zscout.behaviors.arc",
-    "Lab": "zscout.behaviors.blocking",
-    "RequestRefused": "zscout.behaviors.client",
-    "Revoked": "zscout.behaviors.arc",
-    "Stage": "zscout.components.component",
-    "connect": "zscout.behaviors.blocking",
-    "hold": "zscout.behaviors.arc",
-    "holds": "zscout.behaviors.arc",
+    "Client": "zscout.behaviors.client.client",
+    "CommandRefused": "zscout.behaviors.client.client",
+    "Component": "zscout.behaviors.components.component",
+    "ComponentContext": "zscout.behaviors.components.component",
+    "Held": "zscout.behaviors.client.arc",
+    "Lab": "zscout.behaviors.client.blocking",
+    "RequestRefused": "zscout.behaviors.client.client",
+    "Revoked": "zscout.behaviors.client.arc",
+    "Stage": "zscout.behaviors.components.component",
+    "connect": "zscout.behaviors.client.blocking",
+    "hold": "zscout.behaviors.client.arc",
+    "holds": "zscout.behaviors.client.arc",
 }
 
 __all__ = [
     "Client",
     "CommandRefused",
     "Component",
+    "ComponentContext",
     "Held",
     "Lab",
     "RequestRefused",

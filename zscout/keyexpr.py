@@ -22,7 +22,7 @@ ROOT = "zscout"
 MAX_DIGITS = 15
 """Of an incarnation."""
 REMEMBERED = 4_096
-"""Valid names that are not looked at again."""
+"""Valid names that are not checked again."""
 
 
 class BadName(ValueError):
@@ -69,7 +69,7 @@ def check_need(need: str) -> str:
 
 @lru_cache(REMEMBERED)
 def matcher(need: str) -> Callable[[str], bool]:
-    """Tells whether an RC's name matches a pattern, as Zenoh's key expressions do."""
+    """A test of RC names for a pattern, which matches as Zenoh's key expressions do."""
     kind, _, name = need.partition("#")[0].partition("/")
 
     def matches(rc: str) -> bool:
@@ -117,7 +117,7 @@ def incarnation_of(instance: str) -> int:
 
 
 class Sender(NamedTuple):
-    """Who speaks: `<host>/<client>`."""
+    """A process that sends queries and publications: `<host>/<client>`."""
 
     host: str
     client: str
@@ -127,7 +127,7 @@ class Sender(NamedTuple):
 
 
 class Token(NamedTuple):
-    """A liveliness token: who is alive. `name` is `kind/name` for an RC."""
+    """A liveliness token: what is alive. `name` is `kind/name` for an RC."""
 
     host: str
     role: str
@@ -136,7 +136,7 @@ class Token(NamedTuple):
 
 
 class Role:
-    """The roles under which something says that it is alive."""
+    """The roles of liveliness tokens."""
 
     NODE = "node"
     CANDIDATE = "candidate"
@@ -148,11 +148,38 @@ class Role:
     COMPONENT = "component"
 
 
+class _Key:
+    """A key expression of the fleet that needs nothing but the fleet's name."""
+
+    def __init__(self, suffix: str) -> None:
+        self._suffix = suffix
+
+    def __get__(self, keys: Keys, _: object = None) -> str:
+        return f"{keys.base}/{self._suffix}"
+
+
 @dataclass(frozen=True, slots=True)
 class Keys:
     """The keys of one fleet. Arguments must be valid names; each method checks its own."""
 
     fleet: str
+
+    everything = _Key("**")
+    schedule_any = _Key("rcm/schedule/*/*")
+    grants = _Key("rcm/grants")
+    rcm_state = _Key("rcm/state")
+    rc_state_any = _Key("rc/*/*/state")
+    frame_any = _Key("rc/*/*/frame")
+    load_any = _Key("host/*/load")
+    component_any = _Key("host/*/component")
+    rank = _Key("balancer/rank")
+    placer = _Key("placer/component")
+    placements = _Key("placer/placements")
+    notice_any = _Key("client/*/*/notice")
+    requests_any = _Key("client/*/*/requests")
+    behavior_any = _Key("client/*/*/behavior")
+    building_plan_any = _Key("building/*/*/plan")
+    building_poses_any = _Key("building/*/*/poses")
 
     def __post_init__(self) -> None:
         check_name(self.fleet, "fleet")
@@ -161,26 +188,10 @@ class Keys:
     def base(self) -> str:
         return f"{ROOT}/{self.fleet}"
 
-    @property
-    def everything(self) -> str:
-        return f"{self.base}/**"
-
     # RCM
 
     def schedule(self, sender: Sender) -> str:
         return f"{self.base}/rcm/schedule/{_sender(sender)}"
-
-    @property
-    def schedule_any(self) -> str:
-        return f"{self.base}/rcm/schedule/*/*"
-
-    @property
-    def grants(self) -> str:
-        return f"{self.base}/rcm/grants"
-
-    @property
-    def rcm_state(self) -> str:
-        return f"{self.base}/rcm/state"
 
     # Resource controllers
 
@@ -196,83 +207,35 @@ class Keys:
     def rc_state(self, rc: str) -> str:
         return f"{self.base}/rc/{check_rc(rc)}/state"
 
-    @property
-    def rc_state_any(self) -> str:
-        return f"{self.base}/rc/*/*/state"
-
     def frame(self, rc: str) -> str:
         return f"{self.base}/rc/{check_rc(rc)}/frame"
-
-    @property
-    def frame_any(self) -> str:
-        return f"{self.base}/rc/*/*/frame"
 
     # Hosts
 
     def load(self, host: str) -> str:
         return f"{self.base}/host/{check_name(host, 'host')}/load"
 
-    @property
-    def load_any(self) -> str:
-        return f"{self.base}/host/*/load"
-
     def component(self, host: str) -> str:
         return f"{self.base}/host/{check_name(host, 'host')}/component"
-
-    @property
-    def component_any(self) -> str:
-        return f"{self.base}/host/*/component"
-
-    @property
-    def rank(self) -> str:
-        return f"{self.base}/balancer/rank"
-
-    @property
-    def placer(self) -> str:
-        return f"{self.base}/placer/component"
-
-    @property
-    def placements(self) -> str:
-        return f"{self.base}/placer/placements"
 
     # Clients
 
     def notice(self, client: Sender) -> str:
         return f"{self.base}/client/{_sender(client)}/notice"
 
-    @property
-    def notice_any(self) -> str:
-        return f"{self.base}/client/*/*/notice"
-
     def requests(self, client: Sender) -> str:
         return f"{self.base}/client/{_sender(client)}/requests"
 
-    @property
-    def requests_any(self) -> str:
-        return f"{self.base}/client/*/*/requests"
-
     def behavior(self, client: Sender) -> str:
         return f"{self.base}/client/{_sender(client)}/behavior"
-
-    @property
-    def behavior_any(self) -> str:
-        return f"{self.base}/client/*/*/behavior"
 
     # Simulated buildings
 
     def building_plan(self, client: Sender) -> str:
         return f"{self.base}/building/{_sender(client)}/plan"
 
-    @property
-    def building_plan_any(self) -> str:
-        return f"{self.base}/building/*/*/plan"
-
     def building_poses(self, client: Sender) -> str:
         return f"{self.base}/building/{_sender(client)}/poses"
-
-    @property
-    def building_poses_any(self) -> str:
-        return f"{self.base}/building/*/*/poses"
 
     # Liveliness
 
@@ -290,7 +253,7 @@ class Keys:
     # Parsing: each raises BadName for a key of another form
 
     def sender_of(self, key: str) -> Sender:
-        """Who sent a request or command, or owns the key of a client or a building."""
+        """The sender of a request or command, or the owner of the key of a client or a building."""
         chunks = self._chunks(key)
         match chunks:
             case ["rcm", "schedule", host, client] | ["rc", _, _, "command", host, client]:

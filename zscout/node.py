@@ -17,19 +17,19 @@ import click
 import uvloop
 
 from zscout import __version__
-from zscout.config import Framegrabber, Node, Radio, RcSpec, Robot, Video, default_node, load_node
-from zscout.drivers.base import Driver, ResourceController
-from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
-from zscout.drivers.video import VideoDriver
+from zscout.config.devices import RobotRc
+from zscout.config.node import Node, default_node, load_node
+from zscout.config.strict import BadInput
+from zscout.drivers.registry import driver_for
+from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
-from zscout.mesh import Mesh, MeshError
-from zscout.scheduling.model import SECOND
-from zscout.services.candidate import Candidate
-from zscout.services.component_host import ComponentHost
-from zscout.services.load_reporter import LoadReporter
-from zscout.services.recorder_process import RecorderProcess
-from zscout.stall import StallWatch
-from zscout.strict import BadInput
+from zscout.mesh import Mesh, MeshError, ZenohMesh
+from zscout.mesh.stall import StallWatch
+from zscout.services.node.component_host import ComponentHost
+from zscout.services.node.load_reporter import LoadReporter
+from zscout.services.rcm.candidate import Candidate
+from zscout.services.recorder.process import RecorderProcess
+from zscout.types import SECOND
 
 log = logging.getLogger("zscout.node")
 
@@ -38,29 +38,46 @@ ALONE_AFTER = 3.0
 """Seconds after which a node that is linked to nobody says so."""
 
 
+class NodeFailed(Exception):
+    """A service of the node failed, and the node can't go on without it. It has been logged."""
+
+
 async def run_node(node: Node, stop: asyncio.Event) -> None:
-    """Runs a node until `stop`. Raises MeshError where it can't begin."""
+    """Runs a node until `stop`. Raises MeshError where it can't begin, NodeFailed where it can't go on."""
     me = Sender(node.host, "node")
+    async with await ZenohMesh.open(node.fleet.name, me, node.fleet.mesh) as mesh:
+        await run_services(node, mesh, stop)
+
+
+async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
+    """The services of a node, until `stop` or until one fails. The recorder, the load reporter and the
+    candidate start again by themselves; an RC and the component host end the node, and all in order."""
+    me, failures = mesh.me, list[Exception]()
+
+    def fail(error: Exception) -> None:
+        failures.append(error)
+        stop.set()
+
     async with AsyncExitStack() as stack:
-        mesh = await stack.enter_async_context(await Mesh.open(node.fleet.name, me, node.fleet.mesh))
         await _refuse_twin(mesh)
-        stall = StallWatch().start()
+        stall = StallWatch(mesh.now).start()
         stack.callback(stall.stop)
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
         stack.callback(token.close)
         # Robots end first: their last word goes through a radio, which may be one of this node.
-        for spec in sorted(node.rcs, key=lambda spec: isinstance(spec.device, Robot)):
+        for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
             rc = ResourceController(
                 mesh,
                 spec.name,
                 driver_for(spec),
                 hold_lease=node.fleet.timing.hold_lease / SECOND,
                 stall=stall,
+                on_failure=fail,
             )
             await rc.start()
             stack.push_async_callback(rc.stop)
-            log.info("runs %s (%s)", spec.name, spec.driver)
-        components = ComponentHost(mesh, node.fleet, node.components)
+            log.info("runs %s (%s)", spec.name, type(spec).__struct_config__.tag)
+        components = ComponentHost(mesh, node.fleet, node.components, fail)
         if node.load:
             reporter = LoadReporter(mesh, node.labels, components, tree=node.load == "tree")
             reporter.start()
@@ -81,37 +98,8 @@ async def run_node(node: Node, stop: asyncio.Event) -> None:
         stack.callback(alone.cancel)
         await stop.wait()
         log.info("stopping")
-
-
-def driver_for(spec: RcSpec) -> Driver:
-    """The driver that an RC of a node file asks for."""
-    activation = spec.activation / SECOND
-    # What a device needs is loaded where there is one: pyserial, OpenCV.
-    match spec.device:
-        case Radio() as radio:
-            from zscout.drivers.radio import RadioDriver
-
-            return RadioDriver(radio.port, baud=radio.baud, bound=radio.bound / SECOND)
-        case Robot() as robot:
-            from zscout.drivers.robot import RobotDriver
-
-            return RobotDriver(
-                robot.id,
-                radio=robot.radio,
-                channels=robot.channels,
-                warm_up=robot.warm_up / SECOND,
-                dead_man=robot.dead_man / SECOND,
-            )
-        case Video():
-            return VideoDriver()
-        case Framegrabber() as grabber:
-            from zscout.drivers.framegrabber import FramegrabberDriver
-
-            return FramegrabberDriver(grabber.sources, rate=grabber.rate, quality=grabber.quality)
-        case None if spec.driver == "capacity":
-            return CapacityDriver(spec.capacity, activation=activation)
-        case None:
-            return ExclusiveDriver(activation=activation)
+    if failures:
+        raise NodeFailed(f"a service failed: {failures[0]!r}; see the log") from failures[0]
 
 
 async def _refuse_twin(mesh: Mesh) -> None:
@@ -160,7 +148,7 @@ def main(file: Path | None, log_level: str) -> None:
     except BadInput as error:
         click.echo(f"zscout-node: {error}", err=True)
         sys.exit(2)
-    except MeshError as error:
+    except (MeshError, NodeFailed) as error:
         click.echo(f"zscout-node: {error}", err=True)
         sys.exit(1)
 

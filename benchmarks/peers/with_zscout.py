@@ -8,9 +8,9 @@ from pathlib import Path
 
 from benchmarks.peers.peer import LEASE, RCS, Peer, Session, Waiting, package
 from tests.live.lab import Lab
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import OpenArc
-from zscout.config import load_fleet
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
+from zscout.config.fleet import load_fleet
 
 HOLD = 60.0
 

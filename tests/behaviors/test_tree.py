@@ -7,10 +7,10 @@ from typing import Any, cast
 
 import pytest
 
-from zscout.behaviors.client import Client
-from zscout.behaviors.sensor_net.alerts import QUIET, Alerts
+from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.blindness import BAD_FOR, Blindness
-from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, Saying, Scene
+from zscout.behaviors.sensor_net.scout import QUIET, Alerts
+from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, BehaviorContext, BehaviorStatus
 
 
 class Count(Behavior):
@@ -20,11 +20,11 @@ class Count(Behavior):
         super().__init__(name)
         self.to, self.fails, self.count = to, fails, 0
 
-    async def run(self, scene: Scene) -> None:
+    async def run(self, context: BehaviorContext) -> None:
         while self.count < self.to:
             self.count += 1
-            self.say("counting", str(self.count))
-            await scene.safe_point()
+            self.report("counting", str(self.count))
+            await context.safe_point()
         if self.fails:
             raise RuntimeError(self.path)
 
@@ -38,18 +38,18 @@ class Count(Behavior):
 class All(Behavior):
     failures: list[BaseException]
 
-    async def run(self, scene: Scene) -> None:
-        self.failures = await self.side_by_side(scene, self.children)
+    async def run(self, context: BehaviorContext) -> None:
+        self.failures = await self.side_by_side(context, self.children)
 
 
-def played(root: Behavior) -> list[Saying]:
-    said: list[Saying] = []
+def played(root: Behavior) -> list[BehaviorStatus]:
+    said: list[BehaviorStatus] = []
 
     async def safe_point() -> None:
         await asyncio.sleep(0)
 
     nobody = cast("Client", None)  # nothing here speaks to the mesh
-    asyncio.run(root.play(Scene(nobody, safe_point, said.append)))
+    asyncio.run(root.perform(BehaviorContext(nobody, safe_point, said.append)))
     return said
 
 
@@ -66,11 +66,11 @@ def test_one_that_fails_leaves_the_others_at_work() -> None:
 
 def test_the_same_said_again_is_told_once() -> None:
     class Same(Behavior):
-        async def run(self, scene: Scene) -> None:
+        async def run(self, context: BehaviorContext) -> None:
             for _ in range(3):
-                self.say("watch")
-            self.say("watch", alert=True)
-            self.say("watch", camera="framegrabber/f1", boxes=[(1, 2, 3, 4)])
+                self.report("watch")
+            self.report("watch", alert=True)
+            self.report("watch", camera="framegrabber/f1", boxes=[(1, 2, 3, 4)])
 
     said = played(Same("one"))
     assert [(s.doing, s.alert, len(s.boxes)) for s in said] == [

@@ -7,7 +7,6 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 from decimal import Decimal
 from pathlib import Path
 
@@ -17,10 +16,10 @@ from click.testing import CliRunner
 
 from tests.cli import tools
 from tests.live.lab import Lab
-from zscout.cli.arguments import gather_needs, parse_duration, parse_need
 from zscout.cli.common import plain_table, span
 from zscout.cli.main import COMMANDS, main
-from zscout.strict import BadInput
+from zscout.cli.requests.arguments import gather_needs, parse_duration, parse_need
+from zscout.config.strict import BadInput
 
 HEAVY = ("zenoh", "rich", "rerun", "msgspec", "numpy", "cv2")
 
@@ -89,12 +88,10 @@ def test_a_fleet_file_that_is_not_there_is_named() -> None:
 
 
 @pytest.mark.live
-def test_a_mesh_without_an_rcm_is_3_within_seconds(tmp_path: Path) -> None:
+def test_a_mesh_without_an_rcm_is_3(tmp_path: Path) -> None:
     lab = Lab(tmp_path)
-    begin = time.monotonic()
     done = zscout("--fleet", str(lab.fleet_file), "request", "robot/a")
     assert done.returncode == 3
-    assert time.monotonic() - begin < 10
     who = "(no other program either); start zscout-node"
     assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} {who}")
     assert done.stderr.count("\n") == 1

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zscout.config import FLEET_VARIABLE
+from zscout.config.fleet import FLEET_VARIABLE
 
 
 @pytest.fixture(autouse=True)

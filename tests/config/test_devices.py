@@ -6,13 +6,14 @@ import subprocess
 import sys
 
 import pytest
+from msgspec import structs
 
 from tests.config.kit import RC_RULE, short, write
-from zscout import config
-from zscout.config import Framegrabber, Radio, Robot, Video
-from zscout.node import driver_for
-from zscout.scheduling.model import SECOND
-from zscout.strict import BadInput
+from zscout.config.devices import ExclusiveRc, FramegrabberRc, RadioRc, RcConfig, RobotRc, VideoRc
+from zscout.config.node import load_node
+from zscout.config.strict import BadInput
+from zscout.drivers.registry import driver_for
+from zscout.types import SECOND
 
 
 def table(name: str, **keys: str) -> str:
@@ -22,9 +23,9 @@ def table(name: str, **keys: str) -> str:
     return "[[rc]]\n" + "\n".join(lines) + "\n"
 
 
-def device(text: str) -> config.Device | None:
-    (rc,) = config.load_node(write("node.toml", text)).rcs
-    return rc.device
+def device(text: str) -> RcConfig:
+    (rc,) = load_node(write("node.toml", text)).rcs
+    return rc
 
 
 def robot(**keys: str) -> str:
@@ -117,25 +118,32 @@ def test_a_bad_device_is_one_line_that_says_how_to_mend_it(text: str, line: str)
 
 
 def test_what_a_table_says_and_what_it_leaves_out() -> None:
-    assert device(radio()) == Radio("/dev/ttyUSB0", 9600, SECOND // 4)
-    assert device(radio(port='"socket://mast:4001"', baud="1200", bound="1.5")) == Radio(
-        "socket://mast:4001", 1200, 3 * SECOND // 2
+    assert device(radio()) == RadioRc(name="radio/r", port="/dev/ttyUSB0", baud=9600, bound=SECOND // 4)
+    assert device(radio(port='"socket://mast:4001"', baud="1200", bound="1.5")) == RadioRc(
+        name="radio/r", port="socket://mast:4001", baud=1200, bound=3 * SECOND // 2
     )
-    assert device(robot()) == Robot(33, "radio/r", {}, 2 * SECOND, SECOND // 2)
+    plain = RobotRc(
+        name="robot/a", id=33, radio="radio/r", channels={}, warm_up=2 * SECOND, dead_man=SECOND // 2
+    )
+    assert device(robot()) == plain
+    channels = {"video/1": 1, "video/2": 15}
     told = robot(channels='{ "video/1" = 1, "video/2" = 15 }', warm_up="0", dead_man="0.3")
-    assert device(told) == Robot(33, "radio/r", {"video/1": 1, "video/2": 15}, 0, 3 * SECOND // 10)
-    assert device(table("video/1")) == Video()
-    assert device(table("framegrabber/f", source='"/dev/video0"')) == Framegrabber(
-        {"": "/dev/video0"}, 10.0, 80
+    assert device(told) == structs.replace(plain, channels=channels, warm_up=0, dead_man=3 * SECOND // 10)
+    assert device(table("video/1")) == VideoRc(name="video/1")
+    grabber = device(table("framegrabber/f", source='"/dev/video0"'))
+    assert isinstance(grabber, FramegrabberRc)
+    assert (grabber.by_video, grabber.rate, grabber.quality) == ({"": "/dev/video0"}, 10.0, 80)
+    grabber = device(
+        table("framegrabber/f", sources='{ "video/1" = "http://a/1" }', rate="2.5", quality="60")
     )
-    told = table("framegrabber/f", sources='{ "video/1" = "http://a/1" }', rate="2.5", quality="60")
-    assert device(told) == Framegrabber({"video/1": "http://a/1"}, 2.5, 60)
-    assert device(table("robot/a", driver="exclusive")) is None
+    assert isinstance(grabber, FramegrabberRc)
+    assert (grabber.by_video, grabber.rate, grabber.quality) == ({"video/1": "http://a/1"}, 2.5, 60)
+    assert device(table("robot/a", driver="exclusive")) == ExclusiveRc(name="robot/a")
 
 
 def test_every_device_has_its_driver() -> None:
     text = radio() + robot() + table("video/1") + table("robot/b", driver="exclusive", activation="1.5")
-    drivers = [driver_for(rc) for rc in config.load_node(write("node.toml", text)).rcs]
+    drivers = [driver_for(rc) for rc in load_node(write("node.toml", text)).rcs]
     assert [type(driver).__name__ for driver in drivers] == [
         "RadioDriver",
         "RobotDriver",

@@ -7,10 +7,19 @@ from pathlib import Path
 import pytest
 
 from tests.config.kit import ENDPOINT_RULE, MULTICAST_RULE, NAME_RULE, short, write
-from zscout import config
-from zscout.scheduling.model import SECOND
-from zscout.scheduling.policy import Policy
-from zscout.strict import BadInput
+from zscout.config.fleet import (
+    FLEET_VARIABLE,
+    Fleet,
+    MeshConfig,
+    RcmLimits,
+    Timing,
+    default_fleet,
+    fleet_from_env,
+    load_fleet,
+)
+from zscout.config.scheduling_policy import SchedulingPolicy
+from zscout.config.strict import BadInput
+from zscout.types import SECOND
 
 SYNTAX = "mend the TOML there or just before"
 
@@ -137,8 +146,8 @@ BAD_FLEETS = {
 }
 
 
-def fleet(text: str) -> config.Fleet:
-    return config.load_fleet(write("lab.toml", text))
+def fleet(text: str) -> Fleet:
+    return load_fleet(write("lab.toml", text))
 
 
 @pytest.mark.parametrize(("text", "line"), BAD_FLEETS.items(), ids=map(short, BAD_FLEETS))
@@ -150,15 +159,15 @@ def test_bad_fleet_file(text: str, line: str) -> None:
 
 def test_an_empty_fleet_file_means_the_defaults() -> None:
     made = fleet("")
-    assert made == config.default_fleet()
+    assert made == default_fleet()
     assert (made.name, made.candidates, made.strategy, made.operator_priority) == (
         "zscout",
         (),
         "adaptive",
         10,
     )
-    assert made.policy == Policy()
-    assert made.mesh == config.Mesh(
+    assert made.scheduling == SchedulingPolicy()
+    assert made.mesh == MeshConfig(
         listen=(),
         connect=(),
         multicast=True,
@@ -166,8 +175,8 @@ def test_an_empty_fleet_file_means_the_defaults() -> None:
         interface="auto",
         lease=1.0,
     )
-    assert made.limits == config.Limits(10_000, 64, 256, 65_536)
-    assert made.timing == config.Timing(500_000_000, 3_000_000_000, 250_000_000, 200_000_000)
+    assert made.limits == RcmLimits(10_000, 64, 256, 65_536)
+    assert made.timing == Timing(500_000_000, 3_000_000_000, 250_000_000, 200_000_000)
 
 
 def test_every_key_of_a_fleet_file() -> None:
@@ -201,12 +210,12 @@ def test_every_key_of_a_fleet_file() -> None:
         rebuild = 1.25
         """
     )
-    assert made == config.Fleet(
+    assert made == Fleet(
         name="lab",
         candidates=("anvil", "bench"),
         strategy="adaptive",
-        policy=Policy("after_min_runtime", 7, 5 * SECOND // 2, "all", 5),
-        mesh=config.Mesh(
+        scheduling=SchedulingPolicy("after_min_runtime", 7, 5 * SECOND // 2, "all", 5),
+        mesh=MeshConfig(
             listen=("tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"),
             connect=("quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"),
             multicast=False,
@@ -214,30 +223,30 @@ def test_every_key_of_a_fleet_file() -> None:
             interface="eth0,wlan0",
             lease=2.0,
         ),
-        limits=config.Limits(1, 2, 3, 4096, 5),
-        timing=config.Timing(SECOND // 10, 5 * SECOND, 3 * SECOND // 10, 5 * SECOND // 4),
+        limits=RcmLimits(1, 2, 3, 4096, 5),
+        timing=Timing(SECOND // 10, 5 * SECOND, 3 * SECOND // 10, 5 * SECOND // 4),
     )
     assert isinstance(made.mesh.lease, float)
 
 
 def test_the_fleet_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert config.fleet_from_env() == config.default_fleet()
-    monkeypatch.setenv(config.FLEET_VARIABLE, "")
-    assert config.fleet_from_env() == config.default_fleet()
-    monkeypatch.setenv(config.FLEET_VARIABLE, str(write("lab.toml", '[fleet]\nname = "lab"')))
-    assert config.fleet_from_env().name == "lab"
-    monkeypatch.setenv(config.FLEET_VARIABLE, "no.toml")
+    assert fleet_from_env() == default_fleet()
+    monkeypatch.setenv(FLEET_VARIABLE, "")
+    assert fleet_from_env() == default_fleet()
+    monkeypatch.setenv(FLEET_VARIABLE, str(write("lab.toml", '[fleet]\nname = "lab"')))
+    assert fleet_from_env().name == "lab"
+    monkeypatch.setenv(FLEET_VARIABLE, "no.toml")
     with pytest.raises(BadInput, match=r"^no\.toml: there is no such file; .* \(named by \$ZSCOUT_FLEET\)$"):
-        config.fleet_from_env()
+        fleet_from_env()
 
 
 def test_a_byte_order_mark_is_no_error() -> None:
     Path("lab.toml").write_bytes(b"\xef\xbb\xbf[fleet]\r\nname = 'lab'\r\n")
-    assert config.load_fleet(Path("lab.toml")).name == "lab"
+    assert load_fleet(Path("lab.toml")).name == "lab"
 
 
 def test_an_error_is_one_printable_line_whatever_the_file_says() -> None:
     path = write("l\x1b[31m\nab.toml", '"\\u001b[2J\\u202e\\n" = 1')
     with pytest.raises(BadInput) as caught:
-        config.load_fleet(path)
+        load_fleet(path)
     assert str(caught.value).isprintable()

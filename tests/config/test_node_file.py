@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-from fractions import Fraction
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
 
 from tests.config.kit import ENDPOINT_RULE, NAME_RULE, RC_RULE, short, write
-from zscout import config, strict
-from zscout.strict import BadInput, Where
+from zscout.config import strict
+from zscout.config.devices import CapacityRc, ExclusiveRc
+from zscout.config.fleet import MeshConfig, default_fleet
+from zscout.config.node import Node, RecorderConfig, default_node, load_node
+from zscout.config.strict import BadInput, Where
 
 ROBOT = '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
 RADIO = '[[rc]]\nname = "radio/r"\ndriver = "capacity"\n'
@@ -81,8 +84,8 @@ BAD_NODES = {
 }
 
 
-def node(text: str) -> config.Node:
-    return config.load_node(write("node.toml", text))
+def node(text: str) -> Node:
+    return load_node(write("node.toml", text))
 
 
 @pytest.mark.parametrize(("text", "line"), BAD_NODES.items(), ids=map(short, BAD_NODES))
@@ -124,31 +127,31 @@ def test_every_key_of_a_node_file() -> None:
         allow_remote = true
         """,
     )
-    made = config.load_node(path)
+    made = load_node(path)
     assert made.fleet.name == "lab"
-    assert made.fleet.mesh == config.Mesh(
+    assert made.fleet.mesh == MeshConfig(
         listen=("tcp/a:1",), connect=("tcp/b:3",), interface="eth1", lease=0.5
     )
     assert (made.host, made.candidate, made.load) == ("anvil", False, False)
     assert made.labels == ("gpu", "arm64")
     assert made.rcs == (
-        config.RcSpec("robot/scout33", "exclusive", {}, 2_500_000_000),
-        config.RcSpec("radio/rf0", "capacity", {"command_rate": Fraction(10), "share": Fraction(1, 10)}, 0),
+        ExclusiveRc(name="robot/scout33", activation=2_500_000_000),
+        CapacityRc(name="radio/rf0", capacity={"command_rate": Decimal(10), "share": Decimal("0.1")}),
     )
-    assert made.recorder == config.Recorder(Path("hosts/tapes"), "0.0.0.0", 1234)  # noqa: S104
+    assert made.recorder == RecorderConfig(Path("hosts/tapes"), "0.0.0.0", 1234)  # noqa: S104
 
 
 def test_an_empty_node_file_means_the_defaults() -> None:
     made = node("")
-    assert made == config.default_node()
-    assert (made.fleet, made.candidate, made.load, made.rcs) == (config.default_fleet(), True, True, ())
+    assert made == default_node()
+    assert (made.fleet, made.candidate, made.load, made.rcs) == (default_fleet(), True, True, ())
     assert (made.recorder, made.labels) == (None, ())
     assert strict.check_name(made.host, Where("host")) == made.host
 
 
 def test_an_empty_recorder_table_records_on_loopback() -> None:
     recorder = node("[recorder]").recorder
-    assert recorder == config.Recorder(Path("runs"), "127.0.0.1", 9876)
+    assert recorder == RecorderConfig(Path("runs"), "127.0.0.1", 9876)
     assert node('[recorder]\nbind = "localhost"').recorder == recorder
     other = node('[recorder]\nbind = "::1"').recorder
     assert other is not None

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from tests.config.kit import write
-from zscout import strict
-from zscout.strict import BadInput, Where
+from zscout.config import strict
+from zscout.config.strict import BadInput, Where
 
 
 @contextmanager

@@ -6,16 +6,17 @@ import asyncio
 from typing import Any
 
 from tests.live.lab import START, Lab
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import OpenArc
-from zscout.drivers.base import Driver, ResourceController
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
+from zscout.drivers.driver import Driver
+from zscout.drivers.packets import Packet
+from zscout.drivers.resource_controller import ResourceController
 from zscout.drivers.robot import RobotDriver
 from zscout.keyexpr import Sender
-from zscout.mesh import Mesh
+from zscout.mesh import Mesh, ZenohMesh
+from zscout.mesh.stall import StallWatch
 from zscout.messages import Command, Done
-from zscout.packets import Packet
-from zscout.scheduling.model import SECOND, Grant
-from zscout.stall import StallWatch
+from zscout.types import SECOND, Grant
 
 RADIO = {"radio/rf0": {"command_rate": 10}}
 GANG: dict[str, Any] = {"robot/r1": {}, "video/ch1": {}, **RADIO}
@@ -49,7 +50,7 @@ class Post:
         name = f"{host}/{client}"
         if name not in self.meshes:
             fleet = self.lab.fleet
-            self.meshes[name] = await Mesh.open(fleet.name, Sender(host, client), fleet.mesh)
+            self.meshes[name] = await ZenohMesh.open(fleet.name, Sender(host, client), fleet.mesh)
         return self.meshes[name]
 
     async def rc(self, host: str, name: str, driver: Driver) -> ResourceController:

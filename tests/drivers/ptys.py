@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.live.lab import START
-from zscout import clock
-from zscout.packets import Decoder, Packet
-from zscout.scheduling.model import SECOND, Ns
+from zscout.drivers.packets import Packet, PacketDecoder
+from zscout.mesh import clock
+from zscout.types import SECOND, Ns
 
 
 class PtyLine:
@@ -22,7 +22,7 @@ class PtyLine:
     def __init__(self, link: Path, *, baud: int = 9600, reads: bool = True) -> None:
         self.link, self.baud = link, baud
         self.heard: list[tuple[Ns, Packet]] = []
-        self.decoder = Decoder()
+        self.decoder = PacketDecoder()
         self.backlog: Ns = 0
         """The longest that the line had still to carry when more was written to it."""
         self._free: Ns = 0

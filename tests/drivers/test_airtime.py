@@ -16,7 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.thorough import times
-from zscout.drivers.air_queue import MAX_WAITING, AirQueue, Full, Outgoing
 from zscout.drivers.airtime import (
     MAX_RATE,
     URGENT,
@@ -28,9 +27,24 @@ from zscout.drivers.airtime import (
     share_of,
     urgent_burst,
 )
-from zscout.drivers.orders import RadioCamera, RadioDrive
-from zscout.packets import MAX_PACKET, Camera, Drive, Halt, Packet, Stop, encode
-from zscout.scheduling.model import NO_TERM, SECOND, Grant, Ns, Place
+from zscout.drivers.commands import RadioCamera, RadioDrive
+from zscout.drivers.packets import (
+    MAX_PACKET,
+    CameraPacket,
+    DrivePacket,
+    HaltPacket,
+    Packet,
+    StopPacket,
+    encode,
+)
+from zscout.drivers.transmit_queue import MAX_WAITING, OutgoingPacket, QueueFull, TransmitQueue
+from zscout.types import (
+    NO_TERM,
+    SECOND,
+    Grant,
+    Ns,
+    Place,
+)
 
 BOUND = Fraction(1, 4)
 
@@ -53,7 +67,7 @@ shares = st.lists(st.builds(Share, rates, sizes), min_size=1, max_size=12)
 bauds = st.sampled_from([1200, 2400, 9600, 19_200, 115_200])
 
 
-def fill(queue: AirQueue, holders: int) -> None:
+def fill(queue: TransmitQueue, holders: int) -> None:
     """So many holders, each with a packet for its own robot, at time 0."""
     for number in range(holders):
         queue.join(place(number), Share(Fraction(1), Fraction(10)), 0)
@@ -146,7 +160,7 @@ Action: TypeAlias = tuple[Ns, Callable[[], object]]
 class Told:
     """What one run of a queue brought."""
 
-    outgoing: list[Outgoing]
+    outgoing: list[OutgoingPacket]
     written: list[Ns]
 
     @property
@@ -154,7 +168,7 @@ class Told:
         return [outgoing.packet for outgoing in self.outgoing]
 
 
-def run(queue: AirQueue, until: Ns, actions: Iterable[Action] = (), begin: Ns = 0) -> Told:
+def run(queue: TransmitQueue, until: Ns, actions: Iterable[Action] = (), begin: Ns = 0) -> Told:
     """Runs a queue from `begin` to `until`, and calls each action at its time."""
     told, now, events = Told([], []), begin, iter(actions)
     event = next(events, None)
@@ -182,7 +196,7 @@ def test_no_packet_waits_longer_than_the_bound_however_holders_time_it(
     while objection(rate, bound, wanted):
         wanted = wanted[:-1]
     rng = random.Random(seed)  # noqa: S311
-    queue = AirQueue(rate)
+    queue = TransmitQueue(rate)
     seconds = 1
     actions: list[Action] = []
 
@@ -209,12 +223,14 @@ def test_no_packet_waits_longer_than_the_bound_however_holders_time_it(
         for robot in range(len(wanted)):
             if halts.ready(URGENT) <= at:
                 halts.take(URGENT, int(at))
-                kind: type[Stop] | type[Halt] = Stop if rng.random() < 0.5 else Halt
-                actions.append((int(at), partial(queue.urge, robot + 200, kind, int(at))))
+                kind: type[StopPacket] | type[HaltPacket] = StopPacket if rng.random() < 0.5 else HaltPacket
+                actions.append((int(at), partial(queue.send_urgent, robot + 200, kind, int(at))))
         at += SECOND if greedy else rng.randrange(SECOND)
     actions.sort(key=lambda action: action[0])
     told = run(queue, 20 * SECOND, actions)
-    commands = [out for out in told.outgoing if isinstance(out.packet, Drive | Camera) and not out.echo]
+    commands = [
+        out for out in told.outgoing if isinstance(out.packet, DrivePacket | CameraPacket) and not out.repeat
+    ]
     assert queue.waiting == 0
     if any(share.rate for share in wanted):
         assert commands
@@ -233,20 +249,20 @@ def test_one_more_than_accepted_would_break_the_bound() -> None:
     rate = line_rate(9600)
     slow = [Share(Fraction(60, 13), Fraction(10))] * 13
     assert "wait" in objection(rate, BOUND, slow)
-    queue = AirQueue(rate)
+    queue = TransmitQueue(rate)
     for number, share in enumerate(slow):
         queue.join(place(number), share, 0)
     for number in range(13):
-        queue.urge(200 + number, Halt, 0)
+        queue.send_urgent(200 + number, HaltPacket, 0)
         queue.offer(place(number), grant(number), drive(number), 0)
     told = run(queue, SECOND)
-    commands = [out for out in told.outgoing if isinstance(out.packet, Drive)]
+    commands = [out for out in told.outgoing if isinstance(out.packet, DrivePacket)]
     assert len(commands) == 13
     assert max(out.through - out.entered for out in commands) / SECOND > Fraction(9, 10) * BOUND
 
 
 def test_a_faster_holder_replaces_its_own_waiting_packet_and_nobody_elses() -> None:
-    queue = AirQueue(line_rate(9600))
+    queue = TransmitQueue(line_rate(9600))
     queue.join(place(1), Share(Fraction(5), Fraction(10)), 0)
     queue.join(place(2), Share(Fraction(5), Fraction(10)), 0)
     actions: list[Action] = []
@@ -260,61 +276,61 @@ def test_a_faster_holder_replaces_its_own_waiting_packet_and_nobody_elses() -> N
     assert count == {1: 6, 2: 5}
     assert queue.replaced == 50 - 6
     # What goes out is the newest of its moment, and the last word is the last command.
-    lefts = [packet.left for packet in told.packets if isinstance(packet, Drive) and packet.robot == 1]
+    lefts = [packet.left for packet in told.packets if isinstance(packet, DrivePacket) and packet.robot == 1]
     assert lefts == sorted(lefts)
     assert lefts[-1] == 49 / 50
 
 
 def test_halts_and_stops_go_first_and_void_what_waits_for_their_robot() -> None:
-    queue = AirQueue(line_rate(1200))
+    queue = TransmitQueue(line_rate(1200))
     fill(queue, 4)
     told = []
     while (out := queue.next(0, lambda _: True)) is not None:
         told.append(out.packet)
     assert [packet.robot for packet in told] == [0, 1]  # one under way and one in the kernel
-    after = queue.urge(3, Halt, 1)
-    queue.urge(2, Stop, 2)
-    queue.urge(2, Halt, 3)
+    after = queue.send_urgent(3, HaltPacket, 1)
+    queue.send_urgent(2, StopPacket, 2)
+    queue.send_urgent(2, HaltPacket, 3)
     assert queue.replaced == 2
     assert after == round(Fraction((2 * 10 + 7) * SECOND, 120) - 1)
     rest = run(queue, 5 * SECOND, begin=3)
     kinds = [(type(packet), packet.robot) for packet in rest.packets]
-    assert kinds[:2] == [(Halt, 3), (Halt, 2)]
-    assert Counter(kinds) == {(Halt, 3): 3, (Halt, 2): 3}
+    assert kinds[:2] == [(HaltPacket, 3), (HaltPacket, 2)]
+    assert Counter(kinds) == {(HaltPacket, 3): 3, (HaltPacket, 2): 3}
 
 
 def test_what_is_said_again_stays_true() -> None:
-    """Halt, then a drive, then the camera on: whatever gets through, the robot does what was said last."""
-    queue = AirQueue(line_rate(9600), first_number=7)
+    """Halt, then a drive, then the camera on: whatever gets through, the robot does what was sent last."""
+    queue = TransmitQueue(line_rate(9600), first_number=7)
     queue.join(place(1), Share(Fraction(50), Fraction(10)), 0)
     actions: list[Action] = [
-        (0, lambda: queue.urge(1, Halt, 0)),
+        (0, lambda: queue.send_urgent(1, HaltPacket, 0)),
         (20_000_000, lambda: queue.offer(place(1), grant(1), drive(1), 20_000_000)),
     ]
     told = run(queue, SECOND, actions)
-    assert [type(packet) for packet in told.packets] == [Halt, Drive, Camera, Camera]
-    assert [packet.channel for packet in told.packets if isinstance(packet, Camera)] == [0, 0]
-    # A number comes twice only for the same packet, said again with nothing in between.
+    assert [type(packet) for packet in told.packets] == [HaltPacket, DrivePacket, CameraPacket, CameraPacket]
+    assert [packet.channel for packet in told.packets if isinstance(packet, CameraPacket)] == [0, 0]
+    # A number comes twice only for the same packet, sent again with nothing in between.
     assert [packet.number for packet in told.packets] == [7, 8, 9, 9]
 
     now = 2 * SECOND
-    queue.urge(1, Halt, now)
+    queue.send_urgent(1, HaltPacket, now)
     told = run(queue, now + 10_000_000, begin=now)
     queue.offer(place(1), grant(1), RadioCamera(1, 3), now + 20_000_000)
     told = run(queue, now + SECOND, begin=now + 20_000_000)
-    assert [type(packet) for packet in told.packets].count(Halt) == 0
-    assert Counter(type(packet) for packet in told.packets) == {Camera: 3, Stop: 2}
-    assert {packet.channel for packet in told.packets if isinstance(packet, Camera)} == {3}
+    assert [type(packet) for packet in told.packets].count(HaltPacket) == 0
+    assert Counter(type(packet) for packet in told.packets) == {CameraPacket: 3, StopPacket: 2}
+    assert {packet.channel for packet in told.packets if isinstance(packet, CameraPacket)} == {3}
 
 
 def test_what_is_said_again_keeps_to_the_reserve() -> None:
-    queue = AirQueue(line_rate(9600))
+    queue = TransmitQueue(line_rate(9600))
     for robot in range(20):
-        queue.urge(robot, Halt, 0)
+        queue.send_urgent(robot, HaltPacket, 0)
     told = run(queue, 60 * SECOND)
-    # All are said once before any is said again, however much that is at once.
+    # All are sent once before any is sent again, however much that is at once.
     assert [out.packet.robot for out in told.outgoing[:20]] == list(range(20))
-    assert not any(out.echo for out in told.outgoing[:20])
+    assert not any(out.repeat for out in told.outgoing[:20])
     assert Counter(out.packet.robot for out in told.outgoing) == dict.fromkeys(range(20), 3)
     # And then at a tenth of the line, what went out at once paid back first.
     reserve = line_rate(9600) / 10
@@ -322,15 +338,15 @@ def test_what_is_said_again_keeps_to_the_reserve() -> None:
 
 
 def test_the_first_packet_ever_is_said_again_under_a_new_number() -> None:
-    queue = AirQueue(line_rate(9600), first_number=255)
-    queue.urge(1, Halt, 0)
+    queue = TransmitQueue(line_rate(9600), first_number=255)
+    queue.send_urgent(1, HaltPacket, 0)
     assert [packet.number for packet in run(queue, SECOND).packets] == [255, 0, 0]
-    queue.urge(1, Halt, 2 * SECOND)
+    queue.send_urgent(1, HaltPacket, 2 * SECOND)
     assert [packet.number for packet in run(queue, 3 * SECOND, begin=2 * SECOND).packets] == [1, 1, 1]
 
 
 def test_a_packet_whose_hold_is_over_does_not_go_out() -> None:
-    queue = AirQueue(line_rate(300))
+    queue = TransmitQueue(line_rate(300))
     fill(queue, 4)
     first = queue.next(0, lambda _: True)
     assert first is not None
@@ -344,7 +360,7 @@ def test_a_packet_whose_hold_is_over_does_not_go_out() -> None:
 
 
 def test_what_a_share_has_no_room_for_is_refused_in_words() -> None:
-    queue = AirQueue(line_rate(9600))
+    queue = TransmitQueue(line_rate(9600))
     queue.join(place(1), Share(Fraction(0), Fraction(10)), 0)
     with pytest.raises(ValueError, match="command_rate 0"):
         queue.offer(place(1), grant(1), drive(1), 0)
@@ -355,13 +371,13 @@ def test_what_a_share_has_no_room_for_is_refused_in_words() -> None:
     queue.join(place(3), Share(Fraction(1), Fraction(10)), 0)
     for robot in range(MAX_WAITING):
         queue.offer(place(3), grant(3), drive(robot), 0)
-    with pytest.raises(Full):
+    with pytest.raises(QueueFull):
         queue.offer(place(3), grant(3), drive(200), 0)
     queue.offer(place(3), grant(3), drive(1, 0.5), 0)  # it takes the place of its own
 
 
 def test_who_joins_a_busy_line_earns_its_first_packet() -> None:
-    queue = AirQueue(line_rate(1200))
+    queue = TransmitQueue(line_rate(1200))
     fill(queue, 4)
     queue.join(place(9), Share(Fraction(1), Fraction(10)), 0)
     queue.offer(place(9), grant(9), drive(9), 0)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.drivers.mjpeg import MjpegServer, jpeg, number_of, numbered
-from zscout.drivers.capture import Capture, Captured, kind_of, shown
+from zscout.drivers.capture import Capture, CapturedFrame, kind_of, shown
 
 PATIENCE = 20.0
 """Seconds within which anything that is waited for must have come true, on a busy machine."""
@@ -38,13 +38,13 @@ def until(condition: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def picture_of(capture: Capture, after: int = 0) -> Captured:
+def picture_of(capture: Capture, after: int = 0) -> CapturedFrame:
     captured = capture.wait(after, PATIENCE)
     assert captured is not None, capture.health
     return captured
 
 
-def later(capture: Capture) -> Captured:
+def later(capture: Capture) -> CapturedFrame:
     """A picture newer than all that is there."""
     return picture_of(capture, capture.number)
 
@@ -250,7 +250,7 @@ def test_a_process_ends_whatever_its_captures_do(mode: str) -> None:
 def test_who_waits_is_let_go_by_stop() -> None:
     with MjpegServer() as server, capturing(server.url) as capture:
         picture_of(capture)
-        got: list[Captured | None] = []
+        got: list[CapturedFrame | None] = []
         waiter = threading.Thread(target=lambda: got.append(capture.wait(10**9, 600)))
         waiter.start()
         capture.stop()

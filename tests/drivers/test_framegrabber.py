@@ -8,14 +8,14 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.drivers.mjpeg import numbered
-from zscout.drivers.frame_pump import RATE_SPAN, Meter, Pace, encode, is_grey
+from zscout.drivers.frame_pump import RATE_SPAN, FrameMeter, FramePacer, encode, is_grey
 from zscout.drivers.framegrabber import FramegrabberDriver
 from zscout.messages import FrameHead
 
 
 @pytest.mark.parametrize("source", [1, 5, 9, 10, 10.2, 11, 14, 15, 20, 25, 29.97, 30, 60, 240])
 def test_a_pace_admits_no_more_than_its_rate_and_little_less(source: float) -> None:
-    pace = Pace(10)
+    pace = FramePacer(10)
     admitted = [at for at in (n / source for n in range(int(60 * source))) if pace.admits(at)]
     expected = 60 * min(10.0, source)
     assert 0.93 * expected <= len(admitted) <= expected + 1
@@ -29,14 +29,14 @@ def test_a_pace_admits_no_more_than_its_rate_and_little_less(source: float) -> N
 
 
 def test_uneven_pictures_at_the_very_rate_are_all_admitted() -> None:
-    pace = Pace(10)
+    pace = FramePacer(10)
     rng = np.random.default_rng(1)
     jitter = rng.uniform(-0.02, 0.02, 600)
     assert all(pace.admits(n / 10 + late) for n, late in enumerate(jitter))
 
 
 def test_after_a_pause_there_is_no_burst() -> None:
-    pace = Pace(10)
+    pace = FramePacer(10)
     assert pace.admits(0)
     admitted = [n for n in range(101) if pace.admits(60 + n / 100)]
     # 10 in a second, the one at its beginning, and the half interval that one may be early.
@@ -79,7 +79,7 @@ def test_rounding_makes_no_colour() -> None:
 
 
 def test_what_a_meter_tells() -> None:
-    meter = Meter()
+    meter = FrameMeter()
     assert (meter.rate(0), meter.latency()) == (0, 0)
     for number in range(41):
         head = FrameHead(number=number, time=100 + number / 10, width=160, height=120)

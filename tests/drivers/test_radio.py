@@ -12,11 +12,16 @@ from tests.drivers.post import GANG, RADIO, TURN, Post, held, is_in, robot
 from tests.drivers.ptys import PtyLine
 from tests.live.bench import answer, comes_to, until
 from tests.live.lab import START, Lab
-from zscout.behaviors.client import CommandRefused
+from zscout.behaviors.client.client import CommandRefused
+from zscout.drivers.packets import (
+    CameraPacket,
+    DrivePacket,
+    HaltPacket,
+    StopPacket,
+)
 from zscout.drivers.radio import RadioDriver
 from zscout.drivers.video import VideoDriver
-from zscout.packets import Camera, Drive, Halt, Stop
-from zscout.scheduling.model import SECOND
+from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 
@@ -62,7 +67,7 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             assert await answer(client.command("radio/rf0", shared, drive | {"robot": 77})) == "done"
             since = len(line.heard)
             await client.end(other)
-            await line.until(is_in(Halt, 77), since=since)
+            await line.until(is_in(HaltPacket, 77), since=since)
 
             # What comes faster than was asked for is replaced by the newest, at the robot or at the radio.
             since = len(line.heard)
@@ -74,12 +79,14 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             )
             last = await line.until(
                 lambda packets: (
-                    packets and isinstance(packets[-1], Drive) and packets[-1].left > 0.99 and packets
+                    packets and isinstance(packets[-1], DrivePacket) and packets[-1].left > 0.99 and packets
                 ),
                 since=since,
             )
             replaced = sum(answered.result == {"replaced": True} for answered in done)
-            assert replaced + driver.figures()["replaced"] >= 40 - sum(isinstance(p, Drive) for p in last)
+            assert replaced + driver.figures()["replaced"] >= 40 - sum(
+                isinstance(p, DrivePacket) for p in last
+            )
             # Handed over, the robot goes on driving: no safe state between, and only the heir is obeyed.
             heir, since = await lab.client(), len(line.heard)
             await client.command("robot/r1", grant, TURN)
@@ -91,9 +98,9 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             assert under is not None
             await heir.command("robot/r1", under, TURN | {"left": 1})
             await line.until(
-                lambda packets: any(isinstance(p, Drive) and p.left == 1 for p in packets), since=since
+                lambda packets: any(isinstance(p, DrivePacket) and p.left == 1 for p in packets), since=since
             )
-            assert not is_in(Halt)(line.packets[since:])
+            assert not is_in(HaltPacket)(line.packets[since:])
             assert await answer(client.command("robot/r1", grant, TURN)) == "ended"
             client.resume()
             await heir.end(inherited)
@@ -178,15 +185,15 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             assert again is not None
             assert again > grant
             assert radio.health == r1.health == "ok"
-            assert isinstance((await line.until(lambda packets: packets, since=since))[0], Halt)
+            assert isinstance((await line.until(lambda packets: packets, since=since))[0], HaltPacket)
             await client.command("robot/r1", again, TURN)
-            await line.until(is_in(Drive), since=since)
+            await line.until(is_in(DrivePacket), since=since)
 
             # The radio's node goes: the robot can't be stopped, so it is not to be had.
             post.rcs.remove(radio)
             await radio.stop()
             await until(lambda: arc.state == "queued" and r1.health == "radio/rf0 is not there")
-            assert isinstance(line.packets[-1], Halt | Stop | Camera)
+            assert isinstance(line.packets[-1], HaltPacket | StopPacket | CameraPacket)
         line.unplug()
 
     asyncio.run(asyncio.wait_for(story(), START))

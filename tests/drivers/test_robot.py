@@ -14,9 +14,15 @@ from tests.drivers.post import GANG, TURN, held, is_in
 from tests.drivers.ptys import PtyLine
 from tests.live.bench import answer
 from tests.live.lab import START, Lab
-from zscout import clock
-from zscout.packets import Camera, Drive, Halt, Packet, Stop
-from zscout.scheduling.model import SECOND, Grant, Ns
+from zscout.drivers.packets import (
+    CameraPacket,
+    DrivePacket,
+    HaltPacket,
+    Packet,
+    StopPacket,
+)
+from zscout.mesh import clock
+from zscout.types import SECOND, Grant, Ns
 
 pytestmark = pytest.mark.live
 
@@ -67,7 +73,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             client = await lab.client()
             await lab.ready(client, "robot/r1", "radio/rf0", "video/ch1")
             # Nobody knows what it did before: it was halted first.
-            assert isinstance(line.packets[0], Halt)
+            assert isinstance(line.packets[0], HaltPacket)
 
             def drive(grant: Grant, **how: Any) -> Any:
                 return client.command("robot/r1", grant, TURN | how)
@@ -76,7 +82,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
                 """Waits until the robot drives by this order; what it hears from then on has this number."""
                 since = len(line.heard)
                 await order
-                await line.until(is_in(Drive), since=since)
+                await line.until(is_in(DrivePacket), since=since)
                 return len(line.heard)
 
             assert await answer(drive(Grant((await lab.state(client, lambda _: True)).term, 0))) == "free"
@@ -84,16 +90,18 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             since = len(line.heard)
             done = await drive(grant, lasts=0.3)
             assert 0 < done.result["after"] < 1
-            packet = await line.until(is_in(Drive), since=since)
+            packet = await line.until(is_in(DrivePacket), since=since)
             assert (packet.left, packet.right, packet.lasts) == (
                 pytest.approx(0.5, abs=0.01),
                 pytest.approx(-0.5, abs=0.01),
                 0.3,
             )
             await client.command("robot/r1", grant, {"name": "camera", "on": True})
-            assert (await line.until(is_in(Camera), since=since)).channel == 1
+            assert (await line.until(is_in(CameraPacket), since=since)).channel == 1
             await client.command("robot/r1", grant, {"name": "camera", "on": False})
-            await line.until(lambda packets: [p for p in packets if p == Camera(1, p.number, 0)], since=since)
+            await line.until(
+                lambda packets: [p for p in packets if p == CameraPacket(1, p.number, 0)], since=since
+            )
 
             for do, word in (
                 ({"name": "drive", "left": 2, "right": 0, "lasts": 1}, "bad_command"),
@@ -108,7 +116,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             since = len(line.heard)
             began = clock.now()
             await drive(grant)
-            await line.until(is_in(Stop), since=since)
+            await line.until(is_in(StopPacket), since=since)
             assert clock.now() - began > 0.4 * SECOND
             await client.command("robot/r1", grant, TURN | {"left": 0, "right": 0})
 
@@ -116,8 +124,8 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             since = await driving(client.command("robot/r1", grant, TURN))
             began = clock.now()
             await client.end(arc)
-            await line.until(is_in(Halt), since=since)
-            worst = [("released", line_time(line, Halt, since) - began)]
+            await line.until(is_in(HaltPacket), since=since)
+            worst = [("released", line_time(line, HaltPacket, since) - began)]
             assert await answer(drive(grant)) == "ended"
 
             # Taken over while it drives.
@@ -126,13 +134,13 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             since = await driving(client.command("robot/r1", grant, TURN))
             began = clock.now()
             over, his = await held(operator, "operator", GANG, priority=10)
-            await line.until(is_in(Halt), since=since)
-            worst.append(("preempted", line_time(line, Halt, since) - began))
+            await line.until(is_in(HaltPacket), since=since)
+            worst.append(("preempted", line_time(line, HaltPacket, since) - began))
             assert await answer(drive(grant)) == "ended"
             # What was said of the halt again does not stop whoever drives next.
             since = await driving(operator.command("robot/r1", his, TURN))
-            await line.until(is_in(Stop), since=since)
-            assert Halt not in {type(packet) for packet in line.packets[since:]}
+            await line.until(is_in(StopPacket), since=since)
+            assert HaltPacket not in {type(packet) for packet in line.packets[since:]}
             await operator.end(over)
 
             # Its client is killed while it drives: the RCM sees that, and the RC is told.
@@ -141,8 +149,8 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             await holder.event("entered")
             since = await driving(holder.order("command", rc="robot/r1", do=TURN))
             began = holder.kill()
-            await line.until(is_in(Halt), since=since)
-            worst.append(("client killed", line_time(line, Halt, since) - began))
+            await line.until(is_in(HaltPacket), since=since)
+            worst.append(("client killed", line_time(line, HaltPacket, since) - began))
 
             # The robot's node is killed while it drives: its radio halts what was driven under the hold.
             patrol = await client.granted(again)
@@ -152,8 +160,8 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             assert figures["commands"] >= 5
             assert figures["halts"] >= 3
             began = lab.signal("cart", signal.SIGKILL)
-            await line.until(is_in(Halt), since=since)
-            worst.append(("robot's node killed", line_time(line, Halt, since) - began))
+            await line.until(is_in(HaltPacket), since=since)
+            worst.append(("robot's node killed", line_time(line, HaltPacket, since) - began))
         for how, wait in worst:
             print(f"{how}: {wait / 1e6:.1f} ms until the halt is through the line")
         # The hold lease and the mesh's are seconds; nothing here waits for the former.

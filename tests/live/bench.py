@@ -7,14 +7,15 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from tests.live.lab import START, Lab
-from zscout.behaviors.client import Client, CommandRefused
-from zscout.behaviors.request import OpenArc
-from zscout.drivers.base import Driver, ResourceController
+from zscout.behaviors.client.client import Client, CommandRefused
+from zscout.behaviors.client.request import OpenArc
+from zscout.drivers.driver import Driver
+from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
-from zscout.mesh import Mesh
+from zscout.mesh import ZenohMesh
+from zscout.mesh.stall import StallWatch
 from zscout.messages import Done, Holder
-from zscout.scheduling.model import SECOND, Grant
-from zscout.stall import StallWatch
+from zscout.types import SECOND, Grant
 
 ECHO = {"name": "echo", "value": 1}
 
@@ -65,7 +66,7 @@ class Stand:
     async def __aenter__(self) -> Stand:
         fleet = self.lab.fleet
         self.stall = StallWatch().start()
-        self.mesh = await Mesh.open(fleet.name, Sender("bench", "node"), fleet.mesh)
+        self.mesh = await ZenohMesh.open(fleet.name, Sender("bench", "node"), fleet.mesh)
         return self
 
     async def __aexit__(self, *exc: object) -> None:

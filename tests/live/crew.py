@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 
 from tests.live.lab import START, Lab
-from zscout import clock
-from zscout.behaviors.arc import Held, hold
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import OpenArc
+from zscout.behaviors.client.arc import Held, hold
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
+from zscout.mesh import clock
 from zscout.messages import RcmState
-from zscout.scheduling.model import Grant, Ns
+from zscout.types import Grant, Ns
 
 BEAT = 0.02
 """Seconds between two commands of a body."""

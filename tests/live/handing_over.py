@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import OpenArc
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import Sender
 from zscout.messages import RcmState
-from zscout.scheduling.model import Grant
+from zscout.types import Grant
 
 NEEDS: dict[str, dict[str, dict[str, int]]] = {
     "drive": {"robot/x": {}},

@@ -12,7 +12,7 @@ import sys
 import msgspec
 
 from tests.live.handing_over import NEEDS, claimed
-from zscout.behaviors.client import Client
+from zscout.behaviors.client.client import Client
 from zscout.messages import OpenRequest
 
 

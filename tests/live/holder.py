@@ -15,10 +15,10 @@ import json
 import sys
 from typing import Any
 
-from zscout import clock
-from zscout.behaviors.client import Client, CommandRefused, RequestRefused
-from zscout.behaviors.request import OpenArc
-from zscout.scheduling.model import Grant
+from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.client.request import OpenArc
+from zscout.mesh import clock
+from zscout.types import Grant
 
 
 def say(event: str, **details: Any) -> None:

@@ -14,13 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from zscout import clock
-from zscout.behaviors.client import Client
-from zscout.config import Fleet, load_fleet
+from zscout.behaviors.client.client import Client
+from zscout.config.fleet import Fleet, load_fleet
+from zscout.config.scheduling_policy import StrategyName
 from zscout.keyexpr import Role, Token, new_instance
+from zscout.mesh import clock
 from zscout.messages import RcAsk, RcmState, RcState
-from zscout.scheduling.model import Ns
-from zscout.scheduling.policy import StrategyName
+from zscout.types import Ns
 
 START = 20.0
 """Seconds within which anything that is waited for must have come true, on a busy machine."""

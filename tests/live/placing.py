@@ -14,13 +14,14 @@ from typing import Any, Self, TypeVar
 import msgspec
 
 from tests.live.lab import START, Lab
-from zscout.behaviors.arc import Revoked, holds
-from zscout.behaviors.client import Client, CommandRefused
-from zscout.components.component import Component, Stage
-from zscout.drivers.base import ResourceController
+from zscout.behaviors.client.arc import Revoked, holds
+from zscout.behaviors.client.client import Client, CommandRefused
+from zscout.behaviors.components.component import Component, ComponentContext
 from zscout.drivers.generic import ExclusiveDriver
+from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
-from zscout.mesh import Mesh
+from zscout.mesh import ZenohMesh
+from zscout.mesh.stall import StallWatch
 from zscout.messages import (
     ComponentList,
     ComponentSpec,
@@ -35,8 +36,7 @@ from zscout.messages import (
     Problem,
     RankAsk,
 )
-from zscout.scheduling.model import SECOND
-from zscout.stall import StallWatch
+from zscout.types import SECOND
 
 R = TypeVar("R")
 
@@ -156,7 +156,7 @@ class WitnessRc:
     async def __aenter__(self) -> Self:
         fleet = self.lab.fleet
         self._stall = StallWatch().start()
-        self._mesh = await Mesh.open(fleet.name, Sender("devices", "node"), fleet.mesh)
+        self._mesh = await ZenohMesh.open(fleet.name, Sender("devices", "node"), fleet.mesh)
         self._rc = ResourceController(
             self._mesh,
             self.name,
@@ -186,15 +186,17 @@ class Stepper(Component):
         while (self.folder / f"hold-{name}").exists():
             time.sleep(0.005)
 
-    async def run(self, stage: Stage) -> None:
+    async def run(self, context: ComponentContext) -> None:
         while True:
             with suppress(Revoked, CommandRefused):
-                async for attempt in holds(stage.client, stage.component, {self.rc: {}}, min_runtime=3600):
+                async for attempt in holds(
+                    context.client, context.component, {self.rc: {}}, min_runtime=3600
+                ):
                     async with attempt as held:
                         while True:
                             await held.command(self.rc, {"name": "echo", "value": self.count + 1})
                             self.count += 1
-                            await stage.safe_point()
+                            await context.safe_point()
                             await asyncio.sleep(0.005)
             await asyncio.sleep(0.02)
 

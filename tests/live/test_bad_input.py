@@ -6,15 +6,12 @@ Each query gets one clear answer; the node serves on, logs no traceback and does
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
-from typing import Any
 
 import psutil
 import pytest
 
 from tests.live.stranger import HIGH, Stranger, bad, beside_a_node, command, good_ask, proposal, rate, seconds
-from zscout import messages
 
 pytestmark = pytest.mark.live
 
@@ -264,20 +261,3 @@ def test_a_node_does_not_grow(stranger: Stranger) -> None:
     flood(60)
     stranger.serves()
     assert node.memory_info().rss - before < 60_000_000
-
-
-def test_the_check_for_twins_costs_a_request_little() -> None:
-    needs = {f"robot/scout{number}": {"command_rate": 5} for number in range(5)}
-    payload = bad(needs=needs)
-    rounds = 500
-
-    def cost(kind: Any) -> float:
-        best = float("inf")
-        for _ in range(5):
-            begin = time.perf_counter()
-            for _ in range(rounds):
-                messages.decode(payload, kind)
-            best = min(best, time.perf_counter() - begin)
-        return best / rounds
-
-    assert cost(messages.Operation) - cost(messages.Ask) < 50e-6

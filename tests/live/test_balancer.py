@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.live.lab import START, Lab
-from zscout.behaviors.client import Client
+from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Role
 from zscout.messages import HostRanking, RankAsk
 

@@ -6,11 +6,16 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-from tests.components.kit import ComponentLab, Hosts, counts, counts_on
-from zscout.behaviors.client import Client
-from zscout.config import Fleet
+from tests.behaviors.components.kit import (
+    ComponentLab,
+    Hosts,
+    counts,
+    counts_on,
+)
+from zscout.behaviors.client.client import Client
+from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
-from zscout.mesh import Request
+from zscout.mesh import IncomingQuery
 from zscout.messages import (
     ActivateComponent,
     ComponentOperation,
@@ -34,7 +39,7 @@ class Target:
     def __init__(self, node: Client, component: Client | None, incarnation: int) -> None:
         self.node, self.component, self.incarnation = node, component, incarnation
         self.activated = asyncio.Event()
-        self.answer: Callable[[Request[ComponentOperation]], None] = lambda _: None
+        self.answer: Callable[[IncomingQuery[ComponentOperation]], None] = lambda _: None
         """To an activation."""
         self.at_last: Callable[[], Awaitable[None]] = self._nothing
         """What becomes of it then."""
@@ -48,7 +53,7 @@ class Target:
         client = await Client.connect(f"c.{incarnation}", fleet=fleet, host="b") if component else None
         return cls(node, client, incarnation)
 
-    def _asked(self, request: Request[ComponentOperation]) -> None:
+    def _asked(self, request: IncomingQuery[ComponentOperation]) -> None:
         match request.message:
             case RestoreComponent(requests=requests):
                 if self.component is not None:
@@ -138,7 +143,7 @@ def test_who_handed_over_does_nothing_until_it_is_known_that_the_new_one_runs(tm
             answers: list[ComponentView | None] = [target.view("running"), target.view("standby"), None]
             moving = asyncio.create_task(hosts.get("a", MoveComponent("c", 1, "b", 2), Moved))
 
-            def answer(request: Request[ComponentOperation]) -> None:
+            def answer(request: IncomingQuery[ComponentOperation]) -> None:
                 # At first none, then one that says: not yet.
                 view = answers.pop()
                 if view is not None:

@@ -12,8 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.services.paper_run import lanes
-from zscout.simulation.plan import shipped_plans
+from tests.services.recorder.paper_run import lanes
+from zscout.lab.building.plan_file import shipped_plans
 
 pytestmark = pytest.mark.live
 

@@ -14,7 +14,7 @@ import zenoh
 
 from tests.live.lab import Lab
 from tests.live.stranger import HIGH, Stranger, beside_a_node, grants, held, rc_state
-from zscout.behaviors.arc import hold
+from zscout.behaviors.client.arc import hold
 
 pytestmark = pytest.mark.live
 

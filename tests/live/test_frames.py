@@ -17,17 +17,18 @@ import pytest
 from tests.drivers.mjpeg import MjpegServer, jpeg, number_of, numbered
 from tests.live.bench import Bench, SharedBench, Stand, answer, running, until
 from tests.live.lab import START, Lab
-from zscout.behaviors.client import Client
+from zscout.behaviors.client.client import Client
 from zscout.drivers import frame_pump, framegrabber
-from zscout.drivers.base import ResourceController
 from zscout.drivers.framegrabber import FramegrabberDriver
+from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
-from zscout.mesh import Mesh
+from zscout.mesh import ZenohMesh
 from zscout.mesh.frames import Frame, FrameWatch
+from zscout.mesh.transport import Quality
 from zscout.messages import MAX_FRAME, FrameHead
-from zscout.scheduling.model import Term
-from zscout.services.rcm import Rcm
-from zscout.services.rebuild import Inheritance
+from zscout.services.rcm.rcm import Rcm
+from zscout.services.rcm.recovery import RecoveredState
+from zscout.types import Term
 
 pytestmark = pytest.mark.live
 
@@ -82,7 +83,7 @@ def test_who_looks_has_the_newest_frame_and_whoever_publishes_knows(tmp_path: Pa
             lab = Lab(tmp_path)
             here, there = [
                 await stack.enter_async_context(
-                    await Mesh.open(lab.fleet.name, Sender(name, "node"), lab.fleet.mesh)
+                    await ZenohMesh.open(lab.fleet.name, Sender(name, "node"), lab.fleet.mesh)
                 )
                 for name in ("here", "there")
             ]
@@ -136,10 +137,11 @@ def test_who_looks_has_the_newest_frame_and_whoever_publishes_knows(tmp_path: Pa
                 (b"a head without end", b" " * 100_000),
                 (b"x" * (MAX_FRAME + 1), b'{"number": 1, "time": 0, "width": 1, "height": 1}'),
             ]
+            raw = here._transport.publisher(key, None, Quality.FRAME)
             for payload, attachment in bad:
                 before = watch.malformed
                 await until_there(
-                    functools.partial(here._session.put, key, payload, attachment=attachment),
+                    functools.partial(raw.put, payload, attachment),
                     functools.partial(refused, watch, before),
                 )
             assert (await arrives(11, b"good")).head.number == 11
@@ -187,10 +189,10 @@ async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
         two = stack.enter_context(
             MjpegServer(rate=40, picture=lambda number: jpeg(numbered(BLUE + number, grey=False)))
         )
-        leader = await Mesh.open(lab.fleet.name, Sender("leader", "node"), lab.fleet.mesh)
+        leader = await ZenohMesh.open(lab.fleet.name, Sender("leader", "node"), lab.fleet.mesh)
         stack.push_async_callback(leader.close)
-        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: None)
-        rcm.start(Inheritance())
+        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: None, lambda _: None)
+        rcm.start(RecoveredState())
         stack.callback(rcm.stop)
         sources = {"video/ch1": one.url, "video/ch2": two.url}
         driver = FramegrabberDriver(sources, rate=rate, quality=80)

@@ -13,9 +13,9 @@ from tests.live.handing_over import NEEDS, claimed, me, settle_down
 from tests.live.lab import START, Lab
 from tests.live.stranger import Stranger, beside_a_node, good_ask
 from tests.thorough import times
-from zscout.behaviors.client import Client
+from zscout.behaviors.client.client import Client
 from zscout.messages import Grants, RcState
-from zscout.scheduling.model import Grant
+from zscout.types import Grant
 
 pytestmark = pytest.mark.live
 

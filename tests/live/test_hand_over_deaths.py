@@ -14,7 +14,7 @@ from tests.live.bench import ECHO, answer
 from tests.live.handing_over import NEEDS, claimed, holding, me, settle_down
 from tests.live.lab import START, Lab
 from zscout.keyexpr import Sender
-from zscout.scheduling.model import Grant
+from zscout.types import Grant
 
 pytestmark = pytest.mark.live
 

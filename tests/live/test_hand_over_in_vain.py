@@ -12,9 +12,9 @@ from tests.live.bench import running, until
 from tests.live.crew import Body
 from tests.live.handing_over import NEEDS, claimed, me
 from tests.live.lab import START, Lab
-from zscout.behaviors import moving
-from zscout.behaviors.arc import Held, holds
-from zscout.behaviors.client import RequestRefused
+from zscout.behaviors.client import handover
+from zscout.behaviors.client.arc import Held, holds
+from zscout.behaviors.client.client import RequestRefused
 from zscout.keyexpr import Sender
 from zscout.messages import OpenRequest
 
@@ -95,7 +95,7 @@ def test_what_was_handed_to_one_who_died_is_taken_back(tmp_path: Path) -> None:
 def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: bool
 ) -> None:
-    monkeypatch.setattr(moving, "HAND_OVER", 0.0)
+    monkeypatch.setattr(handover, "HAND_OVER", 0.0)
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:
@@ -130,8 +130,8 @@ def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
 def test_what_comes_and_nobody_wants_or_does_not_come(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(moving, "CLAIM", 0.2)
-    monkeypatch.setattr(moving, "COME", 0.2)
+    monkeypatch.setattr(handover, "CLAIM", 0.2)
+    monkeypatch.setattr(handover, "COME", 0.2)
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:

@@ -14,10 +14,10 @@ import pytest
 from tests.live.lab import START, Lab
 from tests.live.placing import Placing, WitnessRc, register
 from tests.thorough import times
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import OpenArc
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
 from zscout.messages import DrainHost, EndComponent, Grants, MigrateComponent, Placement, Placements, RcState
-from zscout.scheduling.model import Grant
+from zscout.types import Grant
 
 pytestmark = pytest.mark.live
 

@@ -15,9 +15,9 @@ from tests.live.bench import Bench, Stand, comes_to, running
 from tests.live.lab import START, Lab
 from tests.live.stranger import Stranger, beside_a_node, command, good_ask
 from tests.live.test_protocol import PlainProcess
-from zscout.behaviors import blocking
-from zscout.behaviors.arc import Held, hold
-from zscout.behaviors.client import CommandRefused, RequestRefused
+from zscout.behaviors.client import blocking
+from zscout.behaviors.client.arc import Held, hold
+from zscout.behaviors.client.client import CommandRefused, RequestRefused
 from zscout.messages import RcmState
 
 pytestmark = pytest.mark.live

@@ -9,11 +9,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.components.kit import ComponentLab, lives
+from tests.behaviors.components.kit import ComponentLab, lives
 from tests.live.lab import START, Lab
 from tests.live.placing import Placing, WitnessRc
-from zscout import clock
 from zscout.keyexpr import Role
+from zscout.mesh import clock
 from zscout.messages import (
     ComponentSpec,
     EndComponent,
@@ -24,7 +24,7 @@ from zscout.messages import (
     Problem,
     UncordonHost,
 )
-from zscout.scheduling.model import SECOND
+from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 

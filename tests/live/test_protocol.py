@@ -19,7 +19,7 @@ import pytest
 import zscout
 from tests.live.lab import START, Lab
 from zscout import messages
-from zscout.behaviors.arc import hold
+from zscout.behaviors.client.arc import hold
 from zscout.keyexpr import Keys, Role, Sender
 from zscout.messages import RcmState
 

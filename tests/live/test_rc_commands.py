@@ -13,13 +13,12 @@ import zenoh
 
 from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, running, until
 from tests.live.lab import START, Lab
-from zscout import clock
-from zscout.behaviors.arc import Revoked, hold
-from zscout.behaviors.client import Client
-from zscout.drivers.base import COMMAND_QUEUE, MAX_TTL
-from zscout.mesh import zenoh_config
+from zscout.behaviors.client.arc import Revoked, hold
+from zscout.behaviors.client.client import Client
+from zscout.drivers.resource_controller import COMMAND_QUEUE, MAX_TTL
+from zscout.mesh import clock, zenoh_config
 from zscout.messages import Done, EndedHold, Problem, RcState, decode
-from zscout.scheduling.model import SECOND, Grant
+from zscout.types import SECOND, Grant
 
 pytestmark = pytest.mark.live
 
@@ -68,7 +67,7 @@ def test_every_refusal(tmp_path: Path) -> None:
                 many = [
                     asyncio.create_task(echo(grant, ttl=60, timeout=START)) for _ in range(COMMAND_QUEUE - 1)
                 ]
-                await until(lambda: rc._work.qsize() == COMMAND_QUEUE)
+                await until(lambda: rc.queue.commands == COMMAND_QUEUE)
                 assert await answer(echo(grant)) == "busy"
                 sent = clock.now()
                 await until(lambda: clock.now() - sent > 0.1 * SECOND)
@@ -86,7 +85,7 @@ def test_every_refusal(tmp_path: Path) -> None:
                 assert await answer(echo(grant)) == "ended"
                 await until(lambda: bench.calls == ["begin one", "safe"])
                 _, brief = await running(client, "brief", "robot/bench", min_runtime=0.2)
-                await until(lambda: not rc.holding.held)
+                await until(lambda: not rc.holds.held)
                 assert await answer(echo(brief)) == "ended"
                 assert warm.calls == ["begin warm"]
 

@@ -13,11 +13,11 @@ import pytest
 
 from tests.live.bench import ECHO, Bench, Stand, answer, until
 from tests.live.lab import START, Lab
-from zscout.drivers import base
+from zscout.drivers import resource_controller
 from zscout.keyexpr import Role, Token
-from zscout.mesh import Request
+from zscout.mesh import IncomingQuery
 from zscout.messages import Grants, HoldView, RcmState, StateAsk
-from zscout.scheduling.model import Grant, Place, Term
+from zscout.types import Grant, Place, Term
 
 pytestmark = pytest.mark.live
 
@@ -44,16 +44,16 @@ def said(seq: int, prev: int) -> Grants:
 
 
 def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(base, "REREAD_TIMEOUT", START)
+    monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", START)
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:
             client = await lab.client()
             mesh, keys = client.mesh, client.mesh.keys
-            waiting: list[Request[StateAsk]] = []
+            waiting: list[IncomingQuery[StateAsk]] = []
             seq = 3
 
-            def on_asked(request: Request[StateAsk]) -> None:
+            def on_asked(request: IncomingQuery[StateAsk]) -> None:
                 if not waiting:
                     # The first answer is held back until more has been published.
                     waiting.append(request)
@@ -65,16 +65,16 @@ def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path, monkeypatch
                 mesh.serve(keys.rcm_state, StateAsk, on_asked)
                 publisher = mesh.publisher(keys.grants, Grants)
                 mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
-                while rc.holding.seq != 3:
+                while rc.holds.seq != 3:
                     publisher.put(said(3, 0))
                     await asyncio.sleep(0.02)
                 await until(lambda: bool(waiting))
                 # Its new term made it read; the grant with number 5 is published and gets lost, 7 arrives.
                 seq = 7
                 publisher.put(said(7, 6))
-                await until(lambda: rc.holding.seq == 7)
+                await until(lambda: rc.holds.seq == 7)
                 waiting[0].answer(RcmState(TERM, 3, "test"))
-                await until(lambda: set(rc.holding.held) == {Grant(TERM, 5)})
+                await until(lambda: set(rc.holds.held) == {Grant(TERM, 5)})
                 assert await answer(client.command("robot/x", Grant(TERM, 5), ECHO)) == "done"
 
     asyncio.run(story())
@@ -83,16 +83,16 @@ def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path, monkeypatch
 def test_a_question_that_nobody_answered_is_asked_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(base, "REREAD_TIMEOUT", 0.1)
+    monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", 0.1)
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:
             client = await lab.client()
             mesh, keys = client.mesh, client.mesh.keys
-            waiting: list[Request[StateAsk]] = []
+            waiting: list[IncomingQuery[StateAsk]] = []
             answers = False
 
-            def on_asked(request: Request[StateAsk]) -> None:
+            def on_asked(request: IncomingQuery[StateAsk]) -> None:
                 if answers:
                     request.answer(RcmState(TERM, 7, "test", [view(str(mesh.me), 5)]))
                 else:
@@ -105,14 +105,14 @@ def test_a_question_that_nobody_answered_is_asked_again(
                 mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
                 while len(waiting) < 2:
                     # A gap, and then a heartbeat: what was missed is still not known.
-                    publisher.put(said(7, 6 if rc.holding.seq < 7 else 7))
+                    publisher.put(said(7, 6 if rc.holds.seq < 7 else 7))
                     await asyncio.sleep(0.02)
-                assert not rc.holding.held
+                assert not rc.holds.held
                 answers = True
-                while not rc.holding.held:
+                while not rc.holds.held:
                     publisher.put(said(7, 7))
                     await asyncio.sleep(0.02)
-                assert set(rc.holding.held) == {Grant(TERM, 5)}
+                assert set(rc.holds.held) == {Grant(TERM, 5)}
 
     asyncio.run(story())
 
@@ -124,7 +124,7 @@ def test_a_command_newer_than_the_rc_knows_makes_it_read(tmp_path: Path) -> None
             mesh, keys = client.mesh, client.mesh.keys
             asked: list[StateAsk] = []
 
-            def on_asked(request: Request[StateAsk]) -> None:
+            def on_asked(request: IncomingQuery[StateAsk]) -> None:
                 asked.append(request.message)
                 holds = [view(str(mesh.me), 5)] if len(asked) > 1 else []
                 request.answer(RcmState(TERM, 5 if holds else 4, "test", holds))
@@ -133,7 +133,7 @@ def test_a_command_newer_than_the_rc_knows_makes_it_read(tmp_path: Path) -> None
                 rc = await stand.rc("robot/x", Bench())
                 mesh.serve(keys.rcm_state, StateAsk, on_asked)
                 publisher = mesh.publisher(keys.grants, Grants)
-                while rc.holding.seq != 4:
+                while rc.holds.seq != 4:
                     publisher.put(said(4, 3))
                     await asyncio.sleep(0.02)
                 await until(lambda: len(asked) == 1)

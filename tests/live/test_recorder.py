@@ -20,15 +20,26 @@ import psutil
 import pytest
 
 from tests.live.lab import START, Lab
-from tests.services.paper_run import colours, events, lanes, rows
-from zscout.behaviors.arc import hold
-from zscout.config import Mesh, Recorder
+from tests.services.recorder.paper_run import (
+    colours,
+    events,
+    lanes,
+    rows,
+)
+from zscout.behaviors.client.arc import hold
+from zscout.config.fleet import MeshConfig
+from zscout.config.node import RecorderConfig
+from zscout.config.strict import BadInput
 from zscout.keyexpr import Role, Token
 from zscout.messages import LoadReport, Notice, RcState
-from zscout.services.blueprint import OPERATOR
-from zscout.services.recorder_files import new_recording, prune
-from zscout.services.recorder_process import Job, Recording, beside, encode_job
-from zscout.strict import BadInput
+from zscout.services.recorder.colours import OPERATOR
+from zscout.services.recorder.files import new_recording, prune
+from zscout.services.recorder.process import (
+    RecorderJob,
+    Recording,
+    beside,
+    encode_job,
+)
 
 pytestmark = pytest.mark.live
 
@@ -305,7 +316,7 @@ def test_the_program_says_where_it_records_and_ends_in_order(
 ) -> None:
     async def story() -> None:
         async with Lab(tmp_path) as lab:
-            job = Job(Recorder(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+            job = RecorderJob(RecorderConfig(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
             process = run_recorder(lab, encode_job(job))
             assert process.stdout is not None
             assert process.stdin is not None
@@ -333,10 +344,12 @@ def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
                 port = other.getsockname()[1]
                 jobs = {
                     f"can't listen on 127.0.0.1, port {port}": encode_job(
-                        Job(Recorder(tmp_path / "runs", "127.0.0.1", port), lab.fleet, "a")
+                        RecorderJob(RecorderConfig(tmp_path / "runs", "127.0.0.1", port), lab.fleet, "a")
                     ),
                     "recordings can't be written to": encode_job(
-                        Job(Recorder(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+                        RecorderJob(
+                            RecorderConfig(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet, "a"
+                        )
                     ),
                     "no job for a recorder": b'{"recorder": 1}\n',
                 }
@@ -373,10 +386,10 @@ def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
 
 
 def test_a_recorder_joins_beside_its_node() -> None:
-    mesh = Mesh(
+    mesh = MeshConfig(
         listen=("tcp/0.0.0.0:7447", "tls/[::]:7448#x=y", "tcp/10.0.0.1:0"), connect=("tcp/10.0.0.2:7447",)
     )
     own = beside(mesh)
     assert own.listen == ("tcp/0.0.0.0:0", "tls/[::]:0#x=y", "tcp/10.0.0.1:0")
     assert own.connect == ("tcp/10.0.0.2:7447", "tcp/127.0.0.1:7447", "tls/[::1]:7448#x=y")
-    assert beside(Mesh()) == Mesh()
+    assert beside(MeshConfig()) == MeshConfig()

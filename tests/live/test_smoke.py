@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.live.lab import START, Lab
-from zscout.behaviors.arc import Revoked, hold
+from zscout.behaviors.client.arc import Revoked, hold
 from zscout.messages import LoadReport
 
 pytestmark = pytest.mark.live

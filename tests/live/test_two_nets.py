@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.components.kit import ComponentLab
+from tests.behaviors.components.kit import ComponentLab
 from tests.live.placing import Placing
 from zscout.behaviors.sensor_net.place_sensor_net import component_of
 from zscout.messages import MAX_COMPONENT_NAME, EndComponent, Placement

@@ -10,11 +10,11 @@ import pytest
 
 from tests.live.bench import ECHO, SharedBench, Stand, answer, comes_to, running
 from tests.live.lab import Lab
-from zscout import clock
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import OpenArc
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
+from zscout.mesh import clock
 from zscout.messages import ProposedHolder
-from zscout.scheduling.model import SECOND
+from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 

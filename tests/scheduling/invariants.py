@@ -8,21 +8,31 @@ from dataclasses import replace
 from fractions import Fraction
 
 from tests.scheduling.oracle import Contender, Oracle
+from tests.scheduling.validate import validate
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Outcome, Queued, Revoked
-from zscout.scheduling.model import NO_TERM, Arc, ArcId, ClientId, Grant, Ns, Params, RcName, Request
+from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Queued
+from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.workload import WorkloadRc, excess
+from zscout.types import (
+    NO_TERM,
+    ArcId,
+    ClientId,
+    Grant,
+    Ns,
+    Params,
+    RcName,
+)
 
 
 class Ledger:
     """Follows grants and revocations and raises `AssertionError` at the first that breaks a promise."""
 
-    def __init__(self, rcs: Iterable[WorkloadRc], requests: Iterable[Request] = ()) -> None:
+    def __init__(self, rcs: Iterable[WorkloadRc], requests: Iterable[ArcRequest] = ()) -> None:
         self.capacity: dict[RcName, Mapping[str, Fraction]] = {
             rc.name: rc.capacity for rc in rcs if rc.sharable
         }
-        self.requests: dict[ArcId, Request] = {request.arc: request for request in requests}
+        self.requests: dict[ArcId, ArcRequest] = {request.arc: request for request in requests}
         self.open: dict[ArcId, Granted] = {}
         self.newest = Grant(NO_TERM, 0)
         self.handed_over: dict[ArcId, Granted] = {}
@@ -34,17 +44,17 @@ class Ledger:
     def will_move(self, core: Core, arc: ArcId, to: ClientId, renamed: ArcId) -> None:
         """The next batch will hand over `arc`."""
         self.requests[renamed] = replace(self.requests[arc], arc=renamed, client=to)
-        self._moves[renamed] = copy(core.floor.running.get(arc) or core.floor.queued[arc])
+        self._moves[renamed] = copy(core._state.running.get(arc) or core._state.queued[arc])
         self._renamed[arc] = renamed
 
     def take(self, now: Ns, core: Core, effects: list[Effect]) -> None:
         """Takes the effects of one batch, and compares the outcome with what the core believes."""
-        core.validate()
+        validate(core)
         for number, effect in enumerate(effects):
             match effect:
                 case Granted():
                     self._granted(effect)
-                case Revoked():
+                case HoldEnded():
                     self._revoked(now, effect, effects[number + 1 :])
                 case Queued(arc=arc):
                     assert arc not in self.open, f"{arc} is told to wait while it holds"
@@ -53,7 +63,7 @@ class Ledger:
         held = {arc: (hold.grant, hold.client) for arc, hold in self.open.items()}
         believed = {
             arc.id: (arc.hold.grant, arc.request.client)
-            for arc in core.floor.running.values()
+            for arc in core._state.running.values()
             if arc.hold is not None
         }
         assert not self.handed_over, "handed over to nobody"
@@ -64,8 +74,8 @@ class Ledger:
         """Who was handed over is there under the new name, at the old place; its wait goes on."""
         granted = {effect.arc for effect in effects if isinstance(effect, Granted)}
         for renamed, before in self._moves.items():
-            assert core.floor.arc(before.id) is None, f"{before.id} is there under its old name"
-            after = core.floor.arc(renamed)
+            assert core._state.arc(before.id) is None, f"{before.id} is there under its old name"
+            after = core._state.arc(renamed)
             if after is None:
                 assert before.hold is not None, f"{before.id} got lost while it was handed over"
                 continue
@@ -104,7 +114,7 @@ class Ledger:
             else:
                 assert holders == [effect.arc], f"{rc} has the holders {holders}"
 
-    def _revoked(self, now: Ns, effect: Revoked, later: list[Effect]) -> None:
+    def _revoked(self, now: Ns, effect: HoldEnded, later: list[Effect]) -> None:
         hold = self.open.pop(effect.arc)
         assert hold.grant == effect.grant, "a hold is revoked under another grant than it was given"
         assert hold.rcs == effect.rcs, "a part of a gang is revoked"
@@ -128,7 +138,7 @@ class Ledger:
             assert taker.priority >= request.priority, "lower priority displaces a kept hold"
 
 
-def _asked_of(request: Request, rc: RcName) -> Params:
+def _asked_of(request: ArcRequest, rc: RcName) -> Params:
     found = request.needs.get(rc)
     if found is not None:
         return found
@@ -137,10 +147,10 @@ def _asked_of(request: Request, rc: RcName) -> Params:
 
 def check_settled(now: Ns, core: Core, rcs: Iterable[WorkloadRc]) -> None:
     """After a pass with no vote out: by the letter of steps 1 to 3, nobody who waits could start."""
-    if next(core.votes.out(), None) is not None:
+    if next(core._votes.out(), None) is not None:
         return
     oracle = Oracle(rcs)
-    for arc in (*core.floor.running.values(), *core.floor.queued.values()):
+    for arc in (*core._state.running.values(), *core._state.queued.values()):
         start = arc.hold.start if arc.hold is not None else None
         oracle.contenders.append(Contender(arc.request, arc.place.arrival, start))
     for one in oracle.contenders:

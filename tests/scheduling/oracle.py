@@ -10,16 +10,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from zscout.scheduling.effects import Outcome
-from zscout.scheduling.model import Ns, RcName, Request
+from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.replay import HoldRecord, Replay
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc, excess
+from zscout.types import Ns, RcName
 
 
 @dataclass(eq=False)
 class Contender:
     """An ARC that was asked for; `start` is None while it waits."""
 
-    request: Request
+    request: ArcRequest
     place: int
     start: Ns | None = None
 
@@ -32,7 +33,7 @@ class Contender:
         assert self.start is not None
         return self.start + self.request.min_runtime
 
-    def overstays(self, now: Ns) -> bool:
+    def past_min_runtime(self, now: Ns) -> bool:
         return self.request.keep and now >= self.end()
 
 
@@ -45,7 +46,7 @@ class Oracle:
         self.holds: list[HoldRecord] = []
         self.arrivals = 0
 
-    def instant(self, now: Ns, asked: list[Request]) -> None:
+    def instant(self, now: Ns, asked: list[ArcRequest]) -> None:
         """First what ends, then what was asked, then one pass."""
         for one in self.running():
             if not one.request.keep and one.end() <= now:
@@ -83,7 +84,7 @@ class Oracle:
         if victims is None:
             return
         for victim in victims:
-            if victim.overstays(now):
+            if victim.past_min_runtime(now):
                 self.finish(victim, now)
             else:
                 self.close(victim, now, Outcome.PREEMPTED)
@@ -98,7 +99,7 @@ class Oracle:
         running = self.running()
 
         def may_displace(other: Contender) -> bool:
-            if other.overstays(now):
+            if other.past_min_runtime(now):
                 return a.request.priority >= other.request.priority
             return a.request.priority > other.request.priority
 
@@ -142,7 +143,7 @@ def play(workload: Workload, *, one_by_one: bool = False) -> Replay:
     while arrivals or oracle.running():
         running = oracle.running()
         # A kept hold's minimum runtime is an event too: from then on equal priority may displace it.
-        times = [one.end() for one in running if not one.overstays(now)]
+        times = [one.end() for one in running if not one.past_min_runtime(now)]
         times += [arrival.at for arrival in arrivals[:1]]
         if times:
             now = min(times)

@@ -4,42 +4,47 @@ from __future__ import annotations
 
 import heapq
 
-from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import Ns
-from zscout.scheduling.priority import UNSETTLED, Actions
-from zscout.scheduling.visit import Admitted, Open, Refused, Visit, listed
-from zscout.scheduling.votes import Votes
+from zscout.scheduling.admission_check import Admissible, AdmissionCheck, Inadmissible, VotesNeeded
+from zscout.scheduling.priority import VOTING, Priority
+from zscout.scheduling.reason import ReasonCode, of_rcs
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.strategy import Actions
 
 
-def run_plain_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
-    """Visits everyone who waits, in rank order, and keeps nothing for the next pass."""
-    order = [(arc.rank, arc) for arc in floor.queued.values()]
-    heapq.heapify(order)
-    off_limits = 0
-    while order:
-        _, arc = heapq.heappop(order)
-        visit = Visit(floor, votes, now, arc)
-        if obstacle := visit.obstacle(off_limits):
-            actions.wait(arc, obstacle)
-            continue
-        if visit.footprint() & off_limits:
-            off_limits |= visit.footprint()
-            actions.wait(arc, UNSETTLED, settled=False)
-            continue
-        match visit.decide():
-            case Refused(_, reason):
-                actions.wait(arc, reason)
-            case Open(questions) if silent := [ask for ask in questions if votes.silent(ask[0].name)]:
-                actions.wait(arc, f"{listed([rc.name for rc, _ in silent])} does not answer")
-                for rc, holders in silent:
-                    actions.propose(rc, holders)
-            case Open(questions):
-                off_limits |= visit.footprint()
-                actions.wait(arc, UNSETTLED, settled=False)
-                for rc, holders in questions:
-                    actions.propose(rc, holders)
-            case Admitted(victims):
-                for victim in victims:
-                    if actions.displace(victim, by=arc):
-                        heapq.heappush(order, (victim.rank, victim))
-                actions.start(arc)
+class PlainPriority(Priority):
+    """Checks everyone who waits, in rank order, and keeps nothing for the next pass."""
+
+    def run_pass(self, state: SchedulerState, actions: Actions) -> None:
+        votes = state.votes
+        order = [(arc.rank, arc) for arc in state.queued.values()]
+        heapq.heapify(order)
+        off_limits = 0
+        while order:
+            _, arc = heapq.heappop(order)
+            check = AdmissionCheck(state, arc)
+            if (obstacle := check.obstacle(off_limits)) is not None:
+                actions.wait(arc, obstacle.reason)
+                continue
+            if check.footprint() & off_limits:
+                off_limits |= check.footprint()
+                actions.wait(arc, VOTING, settled=False)
+                continue
+            match check.decide():
+                case Inadmissible(_, reason):
+                    actions.wait(arc, reason)
+                case VotesNeeded(questions) if silent := [
+                    one for one in questions if votes.silent(one[0].name)
+                ]:
+                    actions.wait(arc, of_rcs(ReasonCode.SILENT, [rc.name for rc, _ in silent]))
+                    for rc, holders in silent:
+                        actions.propose(rc, holders)
+                case VotesNeeded(questions):
+                    off_limits |= check.footprint()
+                    actions.wait(arc, VOTING, settled=False)
+                    for rc, holders in questions:
+                        actions.propose(rc, holders)
+                case Admissible(victims):
+                    for victim in victims:
+                        if actions.preempt(victim, by=arc):
+                            heapq.heappush(order, (victim.rank, victim))
+                    actions.start(arc)

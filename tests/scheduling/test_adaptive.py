@@ -11,29 +11,31 @@ from hypothesis import given, settings
 
 from tests.scheduling.invariants import Ledger, check_settled
 from tests.scheduling.test_optimal import arc, proposed
+from tests.scheduling.validate import validate
 from tests.scheduling.workloads import workloads
-from tests.services.paper_run import RCS, TABLE1
+from tests.services.recorder.paper_run import RCS, TABLE1
 from tests.thorough import times
-from zscout.scheduling import priority
+from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.adaptive import MAX_SLICES, SLICE, Adaptive, steps_for
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Propose, Queued, Revoked, WakeAt
-from zscout.scheduling.events import Asked, Cancelled, Event, RcJoined, Released, Tick, Vote, VoteOverdue
-from zscout.scheduling.model import SECOND, Ns, Request
-from zscout.scheduling.policy import StrategyName
+from zscout.scheduling.effects import Effect, Granted, HoldEnded, Propose, Queued, WakeAt
+from zscout.scheduling.events import Cancelled, Event, RcJoined, Released, Requested, Tick, Vote, VoteOverdue
+from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.priority import Priority
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc, excess
+from zscout.types import SECOND, Ns
 
 MANY_PASSES = 500
 """Far more than any instant takes."""
 
 
-def experiment(seed: int, rcs: int, arcs: int) -> list[Request]:
+def experiment(seed: int, rcs: int, arcs: int) -> list[ArcRequest]:
     """The paper's: ARCs of one priority that need 1 to 5 RCs each."""
     draw = random.Random(seed)  # noqa: S311
     return [
-        Request(f"a{number}", "host/a", {f"rc/{rc}": {} for rc in needs}, 1, SECOND)
+        ArcRequest(f"a{number}", "host/a", {f"rc/{rc}": {} for rc in needs}, 1, SECOND)
         for number in range(arcs)
         for needs in [draw.sample(range(rcs), draw.randint(1, 5))]
     ]
@@ -68,8 +70,8 @@ def instant(core: Core, now: Ns, workload: Workload, events: list[Event]) -> Non
 def in_use(core: Core, now: Ns) -> Counter[int]:
     """(ARC, RC) pairs by priority, but for those past their minimum runtime."""
     pairs: Counter[int] = Counter()
-    for one in core.floor.running.values():
-        if not one.overstays(now):
+    for one in core._state.running.values():
+        if not one.past_min_runtime(now):
             pairs[one.request.priority] += one.mask.bit_count()
     return pairs
 
@@ -80,8 +82,8 @@ def test_the_papers_experiment_is_decided_as_by_optimal(seeds: range) -> None:
         used = {}
         for name in ("adaptive", "optimal"):
             core = free(10, name)
-            core.handle(0, *map(Asked, experiment(seed, 10, 20)))
-            used[name] = core.floor.busy.bit_count()
+            core.handle(0, *map(Requested, experiment(seed, 10, 20)))
+            used[name] = core._state.busy.bit_count()
         assert used["adaptive"] == used["optimal"], seed
 
 
@@ -89,11 +91,11 @@ def test_table_1_is_served_as_by_priority() -> None:
     workload = Workload(
         tuple(WorkloadRc(rc) for rc in RCS),
         tuple(
-            Arrival(at * SECOND, Request(arc, "host/a", {rc: {} for rc in needs}, level, runtime * SECOND))
+            Arrival(at * SECOND, ArcRequest(arc, "host/a", {rc: {} for rc in needs}, level, runtime * SECOND))
             for arc, at, level, runtime, needs in TABLE1
         ),
     )
-    adaptive, first = (replay(workload, strategy=strategy) for strategy in (Adaptive(), priority.run_pass))
+    adaptive, first = (replay(workload, strategy=strategy) for strategy in (Adaptive(), Priority()))
     starts = {(hold.arc, hold.outcome): hold.start for hold in first.holds}
     assert all(hold.start <= starts[hold.arc, hold.outcome] for hold in adaptive.holds)
     assert [hold for hold in adaptive.holds if hold.arc == "arc4"] == [
@@ -124,9 +126,9 @@ def test_no_instant_ends_with_less_than_priority_would_give(workload: Workload) 
     instant(core, 0, workload, [RcJoined(rc.name, rc.sharable) for rc in workload.rcs])
     arrivals = sorted(workload.arrivals, key=lambda arrival: arrival.at)
     for now in sorted({arrival.at for arrival in arrivals} | {second * SECOND for second in range(12)}):
-        events: list[Event] = [Asked(one.request) for one in arrivals if one.at == now]
+        events: list[Event] = [Requested(one.request) for one in arrivals if one.at == now]
         other = copy.deepcopy(core)
-        other.strategy = priority.run_pass
+        other.strategy = Priority()
         instant(core, now, workload, events or [Tick()])
         instant(other, now, workload, events or [Tick()])
         got, least = in_use(core, now), in_use(other, now)
@@ -138,9 +140,9 @@ def test_where_nothing_is_to_gain_priority_decides_at_once() -> None:
     strategy = Adaptive()
     core = Core(strategy)
     core.handle(0, RcJoined("a", False), RcJoined("b", False))
-    core.handle(0, Asked(arc("x", "a")), Asked(arc("y", "b")))
-    core.handle(0, Asked(arc("z", "ab")))
-    assert core.floor.running.keys() == {"x", "y"}
+    core.handle(0, Requested(arc("x", "a")), Requested(arc("y", "b")))
+    core.handle(0, Requested(arc("z", "ab")))
+    assert core._state.running.keys() == {"x", "y"}
     assert (strategy.statistics.searches, strategy.statistics.steps) == (0, 0)
 
 
@@ -149,9 +151,12 @@ def test_a_gain_is_told_in_words() -> None:
     core = Core(strategy)
     core.handle(0, *(RcJoined(rc, False) for rc in "abcd"))
     core.handle(
-        0, Asked(arc("narrow", "bc", 3, 1)), Asked(arc("left", "ab", 3)), Asked(arc("right", "cd", 3))
+        0,
+        Requested(arc("narrow", "bc", 3, 1)),
+        Requested(arc("left", "ab", 3)),
+        Requested(arc("right", "cd", 3)),
     )
-    assert core.floor.running.keys() == {"left", "right"}
+    assert core._state.running.keys() == {"left", "right"}
     assert strategy.statistics.gains == 1
     assert str(strategy.statistics.last).startswith("pairs in use from 2 to 4 at priority 3, in ")
 
@@ -160,13 +165,13 @@ def test_a_large_search_is_cut_into_slices_and_others_go_on() -> None:
     strategy = Adaptive()
     core = Core(strategy)
     core.handle(0, *(RcJoined(f"rc/{number}", False) for number in range(300)), RcJoined("apart", False))
-    effects = core.handle(0, *map(Asked, experiment(0, 300, 600)))
+    effects = core.handle(0, *map(Requested, experiment(0, 300, 600)))
     assert wants_more(0, effects)
-    assert not core.floor.running
+    assert not core._state.running
     assert all(not effect.settled for effect in effects if isinstance(effect, Queued))
     before = strategy.statistics.steps
-    effects = core.handle(0, Asked(Request("other", "host/b", {"apart": {}}, 0, SECOND)))
-    assert core.floor.running.keys() == {"other"}
+    effects = core.handle(0, Requested(ArcRequest("other", "host/b", {"apart": {}}, 0, SECOND)))
+    assert core._state.running.keys() == {"other"}
     passes = 2
     while wants_more(0, effects):
         assert strategy.statistics.steps - before <= SLICE
@@ -174,28 +179,28 @@ def test_a_large_search_is_cut_into_slices_and_others_go_on() -> None:
         effects = core.handle(0, Tick())
         passes += 1
     assert passes <= steps_for(600) / SLICE + 3
-    core.validate()
+    validate(core)
     plain = free(300, "priority")
-    plain.handle(0, *map(Asked, experiment(0, 300, 600)))
-    assert core.floor.busy.bit_count() >= 1.15 * plain.floor.busy.bit_count()
+    plain.handle(0, *map(Requested, experiment(0, 300, 600)))
+    assert core._state.busy.bit_count() >= 1.15 * plain._state.busy.bit_count()
 
 
 def test_a_part_that_keeps_changing_is_decided_all_the_same() -> None:
     core = free(300)
     requests = experiment(1, 300, 700)
-    core.handle(0, *map(Asked, requests[:600]))
+    core.handle(0, *map(Requested, requests[:600]))
     for number, newcomer in enumerate(requests[600:]):
-        core.handle(0, Asked(newcomer), Cancelled(f"a{number}"))
-        core.validate()
-        if core.floor.running:
+        core.handle(0, Requested(newcomer), Cancelled(f"a{number}"))
+        validate(core)
+        if core._state.running:
             break
-    assert core.floor.running
+    assert core._state.running
     assert number <= MAX_SLICES
 
 
 def test_an_arc_that_ends_during_the_search_is_not_started() -> None:
     core = free(300)
-    core.handle(0, *map(Asked, experiment(2, 300, 600)))
+    core.handle(0, *map(Requested, experiment(2, 300, 600)))
     core.handle(0, Tick())
     core.handle(0, *(Cancelled(f"a{number}") for number in range(0, 600, 2)))
     effects = core.handle(0, Tick())
@@ -203,9 +208,9 @@ def test_an_arc_that_ends_during_the_search_is_not_started() -> None:
         if not wants_more(0, effects):
             break
         effects = core.handle(0, Tick())
-    core.validate()
-    assert core.floor.running
-    assert all(int(one[1:]) % 2 for one in core.floor.running)
+    validate(core)
+    assert core._state.running
+    assert all(int(one[1:]) % 2 for one in core._state.running)
 
 
 def test_a_slow_voter_stops_nobody_who_has_nothing_to_do_with_it() -> None:
@@ -214,43 +219,46 @@ def test_a_slow_voter_stops_nobody_who_has_nothing_to_do_with_it() -> None:
     # The better set needs the radio's word; `apart` shares nothing with it.
     effects = core.handle(
         0,
-        Asked(arc("narrow", "ab", runtime=1)),
-        Asked(arc("left", "Ra")),
-        Asked(arc("right", "Rb")),
-        Asked(arc("apart", "d")),
+        Requested(arc("narrow", "ab", runtime=1)),
+        Requested(arc("left", "Ra")),
+        Requested(arc("right", "Rb")),
+        Requested(arc("apart", "d")),
     )
-    assert core.floor.running.keys() == {"apart"}
+    assert core._state.running.keys() == {"apart"}
     (question,) = proposed(effects)
     assert set(question.holders) == {"left", "right"}
     # Nobody waits for it any longer: what can do without it goes first.
     core.handle(SECOND, VoteOverdue(question.proposal))
-    assert core.floor.running.keys() == {"apart", "narrow"}
+    assert core._state.running.keys() == {"apart", "narrow"}
     core.handle(SECOND, Vote(question.proposal, True), Released("narrow"))
-    assert core.floor.running.keys() == {"apart", "left", "right"}
+    assert core._state.running.keys() == {"apart", "left", "right"}
 
 
 def test_a_veto_brings_the_next_best() -> None:
     core = Core(Adaptive())
     core.handle(0, *(RcJoined(rc, rc.isupper()) for rc in "Rabc"))
     effects = core.handle(
-        0, Asked(arc("narrow", "ab", runtime=1)), Asked(arc("left", "Ra")), Asked(arc("right", "Rbc"))
+        0,
+        Requested(arc("narrow", "ab", runtime=1)),
+        Requested(arc("left", "Ra")),
+        Requested(arc("right", "Rbc")),
     )
     for _ in range(MANY_PASSES):
         asked = proposed(effects)
         if not asked:
             break
         effects = core.handle(0, *(Vote(one.proposal, len(one.holders) == 1, "full") for one in asked))
-    assert core.floor.running.keys() == {"right"}
+    assert core._state.running.keys() == {"right"}
 
 
 def test_the_outcome_is_the_same_every_time() -> None:
     def run() -> list[Effect]:
         core = free(100)
-        told = core.handle(0, *map(Asked, experiment(5, 100, 200)))
+        told = core.handle(0, *map(Requested, experiment(5, 100, 200)))
         effects = told
         while wants_more(0, effects):
             effects = core.handle(0, Tick())
             told += effects
-        return [effect for effect in told if isinstance(effect, (Granted, Revoked, Propose))]
+        return [effect for effect in told if isinstance(effect, (Granted, HoldEnded, Propose))]
 
     assert run() == run()

@@ -12,29 +12,35 @@ from hypothesis import strategies as st
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.workloads import capacity, rcs, requests
 from tests.thorough import times
+from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Propose, WakeAt
 from zscout.scheduling.events import (
-    Asked,
     Cancelled,
     ClientLost,
     Event,
     HandedOver,
-    LeadTaken,
     RcJoined,
     RcLost,
     RcReported,
     Released,
-    Standing,
+    Requested,
     Tick,
     Vote,
     VoteOverdue,
-    Waiting,
 )
-from zscout.scheduling.model import NO_TERM, SECOND, Arc, ArcId, ClientId, Ns, RcName, Term
-from zscout.scheduling.policy import StrategyName
+from zscout.scheduling.model import Arc
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import WorkloadRc, excess
+from zscout.types import (
+    NO_TERM,
+    SECOND,
+    ArcId,
+    ClientId,
+    Ns,
+    RcName,
+    Term,
+)
 
 OPS = (
     # The first, asked most often, make the core busy; the others disturb it.
@@ -110,13 +116,13 @@ class Chaos:
 
     def do(self, op: str, pick: int) -> None:
         """One operation of `OPS`, on the `pick`-th of what it applies to; nothing if there is none."""
-        running = sorted(self.core.floor.running)
-        arcs = sorted([*running, *self.core.floor.queued])
+        running = sorted(self.core._state.running)
+        arcs = sorted([*running, *self.core._state.queued])
         absent = [rc for rc in self.fleet if rc.name not in self.present]
         voters = [name for name in self.present if self.sharable[name]]
         answerable = self.waiting + self.late
         if op == "ask" and self.to_ask:
-            self.send(Asked(self.to_ask.pop()))
+            self.send(Requested(self.to_ask.pop()))
         elif op == "answer" and answerable:
             question = answerable[pick % len(answerable)]
             (self.waiting if question in self.waiting else self.late).remove(question)
@@ -147,7 +153,7 @@ class Chaos:
             self.send(self.hand_over(arcs[pick % len(arcs)], f"host/{(pick + 1) % 3}"))
         elif op == "hand over all":
             theirs = self.core.arcs_of(f"host/{pick % 3}")
-            self.send(*[self.hand_over(arc.id, f"host/{(pick + 1) % 3}") for arc in theirs])
+            self.send(*[self.hand_over(arc, f"host/{(pick + 1) % 3}") for arc in theirs])
         elif op == "takeover":
             self.take_over()
 
@@ -162,14 +168,9 @@ class Chaos:
         old, before = self.core, dict(self.ledger.open)
         term = Term(old.term.counter + 1, "rcm/b") if old.term != NO_TERM else Term(1, "rcm/a")
         self.core, self.waiting, self.late = self.new_core(), [], []
-        standing = tuple(
-            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
-            for arc in old.floor.running.values()
-            if arc.hold is not None
-        )
-        queue = tuple(Waiting(arc.request, arc.place, arc.since) for arc in old.floor.queued.values())
+        _, lead = old.as_events(term)
         joins = [RcJoined(name, self.sharable[name]) for name in self.present]
-        self.send(*joins, LeadTaken(term, standing, queue))
+        self.send(*joins, lead)
         assert self.ledger.open == before, "a change of RCM disturbed somebody"
 
     def settle(self) -> None:
@@ -177,25 +178,26 @@ class Chaos:
         self.send(*[self.join(rc) for rc in self.fleet if rc.name not in self.present])
         self.late = []
         while self.to_ask:
-            self.send(Asked(self.to_ask.pop()))
+            self.send(Requested(self.to_ask.pop()))
         for _ in range(MAX_SETTLING_STEPS):
             if self.waiting:
                 self.send(self.vote(self.waiting.pop()))
-            elif not self.core.floor.queued:
+            elif not self.core._state.queued:
                 return
             elif any(
-                arc.request.keep and arc.overstays(self.now) for arc in self.core.floor.running.values()
+                arc.request.keep and arc.past_min_runtime(self.now)
+                for arc in self.core._state.running.values()
             ):
-                kept = [arc for arc in self.core.floor.running.values() if arc.overstays(self.now)]
+                kept = [arc for arc in self.core._state.running.values() if arc.past_min_runtime(self.now)]
                 self.send(*[Released(arc.id) for arc in kept])
-            elif all(self.unservable(arc) for arc in self.core.floor.queued.values()):
+            elif all(self.unservable(arc) for arc in self.core._state.queued.values()):
                 return
             else:
                 assert self.wake is not None, "somebody waits, and nothing is to happen"
                 self.now = max(self.now, self.wake)
                 self.send(Tick())
-        left = [arc.id for arc in self.core.floor.queued.values() if not self.unservable(arc)]
-        raise AssertionError(f"never served: {left}, {[self.core.floor.queued[arc].reason for arc in left]}")
+        left = [arc.id for arc in self.core._state.queued.values() if not self.unservable(arc)]
+        raise AssertionError(f"never served: {left}, {[self.core._state.queued[arc].reason for arc in left]}")
 
     def unservable(self, arc: Arc) -> bool:
         """Whether it needs an RC that is not there, or more than an RC can give to it alone."""

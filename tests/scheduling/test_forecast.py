@@ -7,24 +7,25 @@ from hypothesis import given, settings
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
-from zscout.scheduling.events import Asked, Event, RcJoined, Tick, Vote
+from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Propose
+from zscout.scheduling.events import Event, RcJoined, Requested, Tick, Vote
 from zscout.scheduling.forecast import forecast
-from zscout.scheduling.model import SECOND, ArcId, Ns, Request
+from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.workload import Workload, excess
+from zscout.types import SECOND, ArcId, Ns
 
 
-def request(arc: str, *rcs: str, priority: int = 0, seconds: int = 1, keep: bool = False) -> Request:
-    return Request(arc, "test/" + arc, {rc: {} for rc in rcs}, priority, seconds * SECOND, keep)
+def request(arc: str, *rcs: str, priority: int = 0, seconds: int = 1, keep: bool = False) -> ArcRequest:
+    return ArcRequest(arc, "test/" + arc, {rc: {} for rc in rcs}, priority, seconds * SECOND, keep)
 
 
 def test_a_queue_is_foretold_in_its_order() -> None:
     core = Core()
     core.handle(0, RcJoined("robot/a", sharable=False))
-    core.handle(0, Asked(request("first", "robot/a", seconds=5)))
-    core.handle(1 * SECOND, Asked(request("long", "robot/a", seconds=4)))
-    core.handle(2 * SECOND, Asked(request("short", "robot/a", seconds=3)))
-    core.handle(2 * SECOND, Asked(request("never", "robot/b")))
+    core.handle(0, Requested(request("first", "robot/a", seconds=5)))
+    core.handle(1 * SECOND, Requested(request("long", "robot/a", seconds=4)))
+    core.handle(2 * SECOND, Requested(request("short", "robot/a", seconds=3)))
+    core.handle(2 * SECOND, Requested(request("never", "robot/b")))
     foretold = forecast(core, 3 * SECOND)
     assert foretold.starts == {"short": 5 * SECOND, "long": 8 * SECOND}
     assert not foretold.preempts
@@ -33,21 +34,21 @@ def test_a_queue_is_foretold_in_its_order() -> None:
 def test_a_newcomer_is_told_whom_it_would_preempt_and_the_core_is_not_touched() -> None:
     core = Core()
     core.handle(0, RcJoined("robot/a", sharable=False), RcJoined("robot/b", sharable=False))
-    core.handle(0, Asked(request("mine", "robot/a", seconds=5)))
-    core.handle(0, Asked(request("other", "robot/b", seconds=5)))
-    before = (core.seq, dict(core.floor.running), dict(core.floor.queued))
+    core.handle(0, Requested(request("mine", "robot/a", seconds=5)))
+    core.handle(0, Requested(request("other", "robot/b", seconds=5)))
+    before = (core.seq, dict(core._state.running), dict(core._state.queued))
     foretold = forecast(core, SECOND, request("operator", "robot/a", priority=10))
     assert foretold.starts["operator"] == SECOND
     assert foretold.preempts == ["mine"]
     assert foretold.starts["mine"] == 2 * SECOND
-    assert before == (core.seq, dict(core.floor.running), dict(core.floor.queued))
+    assert before == (core.seq, dict(core._state.running), dict(core._state.queued))
 
 
 def test_a_kept_hold_is_foretold_to_yield_after_its_time() -> None:
     core = Core()
     core.handle(0, RcJoined("robot/a", sharable=False))
-    core.handle(0, Asked(request("kept", "robot/a", seconds=5, keep=True)))
-    core.handle(0, Asked(request("next", "robot/a")))
+    core.handle(0, Requested(request("kept", "robot/a", seconds=5, keep=True)))
+    core.handle(0, Requested(request("next", "robot/a")))
     assert forecast(core, 0).starts == {"next": 5 * SECOND}
 
 
@@ -70,7 +71,7 @@ def test_what_is_foretold_comes(workload: Workload) -> None:
                         starts.setdefault(arc, start)
                     case Propose(proposal=proposal, rc=rc, holders=holders):
                         votes.append(Vote(proposal, not excess(capacity[rc], holders.items())))
-                    case Revoked(outcome=outcome):
+                    case HoldEnded(outcome=outcome):
                         assert outcome in (Outcome.COMPLETED, Outcome.PREEMPTED)
                     case _:
                         pass
@@ -82,7 +83,7 @@ def test_what_is_foretold_comes(workload: Workload) -> None:
         while (ends := ends_of(core)) and min(ends) < arrival.at:
             step(min(ends), Tick())
         wake = arrival.at
-        step(arrival.at, Asked(arrival.request))
+        step(arrival.at, Requested(arrival.request))
     # Only votes that were asked before can be foretold; where one is still unknown, a yes is assumed.
     if any(rc.sharable for rc in workload.rcs):
         return
@@ -94,4 +95,4 @@ def test_what_is_foretold_comes(workload: Workload) -> None:
 
 
 def ends_of(core: Core) -> list[Ns]:
-    return [arc.hold.end for arc in core.floor.running.values() if arc.hold is not None]
+    return [arc.hold.end for arc in core._state.running.values() if arc.hold is not None]

@@ -12,26 +12,27 @@ from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.scheduling import optimal
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked
-from zscout.scheduling.events import Asked, Event, RcJoined, Tick, Vote, VoteOverdue
-from zscout.scheduling.model import SECOND, ArcId, Request
-from zscout.scheduling.packing import Item
+from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Propose
+from zscout.scheduling.events import Event, RcJoined, Requested, Tick, Vote, VoteOverdue
+from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.packing import PackingItem
 from zscout.scheduling.replay import replay
 from zscout.scheduling.workload import Workload, WorkloadRc, excess
+from zscout.types import SECOND, ArcId
 
 
-def arc(name: ArcId, needs: str, priority: int = 0, runtime: int = 5, rate: int = 1) -> Request:
+def arc(name: ArcId, needs: str, priority: int = 0, runtime: int = 5, rate: int = 1) -> ArcRequest:
     """`needs`: RCs by letter; capitals are sharable."""
     shares = {"rate": Fraction(rate)}
-    return Request(
+    return ArcRequest(
         name, "host/a", {rc: shares if rc.isupper() else {} for rc in needs}, priority, runtime * SECOND
     )
 
 
-def core_of(rcs: str, *requests: Request) -> tuple[Core, list[Effect]]:
-    core = Core(optimal.run_pass)
+def core_of(rcs: str, *requests: ArcRequest) -> tuple[Core, list[Effect]]:
+    core = Core(optimal.Optimal())
     core.handle(0, *(RcJoined(rc, rc.isupper()) for rc in rcs))
-    return core, core.handle(0, *map(Asked, requests))
+    return core, core.handle(0, *map(Requested, requests))
 
 
 def proposed(effects: list[Effect]) -> list[Propose]:
@@ -40,32 +41,32 @@ def proposed(effects: list[Effect]) -> list[Propose]:
 
 def test_two_that_use_more_go_before_one_of_better_rank() -> None:
     core, _ = core_of("abcd", arc("narrow", "bc", runtime=1), arc("left", "ab"), arc("right", "cd"))
-    assert core.floor.running.keys() == {"left", "right"}
+    assert core._state.running.keys() == {"left", "right"}
     assert (
-        core.floor.queued["narrow"].reason
+        str(core._state.queued["narrow"].reason)
         == "needs b (held by left, priority 0), c (held by right, priority 0)"
     )
 
 
 def test_who_runs_is_not_ended_for_more_pairs_of_its_own_priority() -> None:
     core, _ = core_of("abc", arc("runs", "b"))
-    core.handle(SECOND, Asked(arc("wide", "abc")))
-    assert core.floor.running.keys() == {"runs"}
+    core.handle(SECOND, Requested(arc("wide", "abc")))
+    assert core._state.running.keys() == {"runs"}
 
 
 def test_a_higher_priority_takes_the_place_that_costs_least() -> None:
     """Both hold what the operator could do with; the one that uses less has to go."""
     core, effects = core_of("R", arc("small", "R", rate=2), arc("great", "R", priority=1, rate=3))
     effects = core.handle(0, Vote(proposed(effects)[0].proposal, True))
-    assert core.floor.running.keys() == {"small", "great"}
-    effects = core.handle(SECOND, Asked(arc("operator", "R", priority=10, rate=3)))
+    assert core._state.running.keys() == {"small", "great"}
+    effects = core.handle(SECOND, Requested(arc("operator", "R", priority=10, rate=3)))
     asked = proposed(effects)
     assert [set(one.holders) for one in asked] == [{"small", "great", "operator"}]
     effects = core.handle(SECOND, Vote(asked[0].proposal, False, "full"))
     asked = proposed(effects)
     assert [set(one.holders) for one in asked] == [{"great", "operator"}]
     effects = core.handle(SECOND, Vote(asked[0].proposal, True))
-    ended = [effect for effect in effects if isinstance(effect, Revoked)]
+    ended = [effect for effect in effects if isinstance(effect, HoldEnded)]
     assert [(effect.arc, effect.outcome, effect.by) for effect in ended] == [
         ("small", Outcome.PREEMPTED, "operator")
     ]
@@ -73,13 +74,13 @@ def test_a_higher_priority_takes_the_place_that_costs_least() -> None:
 
 def test_a_slow_voter_stops_nobody_who_has_nothing_to_do_with_it() -> None:
     core, effects = core_of("Rab", arc("waits", "Ra", priority=5), arc("beside", "a"), arc("apart", "b"))
-    assert core.floor.running.keys() == {"apart"}
+    assert core._state.running.keys() == {"apart"}
     (question,) = proposed(effects)
     core.handle(SECOND, VoteOverdue(question.proposal))
-    assert core.floor.running.keys() == {"apart", "beside"}
-    assert core.floor.queued["waits"].reason
+    assert core._state.running.keys() == {"apart", "beside"}
+    assert core._state.queued["waits"].reason
     effects = core.handle(SECOND, Vote(question.proposal, True))
-    assert core.floor.running.keys() == {"apart", "waits"}
+    assert core._state.running.keys() == {"apart", "waits"}
 
 
 def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
@@ -91,7 +92,7 @@ def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
 @given(workloads())
 def test_promises_hold_in_replay(workload: Workload) -> None:
     ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])
-    replay(workload, ledger.take, strategy=optimal.run_pass)
+    replay(workload, ledger.take, strategy=optimal.Optimal())
     assert not ledger.open
 
 
@@ -104,23 +105,23 @@ def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
     )
     there = {rc.name: rc for rc in workload.rcs}
     able = [one for one in requests if one.needs.keys() <= there.keys()]
-    core = Core(optimal.run_pass)
+    core = Core(optimal.Optimal())
     core.handle(0, *(RcJoined(rc.name, rc.sharable) for rc in workload.rcs))
-    batch: list[Event] = [Asked(request) for request in requests]
+    batch: list[Event] = [Requested(request) for request in requests]
     while batch:
         effects = core.handle(0, *batch)
         batch = [
             Vote(one.proposal, not excess(there[one.rc].capacity, one.holders.items()))
             for one in proposed(effects)
         ]
-    assert core.floor.running.keys() == {able[one].arc for one in expected(able, there)}
+    assert core._state.running.keys() == {able[one].arc for one in expected(able, there)}
 
 
-def expected(requests: list[Request], there: dict[str, WorkloadRc]) -> frozenset[int]:
+def expected(requests: list[ArcRequest], there: dict[str, WorkloadRc]) -> frozenset[int]:
     exclusive = [name for name, rc in there.items() if not rc.sharable]
     levels = sorted({request.priority for request in requests}, reverse=True)
     items = [
-        Item(
+        PackingItem(
             sum(1 << exclusive.index(name) for name in request.needs if name in exclusive),
             len(request.needs),
             levels.index(request.priority),
@@ -142,5 +143,5 @@ def expected(requests: list[Request], there: dict[str, WorkloadRc]) -> frozenset
 def test_nothing_new_is_asked_or_done_by_a_tick() -> None:
     core, effects = core_of("Rab", arc("x", "Ra"), arc("y", "Rb"), arc("z", "ab"))
     core.handle(0, *(Vote(one.proposal, True) for one in proposed(effects)))
-    assert core.floor.running.keys() == {"x", "y"}
-    assert not [one for one in core.handle(SECOND, Tick()) if isinstance(one, (Granted, Revoked, Propose))]
+    assert core._state.running.keys() == {"x", "y"}
+    assert not [one for one in core.handle(SECOND, Tick()) if isinstance(one, (Granted, HoldEnded, Propose))]

@@ -10,51 +10,53 @@ from zscout.scheduling import cpsat
 from zscout.scheduling.adaptive import steps_for
 from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.optimal import best
-from zscout.scheduling.packing import Item, Problem, numbers, pack
+from zscout.scheduling.packing import PackingItem, PackingProblem, numbers, pack
 
-Case = tuple[list[Item], list[frozenset[int]]]
+Case = tuple[list[PackingItem], list[frozenset[int]]]
 
 
 def case(seed: int, most: int = 9) -> Case:
     """Few RCs, some sharable, up to three levels; some run, some of these past their time; some vetoes."""
     draw = random.Random(seed)  # noqa: S311
     rcs = draw.randint(2, 6)
-    items: list[Item] = []
+    items: list[PackingItem] = []
     used = 0
     for _ in range(draw.randint(1, most)):
         mask = sum(1 << rc for rc in draw.sample(range(rcs), draw.randint(1, min(3, rcs))))
         shared = draw.choice([0, 0, 1])
-        standing = not mask & used and draw.random() < 0.5
-        if standing:
+        running = not mask & used and draw.random() < 0.5
+        if running:
             used |= mask
         elif shared and draw.random() < 0.3:
             mask = 0
-        spent = standing and draw.random() < 0.3
-        items.append(Item(mask, mask.bit_count() + shared, draw.randrange(3), standing, spent))
+        past_min_runtime = running and draw.random() < 0.3
+        items.append(
+            PackingItem(mask, mask.bit_count() + shared, draw.randrange(3), running, past_min_runtime)
+        )
     items.sort(key=lambda item: item.level)
     vetoes: list[frozenset[int]] = []
     for _ in range(draw.randint(1, 4) if draw.random() < 0.6 else 0):
         veto = frozenset(draw.sample(range(len(items)), min(len(items), draw.randint(1, 3))))
         # Rules that changed may rule out even those who run.
-        if draw.random() < 0.2 or not all(items[one].standing for one in veto):
+        if draw.random() < 0.2 or not all(items[one].running for one in veto):
             vetoes.append(veto)
     return items, vetoes
 
 
-def problem(case: Case) -> Problem:
+def problem(case: Case) -> PackingProblem:
     items, vetoes = case
-    return Problem(items, [sum(1 << one for one in veto) for veto in vetoes])
+    return PackingProblem(items, [sum(1 << one for one in veto) for veto in vetoes])
 
 
-def large(seed: int, rcs: int, arcs: int, levels: int = 1) -> Problem:
+def large(seed: int, rcs: int, arcs: int, levels: int = 1) -> PackingProblem:
     draw = random.Random(seed)  # noqa: S311
     masks = [sum(1 << rc for rc in draw.sample(range(rcs), draw.randint(1, 5))) for _ in range(arcs)]
-    return Problem(
-        sorted((Item(mask, mask.bit_count(), draw.randrange(levels)) for mask in masks), key=_level)
+    return PackingProblem(
+        sorted((PackingItem(mask, mask.bit_count(), draw.randrange(levels)) for mask in masks), key=_level)
     )
 
 
-def _level(item: Item) -> int:
+def _level(item: PackingItem) -> int:
     return item.level
 
 
@@ -88,7 +90,7 @@ def test_what_is_cut_short_is_lawful_no_better_than_the_best_and_no_worse_than_t
             assert not any(
                 items[one].mask & items[other].mask for one in holders for other in holders if one < other
             )
-            running = [one for one in range(len(items)) if items[one].standing]
+            running = [one for one in range(len(items)) if items[one].running]
             assert all(may_end(items, vetoes, holders, one) for one in running)
             assert asked.key(chosen) <= asked.key(exact.chosen)
             assert vector(items, holders) <= vector(items, numbers(exact.chosen))
@@ -129,7 +131,7 @@ def test_local_search_across_levels_never_gives_up_a_higher_one() -> None:
         search.run(600)
         first, found = (vector(asked.items, numbers(one)) for one in (asked.complete(), search.best))
         assert found > first
-        top = Problem([item for item in asked.items if item.level == 0])
+        top = PackingProblem([item for item in asked.items if item.level == 0])
         assert found[0] >= 0.9 * top.value(best(top))
 
 

@@ -10,38 +10,47 @@ from fractions import Fraction
 import pytest
 
 from tests.scheduling.invariants import Ledger
+from tests.scheduling.validate import validate
 from tests.thorough import times
+from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect, Granted, Propose
 from zscout.scheduling.events import (
-    Asked,
     Event,
     LeadTaken,
     RcJoined,
     RcLost,
+    RecoveredHold,
     Released,
-    Standing,
+    Requested,
     Tick,
     Vote,
     VoteOverdue,
 )
-from zscout.scheduling.model import SECOND, Arc, Grant, Ns, Params, Place, Request, Term
+from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.patterns import check_patterns
-from zscout.scheduling.policy import Policy, StrategyName
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
+from zscout.types import (
+    SECOND,
+    Grant,
+    Ns,
+    Params,
+    Place,
+    Term,
+)
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")
 TERM, NEXT = Term(1, "rcm/a"), Term(2, "rcm/b")
 
 
-def request(arc: str, *needs: str, priority: int = 1, seconds: int = 10, rate: int = 0) -> Request:
+def request(arc: str, *needs: str, priority: int = 1, seconds: int = 10, rate: int = 0) -> ArcRequest:
     wanted: dict[str, Params] = {
         need: {"rate": Fraction(rate)} if need.startswith("radio") else {} for need in needs
     }
-    return Request(arc, "h/c", wanted, priority, seconds * SECOND)
+    return ArcRequest(arc, "h/c", wanted, priority, seconds * SECOND)
 
 
 def core_of(strategy: StrategyName, *rcs: str) -> Core:
@@ -51,31 +60,31 @@ def core_of(strategy: StrategyName, *rcs: str) -> Core:
 
 
 def held(core: Core) -> dict[str, set[str]]:
-    return {arc.id: set(arc.needs) for arc in core.floor.running.values()}
+    return {arc.id: set(arc.needs) for arc in core._state.running.values()}
 
 
 @pytest.mark.parametrize("strategy", ALL)
 def test_any_free_one_will_do(strategy: StrategyName) -> None:
     core = core_of(strategy, "fg/a", "fg/b", "robot/x")
-    core.handle(0, Asked(request("first", "fg/a")))
-    effects = core.handle(0, Asked(request("any", "fg/*", "robot/x")))
+    core.handle(0, Requested(request("first", "fg/a")))
+    effects = core.handle(0, Requested(request("any", "fg/*", "robot/x")))
     assert held(core) == {"first": {"fg/a"}, "any": {"fg/b", "robot/x"}}
     assert [effect.rcs for effect in effects if isinstance(effect, Granted)] == [("fg/b", "robot/x")]
-    core.handle(0, Asked(request("third", "fg/*")))
-    assert core.floor.queued["third"].reason.startswith("no fg/* is to be had: needs fg/")
+    core.handle(0, Requested(request("third", "fg/*")))
+    assert str(core._state.queued["third"].reason).startswith("no fg/* is to be had: needs fg/")
     core.handle(SECOND, Released("first"))
     assert held(core)["third"] == {"fg/a"}
-    core.validate()
+    validate(core)
 
 
 @pytest.mark.parametrize("strategy", ALL)
 def test_several_are_counted_by_naming(strategy: StrategyName) -> None:
     core = core_of(strategy, "fg/a", "fg/b", "fg/c")
-    core.handle(0, Asked(request("two", "fg/*", "fg/*#2")), Asked(request("also", "fg/*", "fg/*#2")))
+    core.handle(0, Requested(request("two", "fg/*", "fg/*#2")), Requested(request("also", "fg/*", "fg/*#2")))
     assert len(held(core)) == 1
     assert len(held(core)["two"]) == 2
-    core.handle(0, Asked(request("four", *(f"fg/*#{n}" for n in range(1, 5)))))
-    assert core.floor.queued["four"].reason == (
+    core.handle(0, Requested(request("four", *(f"fg/*#{n}" for n in range(1, 5)))))
+    assert str(core._state.queued["four"].reason) == (
         "no RC on the mesh is left for fg/*#1, fg/*#2, fg/*#3 and 1 more"
     )
     core.handle(0, RcJoined("fg/d", sharable=False))
@@ -85,17 +94,17 @@ def test_several_are_counted_by_naming(strategy: StrategyName) -> None:
 @pytest.mark.parametrize("strategy", ALL)
 def test_the_narrower_pattern_gets_what_only_it_can_use(strategy: StrategyName) -> None:
     core = core_of(strategy, "fg/a1", "fg/b1")
-    core.handle(0, Asked(request("both", "fg/*", "fg/a$*")))
+    core.handle(0, Requested(request("both", "fg/*", "fg/a$*")))
     assert held(core) == {"both": {"fg/a1", "fg/b1"}}
-    assert core.floor.running["both"].bound == {"fg/*": "fg/b1", "fg/a$*": "fg/a1"}
+    assert core._state.running["both"].bound == {"fg/*": "fg/b1", "fg/a$*": "fg/a1"}
 
 
 @pytest.mark.parametrize("strategy", ALL)
 def test_what_others_name_is_left_to_them(strategy: StrategyName) -> None:
     core = core_of(strategy, "fg/a", "fg/b", "robot/x")
-    core.handle(0, Asked(request("holds", "robot/x")))
-    core.handle(0, Asked(request("names", "fg/a", "robot/x")))
-    core.handle(0, Asked(request("any", "fg/*")))
+    core.handle(0, Requested(request("holds", "robot/x")))
+    core.handle(0, Requested(request("names", "fg/a", "robot/x")))
+    core.handle(0, Requested(request("any", "fg/*")))
     assert held(core)["any"] == {"fg/b"}
 
 
@@ -104,26 +113,26 @@ def test_of_those_that_yield_the_lowest_is_displaced(strategy: StrategyName) -> 
     core = core_of(strategy, "fg/a", "fg/b", "fg/c")
     core.handle(
         0,
-        Asked(request("two", "fg/a", priority=2)),
-        Asked(request("one", "fg/b", priority=1)),
-        Asked(request("three", "fg/c", priority=3)),
+        Requested(request("two", "fg/a", priority=2)),
+        Requested(request("one", "fg/b", priority=1)),
+        Requested(request("three", "fg/c", priority=3)),
     )
-    core.handle(SECOND, Asked(request("any", "fg/*", priority=3)))
+    core.handle(SECOND, Requested(request("any", "fg/*", priority=3)))
     assert held(core) == {"two": {"fg/a"}, "any": {"fg/b"}, "three": {"fg/c"}}
 
 
 @pytest.mark.parametrize("strategy", ALL)
 def test_a_radio_that_refuses_sends_it_to_the_next(strategy: StrategyName) -> None:
     core = core_of(strategy, "radio/a", "radio/b", "radio/c")
-    _answered(core, 0, {"radio/a": 10, "radio/b": 10}, Asked(request("loud", "radio/a", rate=8)))
-    _answered(core, 0, {"radio/a": 10, "radio/b": 10}, Asked(request("any", "radio/*", rate=5)))
+    _answered(core, 0, {"radio/a": 10, "radio/b": 10}, Requested(request("loud", "radio/a", rate=8)))
+    _answered(core, 0, {"radio/a": 10, "radio/b": 10}, Requested(request("any", "radio/*", rate=5)))
     assert held(core)["any"] in ({"radio/b"}, {"radio/c"})
 
 
 @pytest.mark.parametrize("strategy", ALL)
 def test_a_silent_radio_keeps_nobody_who_could_do_with_another(strategy: StrategyName) -> None:
     core = core_of(strategy, "radio/a", "radio/b")
-    events: list[Event] = [Asked(request("any", "radio/*", rate=5))]
+    events: list[Event] = [Requested(request("any", "radio/*", rate=5))]
     asked = []
     while events:
         effects = core.handle(0, *events)
@@ -144,7 +153,7 @@ def test_a_hold_keeps_its_rc_over_a_change_of_rcm_and_may_have_another_after_a_l
 ) -> None:
     core = Core(STRATEGIES[strategy]())
     wanted = request("any", "fg/*")
-    stands = Standing(wanted, Place(TERM, 1), Grant(TERM, 1), 0, 10 * SECOND, {"fg/*": "fg/b"})
+    stands = RecoveredHold(wanted, Place(TERM, 1), Grant(TERM, 1), 0, 10 * SECOND, {"fg/*": "fg/b"})
     joined = [RcJoined(rc, sharable=False) for rc in ("fg/a", "fg/b")]
     core.handle(SECOND, *joined, LeadTaken(NEXT, (stands,)))
     assert held(core) == {"any": {"fg/b"}}
@@ -155,7 +164,7 @@ def test_a_hold_keeps_its_rc_over_a_change_of_rcm_and_may_have_another_after_a_l
 def test_a_standing_hold_must_tell_what_it_holds() -> None:
     for bound in ({}, {"fg/*": "robot/a"}, {"fg/*": "fg/a", "fg/*#2": "fg/b"}):
         with pytest.raises(ValueError, match="what ARC any holds"):
-            Standing(request("any", "fg/*"), Place(TERM, 1), Grant(TERM, 1), 0, SECOND, bound)
+            RecoveredHold(request("any", "fg/*"), Place(TERM, 1), Grant(TERM, 1), 0, SECOND, bound)
 
 
 @pytest.mark.parametrize(
@@ -173,17 +182,19 @@ def test_what_no_request_may_ask(needs: dict[str, Params], message: str) -> None
 
 
 def test_the_owed_are_kept_one_that_matches() -> None:
-    policy = Policy(patience=6 * SECOND)
+    policy = SchedulingPolicy(patience=6 * SECOND)
     core = Core(STRATEGIES["adaptive"](), policy)
     core.handle(0, *(RcJoined(rc, sharable=False) for rc in ("fg/a", "fg/b", "robot/x")))
-    core.handle(0, Asked(request("holds", "robot/x", seconds=20)))
-    core.handle(0, Asked(request("owed", "fg/*", "robot/x")))
+    core.handle(0, Requested(request("holds", "robot/x", seconds=20)))
+    core.handle(0, Requested(request("owed", "fg/*", "robot/x")))
     core.handle(
-        15 * SECOND, Asked(request("one", "fg/*", seconds=30)), Asked(request("two", "fg/*", seconds=30))
+        15 * SECOND,
+        Requested(request("one", "fg/*", seconds=30)),
+        Requested(request("two", "fg/*", seconds=30)),
     )
-    assert sorted(core.floor.running) == ["holds", "one"]
+    assert sorted(core._state.running) == ["holds", "one"]
     core.handle(20 * SECOND, Tick())
-    assert sorted(core.floor.running) == ["one", "owed"]
+    assert sorted(core._state.running) == ["one", "owed"]
 
 
 # At random
@@ -231,7 +242,7 @@ def could_start(core: Core, arc: Arc, work: Workload) -> bool:
     for chosen in bindings(arc, [rc.name for rc in work.rcs]):
         free = True
         for name in chosen:
-            holders = core.floor.rc(name).holders.values()
+            holders = core._state.rc(name).holders.values()
             if name in capacity:
                 used = sum((holder.needs[name]["rate"] for holder in holders), Fraction(0))
                 rate = next(
@@ -253,11 +264,11 @@ def test_nobody_waits_while_some_choice_is_free(strategy: StrategyName, seed: in
 
     def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
         ledger.take(now, core, effects)
-        if next(core.votes.out(), None) is None:
-            for arc in core.floor.queued.values():
+        if next(core._votes.out(), None) is None:
+            for arc in core._state.queued.values():
                 assert not could_start(core, arc, work), f"{arc.id} waits: {arc.reason}"
 
-    played = replay(work, watch, strategy=STRATEGIES[strategy](), policy=Policy(patience=None))
+    played = replay(work, watch, strategy=STRATEGIES[strategy](), policy=SchedulingPolicy(patience=None))
     assert set(played.unserved) == {
         one.request.arc
         for one in work.arrivals
@@ -265,7 +276,7 @@ def test_nobody_waits_while_some_choice_is_free(strategy: StrategyName, seed: in
     }
 
 
-def _arc(wanted: Request) -> Arc:
+def _arc(wanted: ArcRequest) -> Arc:
     return Arc(wanted, Place(TERM, 1), 0)
 
 

@@ -9,41 +9,49 @@ import pytest
 
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.test_waiting import workload
+from tests.scheduling.validate import validate
 from tests.thorough import times
+from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName, owner_of
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Outcome, Revoked
-from zscout.scheduling.events import Asked, LeadTaken, RcJoined, Released, Standing, Tick
-from zscout.scheduling.model import SECOND, Grant, Ns, Place, Request, Term
-from zscout.scheduling.policy import Policy, StrategyName, owner_of
+from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome
+from zscout.scheduling.events import LeadTaken, RcJoined, RecoveredHold, Released, Requested, Tick
+from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
+from zscout.types import (
+    SECOND,
+    Grant,
+    Ns,
+    Place,
+    Term,
+)
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")
 PATIENCE = 6 * SECOND
 
 
-def request(arc: str, *rcs: str, priority: int = 1, seconds: int = 10, host: str = "h") -> Request:
-    return Request(arc, f"{host}/c", {rc: {} for rc in rcs}, priority, seconds * SECOND)
+def request(arc: str, *rcs: str, priority: int = 1, seconds: int = 10, host: str = "h") -> ArcRequest:
+    return ArcRequest(arc, f"{host}/c", {rc: {} for rc in rcs}, priority, seconds * SECOND)
 
 
-def core_of(strategy: StrategyName, policy: Policy, *rcs: str) -> Core:
+def core_of(strategy: StrategyName, policy: SchedulingPolicy, *rcs: str) -> Core:
     core = Core(STRATEGIES[strategy](), policy)
     core.handle(0, *(RcJoined(rc, sharable=False) for rc in rcs))
     return core
 
 
 def running(core: Core) -> set[str]:
-    return set(core.floor.running)
+    return set(core._state.running)
 
 
 @pytest.mark.parametrize("strategy", ALL)
 def test_a_protected_hold_ends_for_an_operator_only(strategy: StrategyName) -> None:
-    core = core_of(strategy, Policy(preempt="after_min_runtime"), "robot/a")
-    core.handle(0, Asked(request("low", "robot/a")))
-    core.handle(SECOND, Asked(request("high", "robot/a", priority=9)))
+    core = core_of(strategy, SchedulingPolicy(preempt="after_min_runtime"), "robot/a")
+    core.handle(0, Requested(request("low", "robot/a")))
+    core.handle(SECOND, Requested(request("high", "robot/a", priority=9)))
     assert running(core) == {"low"}
-    core.handle(2 * SECOND, Asked(request("operator", "robot/a", priority=10, seconds=3)))
+    core.handle(2 * SECOND, Requested(request("operator", "robot/a", priority=10, seconds=3)))
     assert running(core) == {"operator"}
     core.handle(5 * SECOND, Tick())
     assert running(core) == {"high"}
@@ -53,10 +61,12 @@ def test_a_protected_hold_ends_for_an_operator_only(strategy: StrategyName) -> N
 
 @pytest.mark.parametrize("strategy", ALL)
 def test_a_protected_hold_that_is_kept_yields_after_its_time(strategy: StrategyName) -> None:
-    core = core_of(strategy, Policy(preempt="after_min_runtime"), "robot/a")
-    core.handle(0, Asked(Request("kept", "h/c", {"robot/a": {}}, 1, 10 * SECOND, keep=True)))
+    core = core_of(strategy, SchedulingPolicy(preempt="after_min_runtime"), "robot/a")
+    core.handle(0, Requested(ArcRequest("kept", "h/c", {"robot/a": {}}, 1, 10 * SECOND, keep=True)))
     core.handle(
-        SECOND, Asked(request("high", "robot/a", priority=5)), Asked(request("low", "robot/a", priority=0))
+        SECOND,
+        Requested(request("high", "robot/a", priority=5)),
+        Requested(request("low", "robot/a", priority=0)),
     )
     assert running(core) == {"kept"}
     core.handle(10 * SECOND, Tick())
@@ -67,23 +77,23 @@ def test_a_protected_hold_that_is_kept_yields_after_its_time(strategy: StrategyN
 def test_what_an_operator_leaves_is_not_taken_for_another(strategy: StrategyName) -> None:
     """The protected hold of two RCs ends for an operator only if it must: beside an operator on another RC
     it stays, though the one of priority 9 would be worth more."""
-    core = core_of(strategy, Policy(preempt="after_min_runtime"), "robot/a", "robot/b", "robot/c")
-    core.handle(0, Asked(request("held", "robot/a", "robot/b")))
+    core = core_of(strategy, SchedulingPolicy(preempt="after_min_runtime"), "robot/a", "robot/b", "robot/c")
+    core.handle(0, Requested(request("held", "robot/a", "robot/b")))
     effects = core.handle(
         SECOND,
-        Asked(request("nine", "robot/b", "robot/c", priority=9)),
-        Asked(request("operator", "robot/c", priority=10)),
+        Requested(request("nine", "robot/b", "robot/c", priority=9)),
+        Requested(request("operator", "robot/c", priority=10)),
     )
     assert running(core) == {"held", "operator"}
-    assert not any(isinstance(effect, Revoked) for effect in effects)
+    assert not any(isinstance(effect, HoldEnded) for effect in effects)
 
 
 def test_protection_outlives_the_rcm() -> None:
-    core = Core(policy=Policy(preempt="after_min_runtime"))
+    core = Core(policy=SchedulingPolicy(preempt="after_min_runtime"))
     term, old = Term(2, "rcm/b"), Term(1, "rcm/a")
-    stands = Standing(request("low", "robot/a"), Place(old, 1), Grant(old, 1), 0, 10 * SECOND)
+    stands = RecoveredHold(request("low", "robot/a"), Place(old, 1), Grant(old, 1), 0, 10 * SECOND)
     core.handle(SECOND, RcJoined("robot/a", sharable=False), LeadTaken(term, (stands,)))
-    core.handle(2 * SECOND, Asked(request("high", "robot/a", priority=5)))
+    core.handle(2 * SECOND, Requested(request("high", "robot/a", priority=5)))
     assert running(core) == {"low"}
 
 
@@ -101,7 +111,7 @@ def test_nobody_is_ever_preempted_in_a_protected_fleet(strategy: StrategyName, s
         work,
         watch,
         strategy=STRATEGIES[strategy](),
-        policy=Policy(preempt="after_min_runtime", patience=PATIENCE),
+        policy=SchedulingPolicy(preempt="after_min_runtime", patience=PATIENCE),
     )
     assert not played.unserved
     assert {hold.outcome for hold in played.holds} == {Outcome.COMPLETED}
@@ -116,15 +126,15 @@ def test_a_low_priority_starves_unless_the_fleet_promises_all() -> None:
     arrivals.sort(key=lambda one: one.at)
     work = Workload(replay_rcs("robot/a", "robot/b"), tuple(arrivals))
 
-    def start(policy: Policy) -> Ns:
+    def start(policy: SchedulingPolicy) -> Ns:
         played = replay(work, strategy=STRATEGIES["adaptive"](), policy=policy)
         return next(
             hold.start for hold in played.holds if hold.arc == "low" and hold.outcome is Outcome.COMPLETED
         )
 
-    assert start(Policy(patience=PATIENCE)) >= 80 * SECOND
+    assert start(SchedulingPolicy(patience=PATIENCE)) >= 80 * SECOND
     # Due at 7 s: from 4 s on nobody starts who would still run by then, and nobody takes it back.
-    assert start(Policy(patience=PATIENCE, promise="all")) == 6 * SECOND
+    assert start(SchedulingPolicy(patience=PATIENCE, promise="all")) == 6 * SECOND
 
 
 @pytest.mark.parametrize("seed", range(times(50)))
@@ -136,18 +146,20 @@ def test_promise_all_keeps_the_other_promises(seed: int) -> None:
     def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
         ledger.take(now, core, effects)
 
-    policy = Policy(patience=PATIENCE, promise="all", max_running_per_host=draw.choice([None, 1, 2]))
+    policy = SchedulingPolicy(
+        patience=PATIENCE, promise="all", max_running_per_host=draw.choice([None, 1, 2])
+    )
     assert not replay(work, watch, strategy=STRATEGIES["adaptive"](), policy=policy).unserved
 
 
 @pytest.mark.parametrize("strategy", ALL)
 def test_a_host_has_its_quota(strategy: StrategyName) -> None:
-    core = core_of(strategy, Policy(max_running_per_host=1), "robot/a", "robot/b", "robot/c")
-    core.handle(0, *(Asked(request(f"mine{rc}", f"robot/{rc}", host="greedy")) for rc in "ab"))
-    core.handle(0, Asked(request("theirs", "robot/c", host="modest")))
+    core = core_of(strategy, SchedulingPolicy(max_running_per_host=1), "robot/a", "robot/b", "robot/c")
+    core.handle(0, *(Requested(request(f"mine{rc}", f"robot/{rc}", host="greedy")) for rc in "ab"))
+    core.handle(0, Requested(request("theirs", "robot/c", host="modest")))
     assert running(core) == {"minea", "theirs"}
-    assert core.floor.queued["mineb"].reason == "host greedy has 1 ARCs running, its quota"
-    core.handle(SECOND, Asked(request("operator", "robot/b", priority=10, host="greedy")))
+    assert str(core._state.queued["mineb"].reason) == "host greedy has 1 ARCs running, its quota"
+    core.handle(SECOND, Requested(request("operator", "robot/b", priority=10, host="greedy")))
     assert running(core) == {"minea", "theirs", "operator"}
     core.handle(2 * SECOND, Released("operator"))
     assert running(core) == {"minea", "theirs"}
@@ -167,15 +179,15 @@ def test_no_host_ever_has_more_than_its_quota(strategy: StrategyName, seed: int)
     counts: Counter[str] = Counter()
 
     def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
-        core.validate()
+        validate(core)
         for effect in effects:
             if isinstance(effect, Granted):
                 counts[owners[effect.arc]] += 1
                 assert counts[owners[effect.arc]] <= 2
-            elif isinstance(effect, Revoked):
+            elif isinstance(effect, HoldEnded):
                 counts[owners[effect.arc]] -= 1
 
-    policy = Policy(max_running_per_host=2, patience=PATIENCE)
+    policy = SchedulingPolicy(max_running_per_host=2, patience=PATIENCE)
     assert not replay(work, watch, strategy=STRATEGIES[strategy](), policy=policy).unserved
 
 
@@ -183,15 +195,15 @@ def replay_rcs(*names: str) -> tuple[WorkloadRc, ...]:
     return tuple(map(WorkloadRc, names))
 
 
-def _of_host(one: Request, host: str) -> Request:
-    return Request(one.arc, f"{host}/c", one.needs, one.priority, one.min_runtime)
+def _of_host(one: ArcRequest, host: str) -> ArcRequest:
+    return ArcRequest(one.arc, f"{host}/c", one.needs, one.priority, one.min_runtime)
 
 
 def _with_priorities(work: Workload, draw: random.Random, highest: int) -> Workload:
     arrivals = (
         Arrival(
             at.at,
-            Request(
+            ArcRequest(
                 at.request.arc,
                 at.request.client,
                 at.request.needs,

@@ -12,11 +12,11 @@ from tests.scheduling.invariants import Ledger, check_settled
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Propose, Revoked
-from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
-from zscout.scheduling.model import ArcId, Ns
+from zscout.scheduling.effects import Effect, Granted, HoldEnded, Propose
+from zscout.scheduling.events import Event, RcJoined, Released, Requested, Tick, Vote
 from zscout.scheduling.replay import HoldRecord, Replay, replay
 from zscout.scheduling.workload import Workload, excess
+from zscout.types import ArcId, Ns
 
 
 class SlowPlayer:
@@ -45,7 +45,7 @@ class SlowPlayer:
                 now = min(times)
                 asked = [arrival for arrival in arrivals if arrival.at == now]
                 arrivals = arrivals[len(asked) :]
-                events: list[Event] = [Asked(arrival.request) for arrival in asked]
+                events: list[Event] = [Requested(arrival.request) for arrival in asked]
                 for event in events or [Tick()]:
                     self.send(now, event)
                     self.deliver(now, everything=not self.linger)
@@ -73,7 +73,7 @@ class SlowPlayer:
                     self.out.append(effect)
                 case Granted(arc=arc):
                     self.open[arc] = effect
-                case Revoked(arc=arc, outcome=outcome, rcs=rcs):
+                case HoldEnded(arc=arc, outcome=outcome, rcs=rcs):
                     self.holds.append(HoldRecord(arc, self.open.pop(arc).start, now, outcome, rcs))
                 case _:
                     pass

@@ -9,13 +9,14 @@ from random import Random
 
 import pytest
 
-from tests.scheduling.plain_pass import run_plain_pass
+from tests.scheduling.plain_pass import PlainPriority
+from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.scheduling import priority
+from zscout.scheduling.admission_check import AdmissionCheck
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Propose, Queued, Revoked
+from zscout.scheduling.effects import Effect, Granted, HoldEnded, Propose, Queued
 from zscout.scheduling.events import (
-    Asked,
     Cancelled,
     ClientLost,
     Event,
@@ -24,14 +25,16 @@ from zscout.scheduling.events import (
     RcLost,
     RcReported,
     Released,
+    Requested,
     Tick,
     Vote,
     VoteOverdue,
 )
-from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import SECOND, Arc, Params, Request
-from zscout.scheduling.votes import Votes
+from zscout.scheduling.model import Arc, ArcRequest, ArcState
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.status import ArcStatus
 from zscout.scheduling.workload import excess
+from zscout.types import SECOND, Params
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class Twins:
 
     def __init__(self, size: Size, seed: int) -> None:
         self.size, self.rng = size, Random(seed)  # noqa: S311
-        self.indexed, self.plain = Core(), Core(run_plain_pass)
+        self.indexed, self.plain = Core(), Core(PlainPriority())
         self.now = 0
         self.number = 0
         self.sharable = {f"rc/{number}": number < size.sharable for number in range(size.rcs)}
@@ -79,7 +82,9 @@ class Twins:
         }
         client = f"host/{rng.randrange(self.size.clients)}"
         runtime = rng.randint(1, 6) * SECOND // 2
-        return Asked(Request(f"a{self.number}", client, needs, rng.randrange(4), runtime, rng.random() < 0.2))
+        return Requested(
+            ArcRequest(f"a{self.number}", client, needs, rng.randrange(4), runtime, rng.random() < 0.2)
+        )
 
     def send(self, *events: Event) -> bool:
         """False if nothing was decided."""
@@ -92,7 +97,7 @@ class Twins:
                     self.out[proposal] = effect
                 case Granted():
                     self.grants += 1
-                case Revoked(by=by):
+                case HoldEnded(by=by):
                     self.preemptions += by is not None
                 case _:
                     pass
@@ -117,8 +122,8 @@ class Twins:
         return Vote(question.proposal, accept=not reason, reason=reason)
 
     def event(self) -> Event:
-        rng, floor = self.rng, self.indexed.floor
-        running, queued = sorted(floor.running), sorted(floor.queued)
+        rng, state = self.rng, self.indexed._state
+        running, queued = sorted(state.running), sorted(state.queued)
         some_rc = rng.choice(sorted(self.sharable))
         doings: list[tuple[float, Callable[[], Event]]] = [
             (5.0 if len(queued) < self.size.arcs else 0.5, self.ask),
@@ -156,16 +161,18 @@ class Twins:
     def compare(self) -> None:
         """All state, the words for who asks, and the clients' ARCs; slow."""
         # What the plain core said of an ARC is older than what it did for those below: one more pass.
-        calm = not self.send(Tick()) and next(self.indexed.votes.out(), None) is None
-        self.indexed.validate()
-        one, two = self.indexed.floor, self.plain.floor
+        calm = not self.send(Tick()) and next(self.indexed._votes.out(), None) is None
+        validate(self.indexed)
+        one, two = self.indexed._state, self.plain._state
         assert list(one.queued) == list(two.queued)
         assert list(one.running) == list(two.running)
         ranked = sorted(one.queued.values(), key=lambda arc: arc.rank)
         for ahead, arc in enumerate(ranked):
-            assert one.waits.ahead(arc) == ahead
-            if calm and arc.watched is not None:
-                assert self.indexed.reason(arc) == two.queued[arc.id].reason
+            assert one.index.ahead(arc) == ahead
+            if calm and arc.state is ArcState.WATCHING:
+                status = self.indexed.arc(arc.id)
+                assert status is not None
+                assert status.reason == two.queued[arc.id].reason
         for client in {arc.request.client for arc in one.running.values()}:
             theirs: list[Arc] = [*one.queued.values(), *one.running.values()]
             assert one.arcs_of(client) == [arc for arc in theirs if arc.request.client == client]
@@ -197,16 +204,16 @@ def test_what_a_release_looks_at_does_not_grow_with_the_queue(monkeypatch: pytes
     """Counted in visits, not in seconds: 4,000 ARCs that wait for other RCs are nobody's business."""
     looked_at: list[str] = []
 
-    class Counted(priority.Visit):
-        def __init__(self, floor: Floor, votes: Votes, now: int, arc: Arc) -> None:
+    class Counted(AdmissionCheck):
+        def __init__(self, state: SchedulerState, arc: Arc) -> None:
             looked_at.append(arc.id)
-            super().__init__(floor, votes, now, arc)
+            super().__init__(state, arc)
 
-    monkeypatch.setattr(priority, "Visit", Counted)
+    monkeypatch.setattr(priority, "AdmissionCheck", Counted)
     core = Core()
     core.handle(0, *[RcJoined(f"robot/{number}", sharable=False) for number in range(50)])
     asked = [
-        Asked(Request(f"a{number}", "host/c", {f"robot/{number % 50}": {}}, 0, (1 + number) * SECOND))
+        Requested(ArcRequest(f"a{number}", "host/c", {f"robot/{number % 50}": {}}, 0, (1 + number) * SECOND))
         for number in range(4000)
     ]
     core.handle(0, *asked)
@@ -214,24 +221,33 @@ def test_what_a_release_looks_at_does_not_grow_with_the_queue(monkeypatch: pytes
     looked_at.clear()
     granted = [effect for effect in core.handle(1, Released("a7")) if isinstance(effect, Granted)]
     assert [grant.arc for grant in granted] == ["a57"], "the next in line for robot/7"
-    assert looked_at == [f"a{57 + 50 * step}" for step in range(1 + priority.TOLD)]
+    assert looked_at == [f"a{57 + 50 * step}" for step in range(1 + priority.MAX_REPORTED)]
 
 
 def test_the_words_for_who_asks_are_those_of_now() -> None:
     core = Core()
     core.handle(0, RcJoined("robot/a", sharable=False))
-    core.handle(0, *[Asked(Request(f"a{number}", "h/c", {"robot/a": {}}, 0, SECOND)) for number in range(20)])
-    last = core.floor.queued["a19"]
-    assert core.reason(last) == last.reason == "needs robot/a (held by a0, priority 0)"
+    core.handle(
+        0, *[Requested(ArcRequest(f"a{number}", "h/c", {"robot/a": {}}, 0, SECOND)) for number in range(20)]
+    )
+    assert reason_of(core) == str(last_of(core).reported) == "needs robot/a (held by a0, priority 0)"
     core.handle(1, Released("a0"))
-    assert core.reason(last) == "needs robot/a (held by a1, priority 0)"
-    assert core.floor.waits.ahead(last) == 17
+    assert reason_of(core) == "needs robot/a (held by a1, priority 0)"
+    assert last_of(core).ahead == 17
     core.handle(2, RcLost("robot/a"))
-    assert core.reason(last) == last.reason == "robot/a not on the mesh"
+    assert reason_of(core) == str(last_of(core).reported) == "robot/a not on the mesh"
+
+
+def reason_of(core: Core) -> str:
+    return str(last_of(core).reason)
+
+
+def last_of(core: Core) -> ArcStatus:
+    return core.status().queued[-1]
 
 
 def test_one_asleep_hears_in_the_next_pass_of_what_was_done_below_it() -> None:
-    cores = (Core(), Core(run_plain_pass))
+    cores = (Core(), Core(PlainPriority()))
 
     def both(*events: Event) -> list[Effect]:
         effects, plain = (core.handle(1, *events) for core in cores)
@@ -242,11 +258,11 @@ def test_one_asleep_hears_in_the_next_pass_of_what_was_done_below_it() -> None:
         return next(effect.proposal for effect in effects if isinstance(effect, Propose))
 
     both(RcJoined("radio/s", sharable=True), RcJoined("robot/x", sharable=False))
-    asked = both(Asked(Request("low", "h/c", {"radio/s": {}, "robot/x": {}}, 0, SECOND)))
+    asked = both(Requested(ArcRequest("low", "h/c", {"radio/s": {}, "robot/x": {}}, 0, SECOND)))
     both(Vote(proposed(asked), accept=True))
-    alone = both(Asked(Request("high", "h/c", {"radio/s": {}}, 2, SECOND)))
+    alone = both(Requested(ArcRequest("high", "h/c", {"radio/s": {}}, 2, SECOND)))
     beside_low = both(Vote(proposed(alone), accept=True))
     both(VoteOverdue(proposed(beside_low)))
-    taken = both(Asked(Request("middle", "h/c", {"robot/x": {}}, 1, SECOND)))
+    taken = both(Requested(ArcRequest("middle", "h/c", {"robot/x": {}}, 1, SECOND)))
     assert [effect.arc for effect in taken if isinstance(effect, Granted)] == ["middle"]
     assert [effect.arc for effect in both(Tick()) if isinstance(effect, Granted)] == ["high"]

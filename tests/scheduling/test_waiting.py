@@ -9,20 +9,29 @@ import pytest
 
 from tests.scheduling.invariants import Ledger
 from tests.thorough import times
+from zscout.config.scheduling_policy import SchedulingPolicy
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.effects import Effect
-from zscout.scheduling.events import Asked, LeadTaken, RcJoined, Tick, Waiting
-from zscout.scheduling.model import NO_TERM, SECOND, Ns, Params, Place, RcName, Request, Term
-from zscout.scheduling.policy import Policy
+from zscout.scheduling.events import LeadTaken, RcJoined, RecoveredRequest, Requested, Tick
+from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.replay import Replay, replay
-from zscout.scheduling.reservations import MAX_OWED
+from zscout.scheduling.reservations import MAX_STARVING
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
+from zscout.types import (
+    NO_TERM,
+    SECOND,
+    Ns,
+    Params,
+    Place,
+    RcName,
+    Term,
+)
 
 RUNS = times(1_000)
 PARTS = 10
 PATIENCE = 6 * SECOND
-POLICY = Policy(patience=PATIENCE)
+POLICY = SchedulingPolicy(patience=PATIENCE)
 RADIO = WorkloadRc("radio/rf", sharable=True, capacity={"rate": Fraction(10)})
 
 
@@ -38,7 +47,7 @@ def workload(seed: int) -> Workload:
         if radio and draw.random() < 0.7:
             needs[RADIO.name] = {"rate": Fraction(draw.randint(1, 9))}
         runtime = draw.choice((draw.randint(1, 10), draw.randint(1, 60))) * SECOND // 10
-        request = Request(f"a{number}", "study/client", needs, 1, runtime)
+        request = ArcRequest(f"a{number}", "study/client", needs, 1, runtime)
         arrivals.append(Arrival(at, request))
         at += draw.randint(0, 2 * runtime * width // len(robots) // SECOND * SECOND // 2 + SECOND // 2)
     rcs = (*map(WorkloadRc, robots), *((RADIO,) if radio else ()))
@@ -60,7 +69,7 @@ def check_bound(workload: Workload, played: Replay, patience: Ns) -> int:
             for other in workload.arrivals
             if other.at <= since and starts[other.request.arc] >= since + patience // 2 and other != arrival
         }
-        linked: dict[str, Request] = {arc.arc: arc}
+        linked: dict[str, ArcRequest] = {arc.arc: arc}
         while found := [
             one
             for one in before.values()
@@ -69,7 +78,7 @@ def check_bound(workload: Workload, played: Replay, patience: Ns) -> int:
         ]:
             linked |= {one.arc: one for one in found}
         ahead = sum(one.min_runtime for one in linked.values() if one is not arc)
-        ahead += longest * ((len(linked) - 1) // MAX_OWED)
+        ahead += longest * ((len(linked) - 1) // MAX_STARVING)
         bound = max(patience, patience // 2 + longest) + ahead
         assert waited <= bound, f"{arc.arc} waited {waited / SECOND} s, promised are {bound / SECOND}"
     return tried
@@ -101,12 +110,12 @@ def narrow_stream(robots: int, *, runtime: Ns, until: Ns) -> Workload:
     """A wide ARC of all robots comes at 1 s into an endless stream of narrow ones that never leaves them all
     free at one time."""
     names = [f"robot/r{number}" for number in range(robots)]
-    arrivals = [Arrival(SECOND, Request("wide", "study/wide", {rc: {} for rc in names}, 1, 2 * runtime))]
+    arrivals = [Arrival(SECOND, ArcRequest("wide", "study/wide", {rc: {} for rc in names}, 1, 2 * runtime))]
     for number, rc in enumerate(names):
         at = number * runtime // robots
         count = 0
         while at < until:
-            arrivals.append(Arrival(at, Request(f"n{number}-{count}", "study/n", {rc: {}}, 1, runtime)))
+            arrivals.append(Arrival(at, ArcRequest(f"n{number}-{count}", "study/n", {rc: {}}, 1, runtime)))
             at, count = at + runtime, count + 1
     return Workload(tuple(map(WorkloadRc, names)), tuple(sorted(arrivals, key=lambda one: one.at)))
 
@@ -119,7 +128,7 @@ def test_the_wide_one_gets_its_turn() -> None:
         return next(hold.start for hold in played.holds if hold.arc == "wide")
 
     assert start(replay(work)) >= until, "the stream should starve it under the letter of the paper"
-    assert start(replay(work, strategy=Adaptive(), policy=Policy(patience=None))) >= until
+    assert start(replay(work, strategy=Adaptive(), policy=SchedulingPolicy(patience=None))) >= until
     wide = start(replay(work, strategy=Adaptive(), policy=POLICY))
     # It starts the moment it is due: the last of the stream were over by then.
     assert wide == SECOND + PATIENCE
@@ -133,7 +142,7 @@ def test_reservations_keep_every_other_promise(seed: int) -> None:
     arrivals = tuple(
         Arrival(
             one.at,
-            Request(
+            ArcRequest(
                 one.request.arc,
                 one.request.client,
                 one.request.needs,
@@ -159,29 +168,29 @@ TERM = Term(1, "rcm/a")
 def test_who_has_waited_under_another_rcm_goes_on_waiting_not_anew() -> None:
     core = Core(Adaptive(), POLICY)
     now = 100 * SECOND
-    wide = Request("wide", "h/c", {"robot/a": {}, "robot/b": {}}, 1, SECOND)
-    long = Request("long", "h/c", {"robot/a": {}}, 1, 10 * SECOND)
-    waiting = (Waiting(wide, Place(NO_TERM, 1), now - PATIENCE),)
+    wide = ArcRequest("wide", "h/c", {"robot/a": {}, "robot/b": {}}, 1, SECOND)
+    long = ArcRequest("long", "h/c", {"robot/a": {}}, 1, 10 * SECOND)
+    waiting = (RecoveredRequest(wide, Place(NO_TERM, 1), now - PATIENCE),)
     core.handle(now, RcJoined("robot/b", sharable=False), LeadTaken(TERM, (), waiting))
     # Nobody is kept a place that an absent RC leaves open for who knows how long.
-    core.handle(now, RcJoined("robot/a", sharable=False), Asked(long))
-    assert core.floor.running.keys() == {"wide"}
+    core.handle(now, RcJoined("robot/a", sharable=False), Requested(long))
+    assert core._state.running.keys() == {"wide"}
     core.handle(now + SECOND, Tick())
-    assert core.floor.running.keys() == {"long"}
+    assert core._state.running.keys() == {"long"}
 
 
 def test_higher_priority_is_not_held_back() -> None:
     core = Core(Adaptive(), POLICY)
     core.handle(0, RcJoined("robot/a", sharable=False), RcJoined("robot/b", sharable=False))
-    wide = Request("wide", "h/c", {"robot/a": {}, "robot/b": {}}, 1, SECOND)
-    core.handle(0, Asked(Request("first", "h/c", {"robot/a": {}}, 1, 60 * SECOND)))
-    core.handle(0, Asked(wide))
+    wide = ArcRequest("wide", "h/c", {"robot/a": {}, "robot/b": {}}, 1, SECOND)
+    core.handle(0, Requested(ArcRequest("first", "h/c", {"robot/a": {}}, 1, 60 * SECOND)))
+    core.handle(0, Requested(wide))
     now = 55 * SECOND
-    core.handle(now, Asked(Request("equal", "h/c", {"robot/b": {}}, 1, 10 * SECOND)))
-    core.handle(now, Asked(Request("lower", "h/c", {"robot/b": {}}, 0, 10 * SECOND)))
-    assert core.floor.running.keys() == {"first"}
-    assert core.reason(core.floor.queued["equal"]).startswith("robot/b is kept for wide")
-    core.handle(now, Asked(Request("short", "h/c", {"robot/b": {}}, 1, 5 * SECOND)))
-    assert core.floor.running.keys() == {"first", "short"}
-    core.handle(now, Asked(Request("higher", "h/c", {"robot/b": {}}, 2, 10 * SECOND)))
-    assert core.floor.running.keys() == {"first", "higher"}
+    core.handle(now, Requested(ArcRequest("equal", "h/c", {"robot/b": {}}, 1, 10 * SECOND)))
+    core.handle(now, Requested(ArcRequest("lower", "h/c", {"robot/b": {}}, 0, 10 * SECOND)))
+    assert core._state.running.keys() == {"first"}
+    assert "robot/b is kept for wide" in {arc.id: str(arc.reason) for arc in core.status().queued}["equal"]
+    core.handle(now, Requested(ArcRequest("short", "h/c", {"robot/b": {}}, 1, 5 * SECOND)))
+    assert core._state.running.keys() == {"first", "short"}
+    core.handle(now, Requested(ArcRequest("higher", "h/c", {"robot/b": {}}, 2, 10 * SECOND)))
+    assert core._state.running.keys() == {"first", "higher"}

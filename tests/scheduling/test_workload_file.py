@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.thorough import times
-from zscout.scheduling.model import Request
+from zscout.config.strict import BadInput
+from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.replay import replay
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.workload_file import MAX_ARCS, MAX_NEEDS, MAX_RCS, parse_workload
-from zscout.strict import BadInput
 
 RC = '[[rc]]\nname = "robot/a"\n'
 RADIO = '[[rc]]\nname = "radio/r"\nsharable = true\n'
@@ -168,8 +168,8 @@ def test_a_good_file_is_read_exactly_and_in_its_order() -> None:
             WorkloadRc("video/ch1", sharable=True),
         ),
         arrivals=(
-            Arrival(100_000_000, Request("late", "late", late, 1, 200_000_000)),
-            Arrival(0, Request("an early one", "an early one", early, 0, 1_000_000_000)),
+            Arrival(100_000_000, ArcRequest("late", "late", late, 1, 200_000_000)),
+            Arrival(0, ArcRequest("an early one", "an early one", early, 0, 1_000_000_000)),
         ),
     )
 
@@ -218,7 +218,9 @@ def workloads(draw: st.DrawFn) -> Workload:
     return Workload(
         tuple(WorkloadRc(name, sharable, capacity if sharable else {}) for name, sharable, capacity in rcs),
         tuple(
-            Arrival(draw(TIMES), Request(name, name, draw(needs), draw(st.integers(0, 10**9)), draw(TIMES)))
+            Arrival(
+                draw(TIMES), ArcRequest(name, name, draw(needs), draw(st.integers(0, 10**9)), draw(TIMES))
+            )
             for name in names
         ),
     )

@@ -18,11 +18,11 @@ import re
 from dataclasses import dataclass, field
 from fractions import Fraction
 
+from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Dropped, Effect, Granted, Propose, Queued, Revoked, WakeAt
+from zscout.scheduling.effects import Dropped, Effect, Granted, HoldEnded, Propose, Queued, WakeAt
 from zscout.scheduling.events import (
-    Asked,
     Cancelled,
     ClientLost,
     Event,
@@ -31,14 +31,22 @@ from zscout.scheduling.events import (
     RcJoined,
     RcLost,
     RcReported,
+    RecoveredHold,
+    RecoveredRequest,
     Released,
-    Standing,
+    Requested,
     Tick,
     Vote,
     VoteOverdue,
-    Waiting,
 )
-from zscout.scheduling.model import Grant, Ns, Params, Place, Request, Term
+from zscout.scheduling.model import ArcRequest
+from zscout.types import (
+    Grant,
+    Ns,
+    Params,
+    Place,
+    Term,
+)
 
 _NEED = re.compile(r"([\w.-]+/[\w.-]+)(?:\{([^}]*)\})?")
 
@@ -49,8 +57,8 @@ class CorePlayer:
 
     core: Core = field(default_factory=Core)
     now: Ns = 0
-    standing: list[Standing] = field(default_factory=list)
-    waiting: list[Waiting] = field(default_factory=list)
+    standing: list[RecoveredHold] = field(default_factory=list)
+    waiting: list[RecoveredRequest] = field(default_factory=list)
 
     def batch(self, line: str) -> list[str]:
         events: list[Event] = []
@@ -64,7 +72,7 @@ class CorePlayer:
         if not events:
             return []
         effects = self.core.handle(self.now, *events)
-        self.core.validate()
+        validate(self.core)
         return [_print(effect) for effect in effects] or ["nothing"]
 
     def event(self, verb: str, rest: str) -> Event | None:
@@ -72,17 +80,17 @@ class CorePlayer:
         match verb:
             case "ask":
                 request, options = _request(rest)
-                return Asked(request, _place(options["place"]) if "place" in options else None)
+                return Requested(request, _place(options["place"]) if "place" in options else None)
             case "standing":
                 request, options = _request(rest)
                 start = ns(options["start"])
                 grant = Grant(*_place(options["grant"]))
                 place = _place(options["place"])
-                self.standing.append(Standing(request, place, grant, start, start + request.min_runtime))
+                self.standing.append(RecoveredHold(request, place, grant, start, start + request.min_runtime))
                 return None
             case "waiting":
                 request, options = _request(rest)
-                self.waiting.append(Waiting(request, _place(options["place"])))
+                self.waiting.append(RecoveredRequest(request, _place(options["place"])))
                 return None
             case "lead":
                 lead = LeadTaken(_term(first), tuple(self.standing), tuple(self.waiting))
@@ -116,7 +124,7 @@ class CorePlayer:
                 raise ValueError(f"no such command: {verb}")
 
 
-def _request(text: str) -> tuple[Request, dict[str, str]]:
+def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
     """`ARC NEED,... key=value ... [keep]`."""
     braces = re.compile(r"\{[^}]*\}")
     # Parameters hold spaces; take them out of the way of the split.
@@ -132,7 +140,7 @@ def _request(text: str) -> tuple[Request, dict[str, str]]:
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
     words = (word for word in rest if word != "keep")
     options = settings(words, "priority", "runtime", "client", "place", "grant", "start")
-    request = Request(
+    request = ArcRequest(
         arc=arc,
         client=options.get("client", "host/" + arc),
         needs=wanted,
@@ -172,7 +180,7 @@ def _print(effect: Effect) -> str:
         case Granted(arc=arc, client=client, grant=grant, rcs=rcs, start=start, end=end):
             span = f"from {seconds(start)} " + ("on" if end is None else f"to {seconds(end)}")
             return f"grant {arc} to {client} ({_grant(grant)}): {', '.join(rcs)} {span}"
-        case Revoked(arc=arc, grant=grant, outcome=outcome, reason=reason, requeued=requeued, by=by):
+        case HoldEnded(arc=arc, grant=grant, outcome=outcome, reason=reason, requeued=requeued, by=by):
             took = f" by {by}" if by is not None else ""
             tail = "; queued again" if requeued else ""
             return f"revoke {arc} ({_grant(grant)}) {outcome.value}{took}: {reason}{tail}"

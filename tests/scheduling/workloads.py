@@ -6,8 +6,9 @@ from fractions import Fraction
 
 from hypothesis import strategies as st
 
-from zscout.scheduling.model import SECOND, Params, RcName, Request
+from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
+from zscout.types import SECOND, Params, RcName
 
 PARAMETERS = ("rate", "width")
 ABSENT: RcName = "robot/absent"
@@ -42,12 +43,12 @@ def rcs(draw: st.DrawFn) -> tuple[WorkloadRc, ...]:
 
 
 @st.composite
-def requests(draw: st.DrawFn, arc: str, names: list[RcName], *, keep: bool = True) -> Request:
+def requests(draw: st.DrawFn, arc: str, names: list[RcName], *, keep: bool = True) -> ArcRequest:
     """One ARC that needs one to four of `names`, now and then of `ABSENT`; kept sometimes, if `keep`."""
     needed = draw(st.lists(st.sampled_from(names), min_size=1, max_size=4, unique=True))
     if draw(st.integers(0, 15)) == 15:
         needed.append(ABSENT)
-    return Request(
+    return ArcRequest(
         arc=arc,
         client=f"host/{draw(st.integers(0, 2))}",
         needs={name: draw(params) for name in needed},

@@ -12,13 +12,12 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any, Final, Literal, TypeAlias
 
-from zscout import clock
-from zscout.behaviors.arc import Held, Revoked, hold
-from zscout.behaviors.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.client.arc import Held, Revoked, hold
+from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.piloting import Pilot
-from zscout.behaviors.request import OpenArc
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
-from zscout.scheduling.model import SECOND, Ns
+from zscout.types import SECOND, Ns
 
 PERIOD: Final = 0.05
 """Seconds between two looks at the pilot."""
@@ -65,7 +64,7 @@ class Teleop:
     def take(self) -> None:
         """The robot is wanted from now on."""
         if not self._wanted.is_set():
-            self._asked_at, self.takeover = clock.now(), None
+            self._asked_at, self.takeover = self.client.mesh.now(), None
             self._wanted.set()
             self._unwanted.clear()
         self.wake()
@@ -151,10 +150,10 @@ class Teleop:
 
     async def _steer(self, robot: HeldRobot) -> None:
         self._wake.clear()
-        wheels = self.pilot.wheels(clock.now() / SECOND)
+        wheels = self.pilot.wheels(self.client.mesh.now() / SECOND)
         obeyed = await robot.drive(wheels.left, wheels.right, min(wheels.lasts, LONGEST))
         if self.takeover is None and obeyed and not wheels.still:
-            self.takeover = (clock.now() - self._asked_at) / SECOND
+            self.takeover = (self.client.mesh.now() - self._asked_at) / SECOND
             self._changed()
 
     def _be(self, state: State, why: str) -> None:

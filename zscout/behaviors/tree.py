@@ -1,17 +1,17 @@
-"""Behaviors that form a tree: what they are called, what they tell, and what they remember.
+"""Behaviors that form a tree: their names, their status, and what outlives a move.
 
     class Greet(Behavior):
-        async def run(self, scene):
-            self.say("greeting", "the robot")
-            await scene.safe_point()
+        async def run(self, context):
+            self.report("greeting", "the robot")
+            await context.safe_point()
 
     root = Greet("hall")
     root.add(Greet("door"))           # its path is hall/door
-    await root.run(scene)
+    await root.perform(context)
 
 A behavior runs its children as it likes: one after the other, or side by side with `side_by_side`, where one
-that fails does not stop the others. What any of them says goes out under its path, so that people see the
-tree; what each of them remembers is checkpointed with the whole tree.
+that fails does not stop the others. The status that any of them reports is published under its path, so that
+people see the tree; the memory of each is checkpointed with the whole tree.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from zscout.behaviors.client import Client
+from zscout.behaviors.client.client import Client
 from zscout.keyexpr import check_name
 from zscout.messages import Box
+from zscout.types import SECOND, Ns
 
 MAX_DEPTH: Final = 8
 MAX_CHILDREN: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Saying:
-    """What a behavior said; `doing` is empty when it has ended."""
+class BehaviorStatus:
+    """What a behavior does; `doing` is empty when it has ended."""
 
     path: str
     doing: str
@@ -42,14 +43,14 @@ class Saying:
     boxes: tuple[Box, ...] = ()
 
 
-class Scene:
+class BehaviorContext:
     """What a tree of behaviors runs on."""
 
     def __init__(
         self,
         client: Client,
         safe_point: Callable[[], Awaitable[None]],
-        voice: Callable[[Saying], None],
+        publish: Callable[[BehaviorStatus], None],
         *,
         speed: float = 1.0,
         name: str = "",
@@ -57,7 +58,7 @@ class Scene:
         self.client = client
         self.safe_point = safe_point
         """Await it wherever the state of the whole tree is sound: the tree may be moved to another host."""
-        self.voice = voice
+        self.publish = publish
         self.name = name
         """Of the component that the tree runs as, if it is one."""
         self.speed = speed
@@ -76,7 +77,7 @@ class Behavior:
         self.children: list[Behavior] = []
         self.doing = ""
         self.detail = ""
-        self._voice: Callable[[Saying], None] | None = None
+        self._publish_status: Callable[[BehaviorStatus], None] | None = None
 
     def add(self, child: Behavior) -> None:
         """Puts `child` under this one. Raises ValueError for a name that is there, or a tree too large."""
@@ -102,24 +103,28 @@ class Behavior:
         for child in self.children:
             yield from child.walk()
 
-    async def run(self, scene: Scene) -> None:
+    async def run(self, context: BehaviorContext) -> None:
         """Does its work. To raise is to fail; cancelled when it is to end."""
         raise NotImplementedError(f"{type(self).__name__} has no run(); write one")
 
-    async def play(self, scene: Scene) -> None:
-        """`run`, with its voice: call this for a child, and for the root."""
-        self._voice = scene.voice
+    async def perform(self, context: BehaviorContext) -> None:
+        """`run`, with its status published: call this for a child, and for the root."""
+        self._publish_status = context.publish
         try:
-            await self.run(scene)
+            await self.run(context)
         finally:
-            self.say("")
+            self.report("")
 
-    async def side_by_side(self, scene: Scene, children: Iterable[Behavior]) -> list[BaseException]:
-        """Plays `children` at once and returns the failures; one that fails leaves the others running."""
-        results = await asyncio.gather(*(child.play(scene) for child in children), return_exceptions=True)
+    async def side_by_side(
+        self, context: BehaviorContext, children: Iterable[Behavior]
+    ) -> list[BaseException]:
+        """Performs `children` at once and returns the failures; one that fails leaves the others running."""
+        results = await asyncio.gather(
+            *(child.perform(context) for child in children), return_exceptions=True
+        )
         return [result for result in results if isinstance(result, BaseException)]
 
-    def say(
+    def report(
         self,
         doing: str,
         detail: str = "",
@@ -129,12 +134,12 @@ class Behavior:
         alert: bool = False,
         boxes: Sequence[Box] = (),
     ) -> None:
-        """Tells what it does from now on. The same said again is told once, but for alerts and boxes."""
+        """What it does from now on. The same reported again is published once, but for alerts and boxes."""
         if (doing, detail) == (self.doing, self.detail) and not alert and not camera:
             return
         self.doing, self.detail = doing, detail
-        if self._voice is not None:
-            self._voice(Saying(self.path, doing, detail, robot, camera, alert, tuple(boxes)))
+        if self._publish_status is not None:
+            self._publish_status(BehaviorStatus(self.path, doing, detail, robot, camera, alert, tuple(boxes)))
 
     # What outlives a move
 
@@ -156,3 +161,18 @@ class Behavior:
         for child in self.children:
             if child.name in known:
                 child.restore(known[child.name])
+
+
+class CarriedClock:
+    """The seconds that a behavior has lived, carried from host to host, whose own clocks differ."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._read_at: Ns | None = None
+
+    def read(self, at: Ns, speed: float = 1.0) -> float:
+        """The seconds lived until `at` by this host's clock, since the last reading at `speed`."""
+        if self._read_at is not None:
+            self.seconds += (at - self._read_at) / SECOND * speed
+        self._read_at = at
+        return self.seconds

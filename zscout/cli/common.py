@@ -18,15 +18,15 @@ from typing import IO, TYPE_CHECKING, Any, Final, TypeVar
 import click
 import msgspec
 
-from zscout.config import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
+from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
+from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.messages import RcmState
-from zscout.strict import BadInput, quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from zscout.behaviors.client import Client
+    from zscout.behaviors.client.client import Client
 
 LOOK_FOR_RCM: Final = 2.0
 """Seconds in which a mesh that has an RCM shows it."""
@@ -122,7 +122,7 @@ async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = T
     """A client named `<role>-<random>` on the mesh of `fleet` (default: `the_fleet()`), closed at the end.
 
     Raises MeshError, BadInput, and with `need_rcm` NobodyThere where no RCM is seen in time."""
-    from zscout.behaviors.client import Client
+    from zscout.behaviors.client.client import Client
 
     async with await Client.connect(f"{role}-{new_instance()}", fleet=fleet or the_fleet()) as client:
         if need_rcm:
@@ -167,10 +167,10 @@ async def see_rcm(client: Client) -> None:
     )
 
 
-async def state_of(client: Client, arc: str | None = None) -> RcmState:
+async def state_of(client: Client, arc: str | None = None, *, forecast: bool = False) -> RcmState:
     """The RCM's state, with the story of `arc`. Raises NobodyThere where no RCM answers."""
     for _ in range(STATE_TRIES):
-        state = await client.state(arc, forecast=True)
+        state = await client.state(arc, forecast=forecast)
         if state is not None:
             return state
     raise NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again, or see its log")

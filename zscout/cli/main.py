@@ -23,27 +23,36 @@ from click.shell_completion import CompletionItem
 from zscout import __version__
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "request": ("zscout.cli.request", "Wait for devices; hold them, or run a command that needs them."),
-    "take": ("zscout.cli.take", "Take devices at an operator's priority, preempting who holds them."),
-    "drive": ("zscout.cli.drive", "Take a robot and drive it from the keyboard, seeing what it sees."),
-    "watch": ("zscout.cli.watch", "Tell when something moves in the pictures of a camera or video."),
-    "release": ("zscout.cli.give_back", "End the hold of a running ARC."),
-    "cancel": ("zscout.cli.give_back", "End an ARC, running or waiting."),
-    "status": ("zscout.cli.status", "Show devices, holders, the queue and the hosts."),
-    "why": ("zscout.cli.why", "Tell the story of an ARC: what it waits for, and who is in its way."),
-    "start": ("zscout.cli.start", "Have a component run on the best host, and keep it running."),
-    "stop": ("zscout.cli.start", "End components for good."),
-    "components": ("zscout.cli.components", "List components: where each runs, and what it uses."),
-    "logs": ("zscout.cli.logs", "Print or follow the output of a component."),
-    "migrate": ("zscout.cli.migrate", "Move a running component to another host."),
-    "drain": ("zscout.cli.drain", "Empty a host of components, and place none there any more."),
-    "uncordon": ("zscout.cli.drain", "Use a drained host again."),
-    "keys": ("zscout.cli.keys", "List what is alive on the mesh, and the keys it serves."),
-    "view": ("zscout.cli.view", "Watch the fleet live on a timeline, or open a recording."),
-    "replay": ("zscout.cli.replay", "Schedule a workload file under virtual time."),
-    "study": ("zscout.cli.study", "Compare scheduling strategies on random workloads."),
-    "simulate": ("zscout.cli.simulate", "Serve a simulated building with robots, radio and cameras."),
-    "demo": ("zscout.cli.demo.command", "Show what zscout does, on a live mesh on this machine."),
+    "request": (
+        "zscout.cli.requests.request",
+        "Wait for devices; hold them, or run a command that needs them.",
+    ),
+    "take": (
+        "zscout.cli.operator.take",
+        "Take devices at an operator's priority, preempting who holds them.",
+    ),
+    "drive": (
+        "zscout.cli.operator.drive",
+        "Take a robot and drive it from the keyboard, seeing what it sees.",
+    ),
+    "watch": ("zscout.cli.operator.watch", "Tell when something moves in the pictures of a camera or video."),
+    "release": ("zscout.cli.requests.cancel", "End the hold of a running ARC."),
+    "cancel": ("zscout.cli.requests.cancel", "End an ARC, running or waiting."),
+    "status": ("zscout.cli.fleet.status", "Show devices, holders, the queue and the hosts."),
+    "why": ("zscout.cli.requests.why", "Tell the story of an ARC: what it waits for, and who is in its way."),
+    "start": ("zscout.cli.components.start", "Have a component run on the best host, and keep it running."),
+    "stop": ("zscout.cli.components.start", "End components for good."),
+    "components": ("zscout.cli.components.components", "List components: where each runs, and what it uses."),
+    "logs": ("zscout.cli.components.logs", "Print or follow the output of a component."),
+    "migrate": ("zscout.cli.components.migrate", "Move a running component to another host."),
+    "drain": ("zscout.cli.components.drain", "Empty a host of components, and place none there any more."),
+    "uncordon": ("zscout.cli.components.drain", "Use a drained host again."),
+    "keys": ("zscout.cli.fleet.keys", "List what is alive on the mesh, and the keys it serves."),
+    "view": ("zscout.cli.fleet.view", "Watch the fleet live on a timeline, or open a recording."),
+    "replay": ("zscout.cli.lab.replay", "Schedule a workload file under virtual time."),
+    "study": ("zscout.cli.lab.study", "Compare scheduling strategies on random workloads."),
+    "simulate": ("zscout.cli.lab.simulate", "Serve a simulated building with robots, radio and cameras."),
+    "demo": ("zscout.cli.lab.demo", "Show what zscout does, on a live mesh on this machine."),
     "completion": ("zscout.cli.completion", "Print the completion script for bash, zsh or fish."),
 }
 """Name: where the click command of that name lives, and its line in the help."""
@@ -121,9 +130,9 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
         return INTERRUPTED, ""
     # Only a failing command pays for these imports, and most have made them already.
-    from zscout.cli.common import Failed, Interrupted
+    from zscout.cli.common import Failed, Interrupted, NobodyThere
+    from zscout.config.strict import BadInput
     from zscout.keyexpr import BadName
-    from zscout.strict import BadInput
 
     if isinstance(error, Interrupted):
         return error.exit_code, ""
@@ -131,10 +140,14 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         return error.exit_code, f"zscout: {_line(str(error))}"
     if isinstance(error, (BadInput, BadName)):
         return BAD_INPUT, f"zscout: {_line(str(error))}"
-    from zscout.behaviors.client import CommandRefused, RequestRefused
+    from zscout.behaviors.client.client import CommandRefused, RequestRefused
+    from zscout.behaviors.client.placer_client import PlacerSilent
+    from zscout.lab import LabError
     from zscout.mesh import MeshError
 
-    if isinstance(error, (RequestRefused, CommandRefused, MeshError)):
+    if isinstance(error, PlacerSilent):
+        return NobodyThere.exit_code, f"zscout: {_line(str(error))}"
+    if isinstance(error, (RequestRefused, CommandRefused, MeshError, LabError)):
         return COULD_NOT, f"zscout: {_line(str(error))}"
     return None
 

@@ -1,1 +1,1 @@
-"""Components: programs that a node starts, watches, moves and ends. `component.py` tells how to write one."""
+"""For authors of components: `zscout.components.component` has what one is written with."""

@@ -1,188 +1,161 @@
-"""Devices in the node file: what each driver is told in its [[rc]] table, and nothing that is another's."""
+"""The [[rc]] tables of a node file: one struct for each driver, told apart by the key `driver`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from decimal import Decimal
-from typing import Annotated, Final, Literal, TypeAlias, get_args
+from typing import Annotated, Final, TypeAlias
 
 from msgspec import Meta, Struct
 
-from zscout.packets import MAX_CHANNEL, MAX_ROBOT
-from zscout.scheduling.model import Ns
-from zscout.strict import Where, check_rc_name, quoted, seconds_to_ns
-
-Driver = Literal["exclusive", "capacity", "radio", "robot", "video", "framegrabber"]
+from zscout.config.strict import Where, amounts, check_name, check_rc_name, key, quoted, seconds
+from zscout.types import MAX_CHANNEL, MAX_ROBOT, SECOND, Ns
 
 MAX_CHANNELS: Final = 64
 """Video RCs that one robot or framegrabber knows."""
 MAX_SOURCE: Final = 1_000
 """Characters of a port or source."""
-KEYS: Final[Mapping[str, tuple[str, ...]]] = {
-    "exclusive": ("activation",),
-    "capacity": ("capacity", "activation"),
-    "radio": ("port", "baud", "bound"),
-    "robot": ("id", "radio", "channels", "warm_up", "dead_man"),
-    "video": (),
-    "framegrabber": ("source", "sources", "rate", "quality"),
-}
-"""What may stand in the table of each driver, beside `name` and `driver`."""
+MAX_PARAMETERS: Final = 64
+"""Capacities of one RC."""
+
+A_PORT: Final = 'port = "/dev/ttyUSB0"'
+AN_ID: Final = "that its packets carry, as in id = 33"
+A_RADIO: Final = 'that carries its halt, as in radio = "radio/rf0"'
+A_SOURCE: Final = 'source = "/dev/video0", or a table sources'
+
+Activation: TypeAlias = Annotated[Ns, seconds("0", "3600", "From a grant until the device can be used.")]
 
 
-class Radio(Struct, frozen=True, tag="radio"):
+class RcTable(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="driver"):
+    """An RC that the node runs."""
+
+    name: Annotated[str, key("`kind/name`.", example="robot/scout33")]
+
+
+class ExclusiveRc(RcTable, frozen=True, tag="exclusive"):
+    """A device that one ARC holds at a time; it needs no driver of its own."""
+
+    activation: Activation = 0
+
+
+class CapacityRc(RcTable, frozen=True, tag="capacity"):
+    """A device that several ARCs share within its capacity."""
+
+    capacity: Annotated[
+        Mapping[str, Decimal],
+        key("Greatest sum of each bandwidth parameter.", most=MAX_PARAMETERS, example={"command_rate": 10}),
+    ] = {}
+    activation: Activation = 0
+
+
+class RadioRc(RcTable, frozen=True, tag="radio"):
     """A serial line to a transmitter."""
 
-    port: str
-    """For pyserial's `serial_for_url`."""
-    baud: int
-    bound: Ns
-    """The longest that a packet may wait."""
+    port: Annotated[
+        str,
+        key("For pyserial's `serial_for_url`.", example="/dev/ttyUSB0", remedy=f"add it, as in {A_PORT}"),
+    ]
+    baud: Annotated[int, key("Of the line.", 300, 1_000_000, unit="bit/s")] = 9_600
+    bound: Annotated[Ns, seconds("0.01", "10", "The longest that a packet may wait.")] = SECOND // 4
 
 
-class Robot(Struct, frozen=True, tag="robot"):
+class RobotRc(RcTable, frozen=True, tag="robot"):
     """A robot that is driven over a radio."""
 
-    id: int
-    radio: str
-    """The radio RC that carries its halt."""
-    channels: Mapping[str, int]
-    """Of its camera's transmitter, by video RC."""
-    warm_up: Ns
-    dead_man: Ns
-    """After this long without a command the wheels are stopped."""
+    id: Annotated[int, key("That its packets carry.", 0, MAX_ROBOT, example=33, remedy=f"add the id {AN_ID}")]
+    radio: Annotated[
+        str,
+        key("The RC that carries its halt.", example="radio/rf0", remedy=f"add the radio {A_RADIO}"),
+    ]
+    channels: Annotated[
+        Mapping[str, Annotated[int, Meta(ge=1, le=MAX_CHANNEL)]],
+        key("Of its camera's transmitter, by video RC.", most=MAX_CHANNELS, example={"video/ch1": 1}),
+    ] = {}
+    warm_up: Annotated[Ns, seconds("0", "60", "Of its camera, once it is switched on.")] = 2 * SECOND
+    dead_man: Annotated[
+        Ns, seconds("0.05", "5", "Its wheels are stopped this long after the last drive command.")
+    ] = SECOND // 2
 
 
-class Video(Struct, frozen=True, tag="video"):
+class VideoRc(RcTable, frozen=True, tag="video"):
     """A video channel."""
 
 
-class Framegrabber(Struct, frozen=True, tag="framegrabber"):
-    """A receiver of pictures."""
+class FramegrabberRc(RcTable, frozen=True, tag="framegrabber"):
+    """A receiver of frames. It has either one source, or one for each video RC."""
 
-    sources: Mapping[str, str]
-    """An OpenCV source for each video RC; "" alone where it has one for all."""
-    rate: float
-    """Frames a second that are published at most."""
-    quality: int
-    """Of the JPEG, 1 to 100."""
+    source: Annotated[str | None, key("For OpenCV, whatever it shows.", example="/dev/video0")] = None
+    sources: Annotated[
+        Annotated[Mapping[str, str], Meta(max_length=MAX_CHANNELS)] | None,
+        key("For OpenCV, of each video RC.", example={"video/ch1": "/dev/video0"}),
+    ] = None
+    rate: Annotated[float, key("Published at most.", 0.1, 60, unit="frames/s")] = 10.0
+    quality: Annotated[int, key("Of the JPEG.", 1, 100)] = 80
 
-
-Device: TypeAlias = Radio | Robot | Video | Framegrabber
-
-
-class DeviceTable(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The devices' part of an [[rc]] table, as it is written. None: not written."""
-
-    port: str | None = None
-    baud: Annotated[int, Meta(ge=300, le=1_000_000)] | None = None
-    bound: Decimal | None = None
-    id: Annotated[int, Meta(ge=0, le=MAX_ROBOT)] | None = None
-    radio: str | None = None
-    channels: (
-        Annotated[dict[str, Annotated[int, Meta(ge=1, le=MAX_CHANNEL)]], Meta(max_length=MAX_CHANNELS)] | None
-    ) = None
-    warm_up: Decimal | None = None
-    dead_man: Decimal | None = None
-    source: str | None = None
-    sources: Annotated[dict[str, str], Meta(max_length=MAX_CHANNELS)] | None = None
-    rate: Annotated[float, Meta(ge=0.1, le=60)] | None = None
-    quality: Annotated[int, Meta(ge=1, le=100)] | None = None
+    @property
+    def by_video(self) -> Mapping[str, str]:
+        """The source of each video RC; "" alone where one serves for all."""
+        return {"": self.source} if self.source is not None else self.sources or {}
 
 
-def check_keys(written: Mapping[str, object], driver: Driver, at: Where) -> None:
-    """Refuses the keys of other drivers. Raises BadInput."""
-    for key, value in written.items():
-        if value is not None and key not in ("name", "driver", *KEYS[driver]):
-            others = [quoted(other) for other in get_args(Driver) if key in KEYS[other]]
-            raise (at / key).bad(
-                f'the driver "{driver}" has none', f"remove it, or write driver = {' or '.join(others)}"
+RcConfig: TypeAlias = ExclusiveRc | CapacityRc | RadioRc | RobotRc | VideoRc | FramegrabberRc
+
+
+def check_rc(rc: RcConfig, at: Where) -> None:
+    """Refuses what no type can: names of another kind, sources that stand twice. Raises BadInput."""
+    check_rc_name(rc.name, at / "name")
+    if isinstance(rc, RadioRc | RobotRc | VideoRc | FramegrabberRc):
+        driver = str(rc.__struct_config__.tag)
+        kind, _, name = rc.name.partition("/")
+        if kind != driver:
+            raise (at / "name").bad(
+                f'{quoted(rc.name)} is no {driver}, as driver = "{driver}" says',
+                f"name it {driver}/{name}, or choose another driver",
             )
+    match rc:
+        case CapacityRc():
+            if not rc.capacity:
+                raise (at / "capacity").bad(
+                    "is missing or empty", "add one, as in capacity = { command_rate = 10 }"
+                )
+            for parameter in rc.capacity:
+                check_name(parameter, at / "capacity")
+            amounts(rc.capacity, at / "capacity")
+        case RadioRc():
+            _check_source(rc.port, at / "port", A_PORT)
+        case RobotRc():
+            _check_kind(rc.radio, "radio", at / "radio")
+            channels: dict[int, str] = {}
+            for video, channel in rc.channels.items():
+                here = at / "channels" / video
+                _check_kind(video, "video", here)
+                if channel in channels:
+                    raise here.bad(f"is {channel}, as {channels[channel]} is", "give each its own channel")
+                channels[channel] = video
+        case FramegrabberRc():
+            _check_sources(rc, at)
 
 
-def device(table: DeviceTable, name: str, driver: Driver, at: Where) -> Device | None:
-    """The device of an RC; None for a driver that is none of a device. Raises BadInput."""
-    if driver in ("exclusive", "capacity"):
-        return None
-    kind = name.partition("/")[0]
-    if kind != driver:
-        raise (at / "name").bad(
-            f'{quoted(name)} is no {driver}, as driver = "{driver}" says',
-            f"name it {driver}/{name.partition('/')[2]}, or choose another driver",
-        )
-    match driver:
-        case "radio":
-            return _radio(table, at)
-        case "robot":
-            return _robot(table, at)
-        case "framegrabber":
-            return _framegrabber(table, at)
-        case _:
-            return Video()
-
-
-def _radio(table: DeviceTable, at: Where) -> Radio:
-    bound = Decimal("0.25") if table.bound is None else table.bound
-    return Radio(
-        port=_source(table.port, at / "port", 'port = "/dev/ttyUSB0"'),
-        baud=9600 if table.baud is None else table.baud,
-        bound=seconds_to_ns(bound, at / "bound", low=Decimal("0.01"), high=Decimal(10)),
-    )
-
-
-def _robot(table: DeviceTable, at: Where) -> Robot:
-    if table.id is None:
-        raise (at / "id").bad("is missing", "add the id that its packets carry, as in id = 33")
-    if table.radio is None:
-        raise (at / "radio").bad(
-            "is missing", 'add the radio that carries its halt, as in radio = "radio/rf0"'
-        )
-    _of_kind(table.radio, "radio", at / "radio")
-    channels: dict[int, str] = {}
-    for video, channel in (table.channels or {}).items():
-        here = at / "channels" / video
-        _of_kind(video, "video", here)
-        if channel in channels:
-            raise here.bad(f"is {channel}, as {channels[channel]} is", "give each its own channel")
-        channels[channel] = video
-    warm_up = Decimal(2) if table.warm_up is None else table.warm_up
-    dead_man = Decimal("0.5") if table.dead_man is None else table.dead_man
-    return Robot(
-        id=table.id,
-        radio=table.radio,
-        channels={video: channel for channel, video in channels.items()},
-        warm_up=seconds_to_ns(warm_up, at / "warm_up", high=Decimal(60)),
-        dead_man=seconds_to_ns(dead_man, at / "dead_man", low=Decimal("0.05"), high=Decimal(5)),
-    )
-
-
-def _framegrabber(table: DeviceTable, at: Where) -> Framegrabber:
-    if table.source is not None and table.sources is not None:
+def _check_sources(rc: FramegrabberRc, at: Where) -> None:
+    if rc.source is not None and rc.sources is not None:
         raise (at / "sources").bad("stands beside source", "remove one of the two")
-    if table.sources is not None:
-        if not table.sources:
-            raise (at / "sources").bad("is empty", 'add one, as in "video/ch1" = "/dev/video0"')
-        sources = {}
-        for video, source in table.sources.items():
-            _of_kind(video, "video", at / "sources" / video)
-            sources[video] = _source(source, at / "sources" / video, f'"{video}" = "/dev/video0"')
-    else:
-        sources = {"": _source(table.source, at / "source", 'source = "/dev/video0", or a table sources')}
-    return Framegrabber(
-        sources=sources,
-        rate=10.0 if table.rate is None else table.rate,
-        quality=80 if table.quality is None else table.quality,
-    )
+    if rc.source is not None:
+        _check_source(rc.source, at / "source", A_SOURCE)
+    elif rc.sources is None:
+        raise (at / "source").bad("is missing", f"add it, as in {A_SOURCE}")
+    elif not rc.sources:
+        raise (at / "sources").bad("is empty", 'add one, as in "video/ch1" = "/dev/video0"')
+    for video, source in (rc.sources or {}).items():
+        _check_kind(video, "video", at / "sources" / video)
+        _check_source(source, at / "sources" / video, f'"{video}" = "/dev/video0"')
 
 
-def _of_kind(name: str, kind: str, at: Where) -> None:
+def _check_kind(name: str, kind: str, at: Where) -> None:
     check_rc_name(name, at)
     if not name.startswith(f"{kind}/"):
         raise at.bad(f"{quoted(name)} is no {kind}", f'name one, as in "{kind}/..."')
 
 
-def _source(text: str | None, at: Where, example: str) -> str:
-    if text is None:
-        raise at.bad("is missing", f"add it, as in {example}")
+def _check_source(text: str, at: Where, example: str) -> None:
     if not text or len(text) > MAX_SOURCE or not text.isprintable():
         raise at.bad(f"{quoted(text)} can't be opened", f"name what to open, as in {example}")
-    return text

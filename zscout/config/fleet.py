@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import os
-from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
-from zscout.endpoints import check_links, check_multicast
-from zscout.placing.rules import DEFAULT_RULES, Rules
-from zscout.scheduling.model import SECOND, Ns
-from zscout.scheduling.policy import OPERATOR_PRIORITY, PATIENCE, Policy, Preempt, Promise, StrategyName
-from zscout.strict import BadInput, Where, check_name, check_unique, read_toml, seconds_to_ns
+from zscout.config.endpoints import check_links, check_multicast
+from zscout.config.placement_policy import DEFAULT_PLACEMENT, PlacementPolicy
+from zscout.config.scheduling_policy import (
+    OPERATOR_PRIORITY,
+    PATIENCE,
+    Preempt,
+    Promise,
+    SchedulingPolicy,
+    StrategyName,
+)
+from zscout.config.strict import (
+    BadInput,
+    Where,
+    check_name,
+    check_unique,
+    key,
+    read_toml,
+    seconds,
+)
+from zscout.types import SECOND, Ns
 
 FLEET_VARIABLE: Final = "ZSCOUT_FLEET"
 """Environment variable with the path of the fleet file, for the CLI."""
@@ -24,48 +38,47 @@ MAX_ENDPOINTS: Final = 256
 Endpoints = Annotated[tuple[str, ...], Meta(max_length=MAX_ENDPOINTS)]
 
 
-class Mesh(Struct, frozen=True, forbid_unknown_fields=True):
-    """How this host joins the mesh: what Zenoh is told."""
+class MeshConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [mesh]: how a host joins the mesh."""
 
-    listen: Endpoints = ()
-    """Endpoints such as `tcp/0.0.0.0:7447`; none: Zenoh chooses a port on all interfaces."""
-    connect: Endpoints = ()
-    """Endpoints of other hosts to be connected to at all times."""
-    multicast: bool = True
-    """Whether hosts find each other by UDP multicast."""
-    multicast_address: str = "224.0.0.224:7446"
-    interface: str = "auto"
-    """The network interface for multicast, several by commas."""
-    lease: Annotated[float, Meta(ge=0.2, le=30)] = 1.0
-    """Seconds without a sign of life after which the others hold this host for gone."""
-
-
-class Limits(Struct, frozen=True, forbid_unknown_fields=True):
-    """What the RCM accepts at most."""
-
-    max_queued: Annotated[int, Meta(ge=1, le=1_000_000)] = 10_000
-    """ARCs that wait at one time."""
-    max_needs: Annotated[int, Meta(ge=1, le=1_000)] = 64
-    """RCs in one ARC."""
-    max_requests_per_client: Annotated[int, Meta(ge=1, le=100_000)] = 256
-    """ARCs of one client, waiting or running."""
-    max_payload: Annotated[int, Meta(ge=1_024, le=16_777_216)] = 65_536
-    """Bytes in one message."""
-    max_running_per_host: Annotated[int, Meta(ge=0, le=100_000)] = 0
-    """ARCs of all clients of one host that may run at one time; an operator's do not count. 0: any number."""
+    listen: Annotated[
+        Endpoints,
+        key("Endpoints of this host; none: a free port.", example=["tcp/0.0.0.0:7447"]),
+    ] = ()
+    connect: Annotated[
+        Endpoints,
+        key("Endpoints of hosts to be connected to always.", example=["tcp/anvil:7447"]),
+    ] = ()
+    multicast: Annotated[bool, key("Whether hosts find each other by UDP multicast.")] = True
+    multicast_address: Annotated[str, key("`ip:port`.")] = "224.0.0.224:7446"
+    interface: Annotated[str, key("Network interfaces for multicast.", example="eth0")] = "auto"
+    lease: Annotated[float, key("A host that was silent for this long is gone.", 0.2, 30, unit="s")] = 1.0
 
 
-class Timing(Struct, frozen=True):
-    """The clockwork of the RCM and of RCs. `hold_lease` is longer than the mesh lease plus `rebuild`."""
+class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [limits]: what the RCM accepts at most."""
 
-    heartbeat: Ns
-    """From one publication of the RCM to the next at the latest, in ns."""
-    hold_lease: Ns
-    """Time in ns after which a hold ends at the RC and the client if no RCM was heard."""
-    vote_timeout: Ns
-    """Time in ns after which a vote is overdue."""
-    rebuild: Ns
-    """How long in ns a new RCM waits for what stands."""
+    max_queued: Annotated[int, key("ARCs that wait at one time.", 1, 1_000_000)] = 10_000
+    max_needs: Annotated[int, key("RCs in one ARC.", 1, 1_000)] = 64
+    max_requests_per_client: Annotated[int, key("ARCs of one client, waiting or running.", 1, 100_000)] = 256
+    max_payload: Annotated[int, key("Of one message.", 1_024, 16_777_216, unit="bytes")] = 65_536
+    max_running_per_host: Annotated[
+        int, key("Running ARCs of all clients of one host, but for an operator's; 0: any number.", 0, 100_000)
+    ] = 0
+
+
+class Timing(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [timing]: the clockwork of the RCM and of RCs, in ns. `hold_lease` is longer than the mesh
+    lease plus `rebuild`."""
+
+    heartbeat: Annotated[
+        Ns, seconds("0.05", "10", "From one publication of the RCM to the next at the latest.")
+    ] = SECOND // 2
+    hold_lease: Annotated[
+        Ns, seconds("0.5", "300", "A hold ends at RC and client when no RCM was heard for this long.")
+    ] = 3 * SECOND
+    vote_timeout: Annotated[Ns, seconds("0.01", "10", "A vote is overdue after this long.")] = SECOND // 4
+    rebuild: Annotated[Ns, seconds("0.01", "10", "A new RCM waits this long for what stands.")] = SECOND // 5
 
 
 class Fleet(Struct, frozen=True):
@@ -75,67 +88,62 @@ class Fleet(Struct, frozen=True):
     candidates: tuple[str, ...]
     """Hosts whose nodes may lead, best first; empty: every node, by name."""
     strategy: StrategyName
-    policy: Policy
-    mesh: Mesh
-    limits: Limits
+    scheduling: SchedulingPolicy
+    mesh: MeshConfig
+    limits: RcmLimits
     timing: Timing
-    rules: Rules = DEFAULT_RULES
-    """Of the component placer."""
+    placement: PlacementPolicy = DEFAULT_PLACEMENT
 
     @property
     def operator_priority(self) -> int:
         """ARCs of this priority and above are an operator's."""
-        return self.policy.operator_priority
+        return self.scheduling.operator_priority
 
 
 # The file as it is written
 
 
-class _FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
-    name: str = DEFAULT_FLEET_NAME
-    candidates: Annotated[tuple[str, ...], Meta(max_length=MAX_CANDIDATES)] = ()
-    strategy: StrategyName = "adaptive"
-    operator_priority: Annotated[int, Meta(ge=0, le=1_000_000_000)] = OPERATOR_PRIORITY
-    preempt: Preempt = "always"
-    patience: Decimal = Decimal(PATIENCE) / SECOND
-    promise: Promise = "equals"
+class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [fleet]."""
+
+    name: Annotated[str, key("Hosts of one name find each other.", example="lab")] = DEFAULT_FLEET_NAME
+    candidates: Annotated[
+        tuple[str, ...],
+        key("Hosts that may lead, best first; none: every one.", most=MAX_CANDIDATES, example=["anvil"]),
+    ] = ()
+    strategy: Annotated[StrategyName, key("By which the RCM schedules.")] = "adaptive"
+    operator_priority: Annotated[
+        int, key("ARCs of this priority and above are an operator's: nothing keeps them.", 0, 1_000_000_000)
+    ] = OPERATOR_PRIORITY
+    preempt: Annotated[Preempt, key("When one ARC may take the hold of another of lower priority.")] = (
+        "always"
+    )
+    patience: Annotated[
+        Ns, seconds("0", "31622400", "`adaptive`: after this long an ARC that waits is due; 0: never.")
+    ] = PATIENCE
+    promise: Annotated[
+        Promise, key("Whom an ARC that is due goes before: equal and lower priority, or all but operators.")
+    ] = "equals"
 
 
-class _TimingTable(Struct, frozen=True, forbid_unknown_fields=True):
-    heartbeat: Decimal = Decimal("0.5")
-    hold_lease: Decimal = Decimal(3)
-    vote_timeout: Decimal = Decimal("0.25")
-    rebuild: Decimal = Decimal("0.2")
+class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
+    """A fleet file."""
 
-
-class _PlacementTable(Struct, frozen=True, forbid_unknown_fields=True):
-    start_timeout: Decimal = Decimal(DEFAULT_RULES.start_timeout) / SECOND
-    restarts: Annotated[int, Meta(ge=0, le=1_000)] = DEFAULT_RULES.restarts
-    back_off: Decimal = Decimal(DEFAULT_RULES.back_off) / SECOND
-    longest_back_off: Decimal = Decimal(DEFAULT_RULES.longest_back_off) / SECOND
-    settled: Decimal = Decimal(DEFAULT_RULES.settled) / SECOND
-    rebalance: bool = False
-    gain: Annotated[float, Meta(ge=0.05, le=100)] = DEFAULT_RULES.gain
-    steady: Decimal = Decimal(DEFAULT_RULES.steady) / SECOND
-    rest: Decimal = Decimal(DEFAULT_RULES.rest) / SECOND
-
-
-class _FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
-    fleet: _FleetTable = _FleetTable()
-    mesh: Mesh = Mesh()
-    limits: Limits = Limits()
-    timing: _TimingTable = _TimingTable()
-    placement: _PlacementTable = _PlacementTable()
+    fleet: FleetTable = FleetTable()
+    mesh: MeshConfig = MeshConfig()
+    limits: RcmLimits = RcmLimits()
+    timing: Timing = Timing()
+    placement: PlacementPolicy = DEFAULT_PLACEMENT
 
 
 def load_fleet(path: Path) -> Fleet:
     """Reads a fleet file. Raises BadInput."""
-    return _fleet(read_toml(path, _FleetFile), Where(str(path)))
+    return _fleet(read_toml(path, FleetFile), Where(str(path)))
 
 
 def default_fleet() -> Fleet:
     """The fleet of those who wrote no file."""
-    return _fleet(_FleetFile(), Where("defaults"))
+    return _fleet(FleetFile(), Where("defaults"))
 
 
 def fleet_from_env() -> Fleet:
@@ -149,7 +157,7 @@ def fleet_from_env() -> Fleet:
         raise BadInput(f"{error} (named by ${FLEET_VARIABLE})") from None
 
 
-def _fleet(file: _FleetFile, top: Where) -> Fleet:
+def _fleet(file: FleetFile, top: Where) -> Fleet:
     table, mesh, at = file.fleet, file.mesh, top / "fleet"
     check_name(table.name, at / "name")
     for number, host in enumerate(table.candidates):
@@ -157,68 +165,40 @@ def _fleet(file: _FleetFile, top: Where) -> Fleet:
     check_unique(table.candidates, at / "candidates")
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")
+    _check_timing(file.timing, mesh.lease, top / "timing")
     return Fleet(
         name=table.name,
         candidates=table.candidates,
         strategy=table.strategy,
-        policy=_policy(table, file.limits, at),
+        scheduling=_scheduling(table, file.limits, at),
         mesh=mesh,
         limits=file.limits,
-        timing=_timing(file.timing, mesh.lease, top / "timing"),
-        rules=_rules(file.placement, top / "placement"),
+        timing=file.timing,
+        placement=file.placement,
     )
 
 
-def _policy(table: _FleetTable, limits: Limits, at: Where) -> Policy:
-    year = Decimal(366 * 24 * 3600)
-    patience = seconds_to_ns(table.patience, at / "patience", high=year)
-    if table.promise != "equals" and (table.strategy != "adaptive" or not patience):
+def _scheduling(table: FleetTable, limits: RcmLimits, at: Where) -> SchedulingPolicy:
+    if table.promise != "equals" and (table.strategy != "adaptive" or not table.patience):
         raise (at / "promise").bad(
             f'is "{table.promise}", but only "adaptive" with some patience promises anything',
             'write strategy = "adaptive" and a patience above 0, or promise = "equals"',
         )
-    return Policy(
+    return SchedulingPolicy(
         preempt=table.preempt,
         operator_priority=table.operator_priority,
-        patience=patience or None,
+        patience=table.patience or None,
         promise=table.promise,
         max_running_per_host=limits.max_running_per_host or None,
     )
 
 
-def _timing(table: _TimingTable, lease: float, at: Where) -> Timing:
-    def ns(key: str, low: str, high: str) -> Ns:
-        return seconds_to_ns(getattr(table, key), at / key, low=Decimal(low), high=Decimal(high))
-
-    timing = Timing(
-        heartbeat=ns("heartbeat", "0.05", "10"),
-        hold_lease=ns("hold_lease", "0.5", "300"),
-        vote_timeout=ns("vote_timeout", "0.01", "10"),
-        rebuild=ns("rebuild", "0.01", "10"),
-    )
+def _check_timing(timing: Timing, lease: float, at: Where) -> None:
     # A takeover begins when the old RCM's lease is over; no hold may end while the new one asks what stands.
     takeover = round(lease * SECOND) + timing.rebuild
     _check_above(timing.hold_lease, takeover, "mesh.lease + timing.rebuild", at / "hold_lease")
     # One lost heartbeat ends nothing.
     _check_above(timing.hold_lease, 2 * timing.heartbeat, "2 * timing.heartbeat", at / "hold_lease")
-    return timing
-
-
-def _rules(table: _PlacementTable, at: Where) -> Rules:
-    def ns(key: str, high: int) -> Ns:
-        return seconds_to_ns(getattr(table, key), at / key, low=Decimal("0.05"), high=Decimal(high))
-
-    return Rules(
-        start_timeout=ns("start_timeout", 600),
-        restarts=table.restarts,
-        back_off=ns("back_off", 3600),
-        longest_back_off=ns("longest_back_off", 86_400),
-        settled=ns("settled", 86_400),
-        rebalance=table.rebalance,
-        gain=table.gain,
-        steady=ns("steady", 3600),
-        rest=ns("rest", 86_400),
-    )
 
 
 def _check_above(value: Ns, bound: Ns, meaning: str, where: Where) -> None:

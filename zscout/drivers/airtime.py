@@ -31,9 +31,8 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Final
 
-from zscout.amounts import exact_amounts
-from zscout.packets import MAX_PACKET, OVERHEAD
-from zscout.scheduling.model import SECOND, Ns
+from zscout.drivers.packets import MAX_PACKET, OVERHEAD
+from zscout.types import SECOND, Ns, exact_amounts
 
 BITS_PER_BYTE: Final = 10
 """On the line: a start bit, eight of data, a stop bit."""

@@ -1,8 +1,8 @@
 """The newest picture of any source that OpenCV can open: a device, a file, or a URL.
 
-OpenCV hands out pictures in order, however old they are: who reads more slowly than they come falls behind
+OpenCV hands out pictures in order, however old they are: a reader that is too slow falls behind
 without end. So a thread of its own reads all of them and keeps only the newest. It opens its source again
-whenever that fails, and says in words how it stands.
+whenever that fails, and describes its state in words.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zscout import clock
-from zscout.scheduling.model import SECOND
+from zscout.mesh import clock
+from zscout.types import SECOND
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ STOP_WAIT: Final = 1.0
 MAX_PIXELS: Final = 1 << 24
 """Of one picture; larger ones count as a failure of the source."""
 FILE_RATE: Final = 25.0
-"""Pictures a second of a file that does not tell its rate, or tells one beyond belief."""
+"""Pictures a second of a file without a rate, or with one beyond belief."""
 FILE_RATES: Final = (0.1, 240.0)
 STALLED: Final = 0.8
 """A read that failed after this share of its timeout ran into it; one that failed sooner was cut off."""
@@ -48,7 +48,7 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 
 @dataclass(frozen=True, slots=True)
-class Captured:
+class CapturedFrame:
     """One picture. `number` counts from 1 and goes on when the source is opened again; `time` is when it was
     read, in seconds of this host's own clock; `picture` is uint8, (height, width) or (height, width, 3) BGR.
     """
@@ -82,8 +82,8 @@ class Capture:
         self._read_timeout = read_timeout
         self._stop = threading.Event()
         self._news = threading.Condition()
-        self._newest: Captured | None = None
-        self._looked = True
+        self._newest: CapturedFrame | None = None
+        self._taken = True
         self._number = 0
         self._due = 0.0
         # A daemon: a process that ends need not wait for ever until OpenCV has given up.
@@ -112,22 +112,22 @@ class Capture:
         """Whether the thread runs, be it only until OpenCV lets go of it."""
         return self._thread.is_alive()
 
-    def newest(self, after: int) -> Captured | None:
+    def newest(self, after: int) -> CapturedFrame | None:
         """The newest picture if its number is above `after`."""
         with self._news:
             return self._take(after)
 
-    def wait(self, after: int, timeout: float) -> Captured | None:
+    def wait(self, after: int, timeout: float) -> CapturedFrame | None:
         """The newest picture with a number above `after`, as soon as there is one; None if none came within
         `timeout` seconds, or when the capture was stopped."""
         with self._news:
             self._news.wait_for(lambda: self._number > after or self._stop.is_set(), timeout)
             return None if self._stop.is_set() else self._take(after)
 
-    def _take(self, after: int) -> Captured | None:
+    def _take(self, after: int) -> CapturedFrame | None:
         if self._newest is None or self._newest.number <= after:
             return None
-        self._looked = True
+        self._taken = True
         return self._newest
 
     # In the thread
@@ -139,7 +139,7 @@ class Capture:
             try:
                 self._read_all()
             except cv2.error as error:
-                self._ails(f"OpenCV failed on {shown(self.source)}: {str(error).strip()[:200]}")
+                self._set_health(f"OpenCV failed on {shown(self.source)}: {str(error).strip()[:200]}")
             if self._number > before:
                 pause = RETRY_FIRST
                 if self.kind == "file":
@@ -153,7 +153,7 @@ class Capture:
         video = _open(self.source, self.kind, self._open_timeout, self._read_timeout)
         try:
             if not video.isOpened():
-                self._ails(self._why_closed(_now() - began))
+                self._set_health(self._why_closed(_now() - began))
                 return
             self.opened += 1
             if self._number == 0:
@@ -176,7 +176,7 @@ class Capture:
                     return
                 misses = 0
                 if picture.dtype != np.uint8 or picture.shape[0] * picture.shape[1] > MAX_PIXELS:
-                    self._ails(f"the pictures of {shown(self.source)} are too large, or not of 8 bits")
+                    self._set_health(f"the pictures of {shown(self.source)} are too large, or not of 8 bits")
                     return
                 self._keep(np.asarray(picture, np.uint8))
         finally:
@@ -193,23 +193,23 @@ class Capture:
         if self.health != "ok":
             log.info("%s gives pictures", shown(self.source))
         with self._news:
-            if not self._looked:
+            if not self._taken:
                 self.dropped += 1
-            self._looked = False
+            self._taken = False
             self._number += 1
-            self._newest = Captured(self._number, _now(), picture)
+            self._newest = CapturedFrame(self._number, _now(), picture)
             self.health = "ok"
             self._news.notify_all()
 
     def _ended(self, waited: float, before: int) -> None:
         if self.kind == "file":
             if before == 0:
-                self._ails(f"there is no picture in {shown(self.source)}")
+                self._set_health(f"there is no picture in {shown(self.source)}")
         elif waited >= STALLED * self._read_timeout:
             self.stalls += 1
-            self._ails(f"no picture from {shown(self.source)} for {self._read_timeout:g} s")
+            self._set_health(f"no picture from {shown(self.source)} for {self._read_timeout:g} s")
         else:
-            self._ails(f"{shown(self.source)} was cut off")
+            self._set_health(f"{shown(self.source)} was cut off")
 
     def _why_closed(self, waited: float) -> str:
         name = shown(self.source)
@@ -230,7 +230,7 @@ class Capture:
             "is it a camera, and free?" if self.kind == "device" else "it is not a video"
         )
 
-    def _ails(self, words: str) -> None:
+    def _set_health(self, words: str) -> None:
         if words != self.health:
             log.warning("%s", words)
             self.health = words
@@ -260,7 +260,7 @@ def kind_of(source: str) -> Literal["device", "file", "url"]:
 
 
 def shown(source: str) -> str:
-    """A source as it may be told and logged: a URL without user, password and query, where secrets stand."""
+    """A source as it may be shown and logged: a URL without user, password and query, where secrets stand."""
     if kind_of(source) != "url":
         return source
     try:

@@ -1,16 +1,47 @@
-"""What a driver has to say for its device; `base.py` has the RC around it."""
+"""What a driver does for its device. `resource_controller.py` has the RC around it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
+from zscout.drivers.holds import HoldTable
+from zscout.drivers.rc_directory import RcDirectory
 from zscout.keyexpr import Sender
-from zscout.mesh import Refused
+from zscout.mesh import Mesh, Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
 
-if TYPE_CHECKING:
-    from zscout.drivers.base import ResourceController
+
+class RcHandle(Protocol):
+    """The RC as its driver sees it."""
+
+    @property
+    def mesh(self) -> Mesh: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def holds(self) -> HoldTable: ...
+    @property
+    def directory(self) -> RcDirectory | None:
+        """Which host offers which RC; only of a driver that relays."""
+
+    @property
+    def supervisor(self) -> Supervisor:
+        """Of tasks, timers and handlers of the driver: it is closed before `safe` and `close` are called at
+        the end. What fails there fails the RC."""
+
+    @property
+    def health(self) -> str:
+        """`ok`, or in words why the device can't carry a holder."""
+
+    def fail(self, why: str) -> None:
+        """The device can't carry its holders any longer: their holds end, the RC counts as lost."""
+
+    def recover(self) -> None:
+        """The device works again."""
+
+    def rules_changed(self) -> None:
+        """The driver votes by other rules from now on: earlier votes are void."""
 
 
 class Driver:
@@ -26,7 +57,7 @@ class Driver:
     activation: float = 0.0
     """Seconds after a grant until the device has its full use, like a camera that warms up."""
 
-    async def open(self, rc: ResourceController) -> None:
+    async def open(self, rc: RcHandle) -> None:
         """The RC is about to be offered: the time to take what is needed of `rc.mesh`. A device that is not
         there is no error: call `rc.fail`, go on trying, and `rc.recover`."""
 
@@ -37,8 +68,8 @@ class Driver:
         """Somebody begins to hold the device."""
 
     async def end(self, holder: Holder) -> None:
-        """Somebody ceases to hold the device; `safe` follows if nobody else does. Not told of a hold that was
-        handed over: it goes on."""
+        """Somebody ceases to hold the device; `safe` follows if nobody else does. Not called for a hold
+        that was handed over: it goes on."""
 
     async def safe(self) -> None:
         """Nobody holds the device any more: motors stopped, transmitter off. Must not raise."""
@@ -62,7 +93,7 @@ class Driver:
         return {}
 
     def figures(self) -> Figures:
-        """Rates, drops, latency and the like, by name; told when they change, once a second at most."""
+        """Rates, drops, latency and the like, by name; published when they change, once a second at most."""
         return {}
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:

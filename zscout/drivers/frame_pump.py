@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zscout import clock
-from zscout.drivers.capture import Capture, Captured
+from zscout.drivers.capture import Capture, CapturedFrame
+from zscout.mesh import clock
 from zscout.messages import MAX_FRAME, FrameHead
-from zscout.scheduling.model import SECOND, Grant
+from zscout.types import SECOND, Grant
 
 if TYPE_CHECKING:
     from zscout.mesh.frames import FramePublisher
@@ -33,12 +33,12 @@ GREY: Final = 3
 """Difference of the colours up to which a picture is grey: what decoding makes of a grey picture that was
 coded in colour."""
 MEASURED: Final = 64
-"""Frames from which the latency is told."""
+"""Frames over which the latency is measured."""
 RATE_SPAN: Final = 3.0
-"""Seconds from which the rate is told."""
+"""Seconds over which the rate is measured."""
 
 
-class Pace:
+class FramePacer:
     """At most `rate` frames a second without holding any back: one that comes too early is passed over.
 
     The generic cell rate algorithm (ITU-T I.371, annex A) with a tolerance of EARLY intervals, so that a
@@ -57,7 +57,7 @@ class Pace:
         return True
 
 
-class Meter:
+class FrameMeter:
     """What a framegrabber has published. Written by one pump at a time, read by the event loop."""
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class Meter:
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class FrameOrigin:
     """Under what a picture is published: number of the picture before the capture's first, and the rest."""
 
     first: int
@@ -96,7 +96,7 @@ class Shot:
     source: str
 
 
-class Pump:
+class FramePump:
     """Publishes the pictures of a capture that are read from now on, until it is stopped.
 
     At most `rate` frames a second, with JPEG `quality` 1..100, and only while somebody subscribes: otherwise
@@ -107,8 +107,8 @@ class Pump:
         self,
         publisher: FramePublisher,
         capture: Capture,
-        meter: Meter,
-        shot: Shot,
+        meter: FrameMeter,
+        shot: FrameOrigin,
         *,
         rate: float,
         quality: int,
@@ -118,11 +118,11 @@ class Pump:
         self._meter = meter
         self._shot = shot
         self._quality = quality
-        self._pace = Pace(rate)
+        self._pace = FramePacer(rate)
         self._after = capture.number
         self._lock = threading.Lock()
         self._stopped = False
-        self._told = False
+        self._complained = False
         self._thread = threading.Thread(target=self._run, name="frame pump", daemon=True)
 
     def start(self) -> None:
@@ -148,7 +148,7 @@ class Pump:
             if self._publisher.watched and self._pace.admits(captured.time):
                 self._publish(captured)
 
-    def _publish(self, captured: Captured) -> None:
+    def _publish(self, captured: CapturedFrame) -> None:
         try:
             jpeg = encode(captured.picture, self._quality)
         except cv2.error as error:
@@ -177,8 +177,8 @@ class Pump:
                 self._meter.count(head, len(jpeg), now)
 
     def _complain(self, words: str) -> None:
-        if not self._told:
-            self._told = True
+        if not self._complained:
+            self._complained = True
             log.warning("%s", words)
 
 

@@ -15,13 +15,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from zscout import clock
-from zscout.drivers.base import Driver, ResourceController
 from zscout.drivers.capture import Capture
-from zscout.drivers.frame_pump import Meter, Pump, Shot
-from zscout.mesh import Refused
+from zscout.drivers.driver import Driver, RcHandle
+from zscout.drivers.frame_pump import FrameMeter, FrameOrigin, FramePump
+from zscout.mesh import Refused, clock
 from zscout.messages import Figures, Holder
-from zscout.scheduling.model import SECOND
+from zscout.types import SECOND
 
 if TYPE_CHECKING:
     from zscout.mesh.frames import FramePublisher
@@ -37,7 +36,7 @@ CHECK: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Totals:
+class CaptureTotals:
     """What the captures of a framegrabber have counted that it has let go."""
 
     pictures: int = 0
@@ -63,7 +62,7 @@ class FramegrabberDriver(Driver):
     Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (how things stand).
     """
 
-    _rc: ResourceController
+    _rc: RcHandle
     _publisher: FramePublisher
 
     def __init__(self, sources: Mapping[str, str], *, rate: float, quality: int) -> None:
@@ -72,28 +71,26 @@ class FramegrabberDriver(Driver):
         self._sources = dict(sources)
         self._rate = rate
         self._quality = quality
-        self._meter = Meter()
+        self._meter = FrameMeter()
         self._holder: Holder | None = None
         self._source: str | None = None
         """Of `sources`: to what it is tuned."""
         self._untuned = ""
         """Why it is tuned to nothing while it is held."""
         self._capture: Capture | None = None
-        self._pump: Pump | None = None
+        self._pump: FramePump | None = None
         self._watching: asyncio.Task[None] | None = None
         self._silent = 0.0
         """Seconds without a picture while it was open and this process awake, since the hold began."""
         self._lost = False
-        self._before = Totals()
+        self._before = CaptureTotals()
 
-    async def open(self, rc: ResourceController) -> None:
+    async def open(self, rc: RcHandle) -> None:
         self._rc = rc
         self._publisher = rc.mesh.frame_publisher(rc.mesh.keys.frame(rc.name))
         self._publisher.follow(self._on_watched)
 
     async def close(self) -> None:
-        if self._watching is not None:
-            self._watching.cancel()
         self._lost = False
         capture, pump = self._capture, self._pump
         self._let_go()
@@ -185,8 +182,10 @@ class FramegrabberDriver(Driver):
         capture = self._capture
         if capture is None or source != self._source:
             capture = self._open(source)
-        shot = Shot(self._before.pictures, holder.grant, source)
-        self._pump = Pump(self._publisher, capture, self._meter, shot, rate=self._rate, quality=self._quality)
+        shot = FrameOrigin(self._before.pictures, holder.grant, source)
+        self._pump = FramePump(
+            self._publisher, capture, self._meter, shot, rate=self._rate, quality=self._quality
+        )
         self._pump.start()
 
     def _open(self, source: str) -> Capture:
@@ -195,7 +194,7 @@ class FramegrabberDriver(Driver):
         capture = self._capture = Capture(self._sources[source])
         capture.start()
         if self._watching is None or self._watching.done():
-            self._watching = asyncio.get_running_loop().create_task(self._watch_over())
+            self._watching = self._rc.supervisor.spawn(self._watch_over())
         return capture
 
     def _let_go(self) -> None:
@@ -258,7 +257,7 @@ class FramegrabberDriver(Driver):
         if len(names) > 1 and self._source is not None:
             self._open(names[(names.index(self._source) + 1) % len(names)])
 
-    # What is told
+    # Status
 
     @property
     def _name(self) -> str:
@@ -268,7 +267,7 @@ class FramegrabberDriver(Driver):
         capture = self._capture
         if capture is None:
             return {"source": None, "health": self._untuned or "not open", "number": 0}
-        told: dict[str, Any] = {
+        found: dict[str, Any] = {
             "source": self._source,
             "health": capture.health,
             "number": self._before.pictures + capture.number,
@@ -276,8 +275,8 @@ class FramegrabberDriver(Driver):
         newest = capture.newest(0)
         if newest is not None:
             height, width = newest.picture.shape[:2]
-            told |= {"width": width, "height": height, "age": round(_now() - newest.time, 3)}
-        return told
+            found |= {"width": width, "height": height, "age": round(_now() - newest.time, 3)}
+        return found
 
 
 def _now() -> float:

@@ -7,10 +7,10 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
-from zscout.amounts import exact_amounts
-from zscout.drivers.base import Driver
+from zscout.drivers.driver import Driver
 from zscout.messages import Amounts, Holder, ProposedHolder
 from zscout.scheduling.workload import excess
+from zscout.types import exact_amounts
 
 
 class ExclusiveDriver(Driver):

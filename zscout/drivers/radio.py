@@ -1,8 +1,8 @@
 """A radio: one serial line that several ARCs share, each for as many packets a second as it asked for.
 
-Nobody acknowledges on this radio, so an answer tells that a packet is in the queue and when it will be out.
-What goes out is handed to the line no sooner than the line can carry it (`air_queue`): in the buffers of the
-system there is a packet or two, and a halt sent now goes out now.
+Nobody acknowledges on this radio, so an answer means that a packet is in the queue, and gives the time until
+it will be out. What goes out is handed to the line no sooner than the line can carry it (`transmit_queue`):
+in the buffers of the system there is a packet or two, and a halt sent now goes out now.
 """
 
 from __future__ import annotations
@@ -16,20 +16,24 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Any, Final
 
-from zscout import clock
-from zscout.drivers.air_queue import AirQueue, Full
 from zscout.drivers.airtime import RESERVE, Share, line_rate, objection, share_of
-from zscout.drivers.base import Driver, ResourceController
-from zscout.drivers.line import CLOSE_TIMEOUT, DEPTH, Line
-from zscout.drivers.orders import RadioHalt, RadioStop, radio_order
+from zscout.drivers.commands import RadioHalt, RadioStop, radio_command
+from zscout.drivers.driver import Driver, RcHandle
+from zscout.drivers.packets import (
+    MAX_PACKET,
+    HaltPacket,
+    StopPacket,
+    encode,
+)
+from zscout.drivers.serial_line import CLOSE_TIMEOUT, DEPTH, SerialLine
+from zscout.drivers.transmit_queue import QueueFull, TransmitQueue
 from zscout.keyexpr import Sender
-from zscout.mesh import Refused
+from zscout.mesh import Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
-from zscout.packets import MAX_PACKET, Halt, Stop, encode
-from zscout.scheduling.model import SECOND, Grant, Ns
+from zscout.types import SECOND, Grant, Ns
 
 RECENT: Final = 64
-"""Packets whose wait is told."""
+"""Packets over which the longest wait is measured."""
 OPENING: Final = 1.0
 """Seconds that a node waits for the line before it offers the RC without it."""
 LONGEST_SLEEP: Final = 60.0
@@ -47,7 +51,7 @@ class RadioDriver(Driver):
         self._rate = line_rate(baud)
         self._bound = Fraction(str(bound))
         # Not 0: the last radio of these robots may have begun there.
-        self._air = AirQueue(self._rate, first_number=random.randrange(256))  # noqa: S311
+        self._air = TransmitQueue(self._rate, first_number=random.randrange(256))  # noqa: S311
         self._robots: dict[int, str] = {}
         """Which robot RC an id belongs to: the first that spoke for it, while it is there."""
         self._up = False
@@ -57,13 +61,14 @@ class RadioDriver(Driver):
         self._quiet = asyncio.Event()
         self._outstanding = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._packets = self._bytes = self._echoes = self._halts = self._losses = 0
+        self._packets = self._bytes = self._repeats = self._halts = self._losses = 0
         self._waits: deque[Fraction] = deque(maxlen=RECENT)
 
-    async def open(self, rc: ResourceController) -> None:
+    async def open(self, rc: RcHandle) -> None:
         self._rc = rc
-        self._loop = asyncio.get_running_loop()
-        self._line = Line(self._port, self._baud, self)
+        # Of its own: halts still go out after the RC has closed that of its other work.
+        self._supervisor = Supervisor(f"the line of {rc.name}", rc.supervisor.fail)
+        self._line = SerialLine(self._port, self._baud, self)
         self._line.start()
         try:
             await asyncio.wait_for(self._known.wait(), OPENING)
@@ -76,8 +81,7 @@ class RadioDriver(Driver):
             self._quiet.clear()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._quiet.wait(), CLOSE_TIMEOUT)
-        if self._timer is not None:
-            self._timer.cancel()
+        await self._supervisor.close()
         await self._line.stop()
 
     # Holders
@@ -104,32 +108,32 @@ class RadioDriver(Driver):
             share = share_of(holder.params)
         except ValueError:  # it was never voted for
             share = Share(Fraction(0), Fraction(MAX_PACKET))
-        self._air.join(holder.place, share, clock.now())
+        self._air.join(holder.place, share, self._rc.mesh.now())
 
     async def end(self, holder: Holder) -> None:
         """What waits for this holder is dropped, and the robots that it drove are halted: their own RCs do so
         too, unless their hosts are gone."""
         for robot in self._air.leave(holder.place):
-            self._urge(robot, Halt)
+            self._send_urgent(robot, HaltPacket)
 
     async def safe(self) -> None:
         for place in self._air.places():
             for robot in self._air.leave(place):
-                self._urge(robot, Halt)
+                self._send_urgent(robot, HaltPacket)
 
     # Commands
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        order = radio_order(do)
+        order = radio_command(do)
         owner = self._robots.get(order.robot)
-        if owner is not None and owner not in holder.rcs and self._offered(owner):
+        if owner is not None and owner not in holder.rcs and self._is_offered(owner):
             raise Refused("not_yours", f"robot {order.robot} is {owner}, which this ARC does not hold")
         self._refuse_down()
         if isinstance(order, RadioStop | RadioHalt):
-            return self._urge(order.robot, Stop if isinstance(order, RadioStop) else Halt)
+            return self._send_urgent(order.robot, StopPacket if isinstance(order, RadioStop) else HaltPacket)
         try:
-            after = self._air.offer(holder.place, holder.grant, order, clock.now())
-        except Full:
+            after = self._air.offer(holder.place, holder.grant, order, self._rc.mesh.now())
+        except QueueFull:
             raise Refused("busy", "too many packets of this ARC wait; send fewer") from None
         except ValueError as error:
             raise Refused("bad_command", str(error)) from None
@@ -140,28 +144,28 @@ class RadioDriver(Driver):
         """A stop or a halt for a robot, from the node of its RC: always carried."""
         if do.get("name") not in ("stop", "halt"):
             return await super().command_without_grant(sender, do)
-        order = radio_order(do)
+        order = radio_command(do)
         assert isinstance(order, RadioStop | RadioHalt)  # noqa: S101 - by their names
-        offers = self._rc.offers
-        if order.rc is None or offers is None or not offers.speaks_for(sender, order.rc):
+        directory = self._rc.directory
+        if order.rc is None or directory is None or not directory.is_node_of(sender, order.rc):
             raise Refused("no_grant", f"{sender} does not offer {order.rc}, the robot that it speaks for")
         # A halt does no harm, whoever else claims the robot; but the claim of who is there stands.
         owner = self._robots.get(order.robot)
-        if owner is None or not self._offered(owner):
+        if owner is None or not self._is_offered(owner):
             self._robots[order.robot] = order.rc
         self._refuse_down()
-        return self._urge(order.robot, Stop if isinstance(order, RadioStop) else Halt)
+        return self._send_urgent(order.robot, StopPacket if isinstance(order, RadioStop) else HaltPacket)
 
-    def _offered(self, rc: str) -> bool:
-        return self._rc.offers is not None and bool(self._rc.offers.hosts(rc))
+    def _is_offered(self, rc: str) -> bool:
+        return self._rc.directory is not None and bool(self._rc.directory.hosts(rc))
 
     def _refuse_down(self) -> None:
         if not self._up:
             raise Refused("down", self._why)
 
-    def _urge(self, robot: int, kind: type[Stop] | type[Halt]) -> dict[str, float]:
-        self._halts += kind is Halt
-        after = self._air.urge(robot, kind, clock.now())
+    def _send_urgent(self, robot: int, kind: type[StopPacket] | type[HaltPacket]) -> dict[str, float]:
+        self._halts += kind is HaltPacket
+        after = self._air.send_urgent(robot, kind, self._rc.mesh.now())
         self._pump()
         return {"after": after / SECOND}
 
@@ -175,8 +179,8 @@ class RadioDriver(Driver):
         if not self._up:
             return
         while self._outstanding < DEPTH:
-            now = clock.now()
-            outgoing = self._air.next(now, self._stands)
+            now = self._rc.mesh.now()
+            outgoing = self._air.next(now, self._is_in_force)
             if outgoing is None:
                 break
             data = encode(outgoing.packet)
@@ -184,20 +188,22 @@ class RadioDriver(Driver):
                 self._outstanding += 1
             self._packets += 1
             self._bytes += len(data)
-            self._echoes += outgoing.echo
-            if not outgoing.echo:
+            self._repeats += outgoing.repeat
+            if not outgoing.repeat:
                 self._waits.append(outgoing.through - outgoing.entered)
         if not self._air.urgent:
             self._quiet.set()
-        at = self._air.wake(clock.now())
+        at = self._air.wake(self._rc.mesh.now())
         if at is not None and self._outstanding < DEPTH:
-            delay = min(max(0.0, (at - clock.now()) / SECOND), LONGEST_SLEEP)
-            self._timer = self._loop.call_later(delay, self._pump)
+            delay = min(max(0.0, (at - self._rc.mesh.now()) / SECOND), LONGEST_SLEEP)
+            self._timer = self._supervisor.call_later(delay, self._pump)
 
-    def _stands(self, grant: Grant) -> bool:
+    def _is_in_force(self, grant: Grant) -> bool:
         """Whether the hold of a packet is in force at the moment when it goes out."""
-        held = self._rc.holding.held.get(grant)
-        return held is not None and self._rc.holding.check(grant, held.holder.client, clock.now()) is None
+        held = self._rc.holds.held.get(grant)
+        return (
+            held is not None and self._rc.holds.check(grant, held.holder.client, self._rc.mesh.now()) is None
+        )
 
     def line_up(self) -> None:
         self._up, self._why, self._outstanding = True, "", 0
@@ -222,7 +228,7 @@ class RadioDriver(Driver):
         return {
             "packets": float(self._packets),
             "bytes": float(self._bytes),
-            "repeats": float(self._echoes),
+            "repeats": float(self._repeats),
             "halts": float(self._halts),
             "replaced": float(self._air.replaced),
             "dropped": float(self._air.dropped),

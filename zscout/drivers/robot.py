@@ -1,6 +1,6 @@
 """A robot that is driven through a radio, and stopped whenever nobody drives it.
 
-The robot hears packets and says nothing. So what this RC knows of it is what it has had sent: the robot
+The robot receives packets and sends none. So all that this RC knows is what it has had sent: the robot
 counts as there once the radio has taken a halt for it, and as lost while its radio can't.
 """
 
@@ -15,13 +15,20 @@ from typing import Any, Final
 
 import msgspec
 
-from zscout import clock
-from zscout.drivers.base import Driver, ResourceController
-from zscout.drivers.offers import Offers
-from zscout.drivers.orders import Camera, Drive, RadioCamera, RadioDrive, RadioHalt, RadioStop, robot_order
-from zscout.mesh import Declared, Refused, Reply
+from zscout.drivers.commands import (
+    RadioCamera,
+    RadioDrive,
+    RadioHalt,
+    RadioStop,
+    RobotCamera,
+    RobotDrive,
+    robot_command,
+)
+from zscout.drivers.driver import Driver, RcHandle
+from zscout.drivers.rc_directory import RcDirectory
+from zscout.mesh import Declaration, Refused, Reply
 from zscout.messages import Command, Done, Figures, Holder, RcState
-from zscout.scheduling.model import SECOND, Grant, Ns
+from zscout.types import SECOND, Grant, Ns
 
 ANSWER: Final = 0.5
 """Seconds within which the radio answers a command, and for which one may wait on its way."""
@@ -32,7 +39,7 @@ PAUSES: Final = (0.05, 2.0)
 """Seconds between such tries: the first, and the longest."""
 MAX_WAITING: Final = 16
 RECENT: Final = 64
-"""Answers of the radio whose latency is told."""
+"""Answers of the radio over which the latency is measured."""
 
 
 @dataclass(slots=True)
@@ -59,59 +66,55 @@ class RobotDriver(Driver):
         self._dead_man = dead_man
         self._waiting: deque[_Waiting] = deque()
         self._timer: asyncio.TimerHandle | None = None
-        self._over: Ns | None = 0
+        self._standing_at: Ns | None = 0
         """When the wheels stand by themselves; None: a drive command is under way, and nobody knows."""
         self._unsure = asyncio.Event()
         self._unsure.set()
-        self._news = asyncio.Event()
-        self._more = asyncio.Event()
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._declared: list[Declared] = []
-        self._commands = self._refused = self._halts = self._let_go = 0
+        self._wake = asyncio.Event()
+        self._queued = asyncio.Event()
+        self._declared: list[Declaration] = []
+        self._commands = self._refused = self._halts = self._dead_man_stops = 0
         self._latencies: deque[float] = deque(maxlen=RECENT)
 
-    async def open(self, rc: ResourceController) -> None:
+    async def open(self, rc: RcHandle) -> None:
         self._rc, self._mesh = rc, rc.mesh
         rc.fail(f"{self._radio} has not taken its halt yet")
-        self._offers = Offers(rc.mesh, self._on_offers)
-        self._declared.append(self._offers.watch())
+        self._directory = RcDirectory(rc.mesh, self._on_directory_change)
+        self._declared.append(self._directory.watch())
         keys = rc.mesh.keys
         self._declared.append(rc.mesh.subscribe(keys.rc_state(self._radio), RcState, self._on_radio_state))
-        self._spawn(self._make_sure())
-        self._spawn(self._send_all())
+        rc.supervisor.spawn(self._halt_until_sure())
+        rc.supervisor.spawn(self._send_all())
 
     async def close(self) -> None:
         for declared in self._declared:
             declared.close()
-        for task in list(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
         self._drop_waiting()
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
-        """All of it: only the camera warms up, and not before it is told to."""
+        """All of it: only the camera warms up, and not before a command switches it on."""
         return True
 
     # Commands
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        order = robot_order(do)
+        order = robot_command(do)
         radio = self._radio_of(holder)
         self._commands += 1
         sent: RadioDrive | RadioCamera | RadioStop
-        if isinstance(order, Camera):
+        if isinstance(order, RobotCamera):
             sent = RadioCamera(self._id, self._channel_of(holder) if order.on else 0)
         else:
             # A newer command makes those void that wait: the newest is the true one.
             for waiting in [waiting for waiting in self._waiting if isinstance(waiting.order, RadioDrive)]:
                 self._waiting.remove(waiting)
-                _settle(waiting.answer, {"replaced": True})
-            if isinstance(order, Drive):
+                _resolve(waiting.answer, {"replaced": True})
+            if isinstance(order, RobotDrive):
                 sent = RadioDrive(self._id, order.left, order.right, order.lasts)
-                self._drives(turns=bool(order.left or order.right))
+                self._restart_dead_man(turns=bool(order.left or order.right))
             else:
                 sent = RadioStop(self._id)
-                self._drives(turns=False)
+                self._restart_dead_man(turns=False)
         if len(self._waiting) >= MAX_WAITING:
             raise Refused("busy", f"{MAX_WAITING} commands wait for {radio}; send fewer")
         answer: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
@@ -120,7 +123,7 @@ class RobotDriver(Driver):
             self._waiting.appendleft(waiting)
         else:
             self._waiting.append(waiting)
-        self._more.set()
+        self._queued.set()
         return answer
 
     def _radio_of(self, holder: Holder) -> str:
@@ -152,22 +155,22 @@ class RobotDriver(Driver):
     async def _send_all(self) -> None:
         """Has the radio send what waits, one after the other."""
         while True:
-            await self._more.wait()
-            self._more.clear()
+            await self._queued.wait()
+            self._queued.clear()
             while self._waiting:
                 await self._send(self._waiting.popleft())
 
     async def _send(self, waiting: _Waiting) -> None:
-        began, order = clock.now(), waiting.order
+        began, order = self._mesh.now(), waiting.order
         if isinstance(order, RadioDrive):
-            self._over = None
-        reply = await self._tell(waiting.radio, order, waiting.grant, ANSWER)
-        self._latencies.append((clock.now() - began) / SECOND)
+            self._standing_at = None
+        reply = await self._ask_radio(waiting.radio, order, waiting.grant, ANSWER)
+        self._latencies.append((self._mesh.now() - began) / SECOND)
         if reply is not None and reply.message is not None:
             result = reply.message.result
-            if isinstance(order, RadioDrive) and self._over is None:
-                self._over = clock.now() + round((_after(result) + order.lasts) * SECOND)
-            _settle(waiting.answer, result)
+            if isinstance(order, RadioDrive) and self._standing_at is None:
+                self._standing_at = self._mesh.now() + round((_after(result) + order.lasts) * SECOND)
+            _resolve(waiting.answer, result)
             return
         self._refused += 1
         if reply is None or reply.problem is None:
@@ -176,61 +179,63 @@ class RobotDriver(Driver):
             refused = Refused(
                 "radio_refused", f"{waiting.radio}: {reply.problem.message} ({reply.problem.code})"
             )
-        _settle(waiting.answer, refused)
+        _resolve(waiting.answer, refused)
 
-    async def _tell(self, radio: str, order: Any, grant: Grant | None, timeout: float) -> Reply[Done] | None:
+    async def _ask_radio(
+        self, radio: str, order: Any, grant: Grant | None, timeout: float
+    ) -> Reply[Done] | None:
         key = self._mesh.keys.command(radio, self._mesh.me)
         message = Command(do=msgspec.to_builtins(order), grant=grant, ttl=timeout)
         return await self._mesh.ask_one(key, message, Done, timeout=timeout)
 
     def _drop_waiting(self) -> None:
         while self._waiting:
-            _settle(self._waiting.popleft().answer, Refused("ended", "the hold ended before it was sent"))
+            _resolve(self._waiting.popleft().answer, Refused("ended", "the hold ended before it was sent"))
 
     # Stopping
 
     async def safe(self) -> None:
         """The robot halts: wheels and transmitter. Where the radio does not take that, the RC counts as lost
         until it does."""
-        self._drives(turns=False)
+        self._restart_dead_man(turns=False)
         self._drop_waiting()
-        problem = await self._urge(RadioHalt(self._id, self._rc.name), HALT_TRIES)
+        problem = await self._send_urgent(RadioHalt(self._id, self._rc.name), HALT_TRIES)
         if problem:
-            self._doubt(problem)
+            self._set_unsure(problem)
 
-    def _drives(self, *, turns: bool) -> None:
+    def _restart_dead_man(self, *, turns: bool) -> None:
         """A command for the wheels came: the dead man's clock begins anew, or stands."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._over = None if turns else 0
+        self._standing_at = None if turns else 0
         if turns:
-            self._timer = asyncio.get_running_loop().call_later(self._dead_man, self._dead)
+            self._timer = self._rc.supervisor.call_later(self._dead_man, self._stop_unattended)
 
-    def _dead(self) -> None:
+    def _stop_unattended(self) -> None:
         """Commands ceased."""
         self._timer = None
-        if self._over is not None and self._over <= clock.now():
+        if self._standing_at is not None and self._standing_at <= self._mesh.now():
             return
-        self._let_go += 1
+        self._dead_man_stops += 1
         for waiting in [waiting for waiting in self._waiting if isinstance(waiting.order, RadioDrive)]:
             self._waiting.remove(waiting)
-            _settle(waiting.answer, Refused("stale", "it waited too long for the radio"))
-        self._over = 0
-        self._spawn(self._stop())
+            _resolve(waiting.answer, Refused("stale", "it waited too long for the radio"))
+        self._standing_at = 0
+        self._rc.supervisor.spawn(self._stop())
 
     async def _stop(self) -> None:
-        problem = await self._urge(RadioStop(self._id, self._rc.name), HALT_TRIES)
+        problem = await self._send_urgent(RadioStop(self._id, self._rc.name), HALT_TRIES)
         if problem:
-            self._doubt(problem)
+            self._set_unsure(problem)
 
-    async def _urge(self, order: RadioStop | RadioHalt, tries: int) -> str:
+    async def _send_urgent(self, order: RadioStop | RadioHalt, tries: int) -> str:
         """Has the robot's own radio send a stop or a halt. Returns what is wrong; empty if it is taken."""
         problem = ""
         for _ in range(tries):
-            if not self._offers.hosts(self._radio):
+            if not self._directory.hosts(self._radio):
                 return f"{self._radio} is not there"
-            reply = await self._tell(self._radio, order, None, HALT_ANSWER)
+            reply = await self._ask_radio(self._radio, order, None, HALT_ANSWER)
             if reply is not None and reply.message is not None:
                 self._halts += isinstance(order, RadioHalt)
                 return ""
@@ -239,67 +244,62 @@ class RobotDriver(Driver):
                 problem = f"{self._radio}: {reply.problem.message}"
         return problem
 
-    def _doubt(self, why: str) -> None:
+    def _set_unsure(self, why: str) -> None:
         """The robot can't be stopped for now: nobody may drive it."""
         if self._rc.health != why:
             self._rc.fail(why)
         self._unsure.set()
 
-    async def _make_sure(self) -> None:
+    async def _halt_until_sure(self) -> None:
         """Halts the robot whenever its state is unknown, and offers it again once that is done."""
         pause = PAUSES[0]
         while True:
             await self._unsure.wait()
-            self._news.clear()
-            problem = await self._urge(RadioHalt(self._id, self._rc.name), 1)
+            self._wake.clear()
+            problem = await self._send_urgent(RadioHalt(self._id, self._rc.name), 1)
             if not problem:
                 self._unsure.clear()
                 self._rc.recover()
                 pause = PAUSES[0]
                 continue
-            self._doubt(problem)
+            self._set_unsure(problem)
             try:
                 # Not wait_for, which loses a cancellation that comes together with the news.
                 async with asyncio.timeout(pause):
-                    await self._news.wait()
+                    await self._wake.wait()
             except TimeoutError:
                 pause = min(2 * pause, PAUSES[1])
 
-    def _on_offers(self) -> None:
-        self._news.set()
-        if not self._offers.hosts(self._radio) and not self._unsure.is_set():
-            self._doubt(f"{self._radio} is not there")
+    def _on_directory_change(self) -> None:
+        self._wake.set()
+        if not self._directory.hosts(self._radio) and not self._unsure.is_set():
+            self._set_unsure(f"{self._radio} is not there")
 
     def _on_radio_state(self, _key: str, state: RcState) -> None:
         if state.rc != self._radio:
             return
         if state.health != "ok":
-            self._doubt(f"{self._radio}: {state.health}")
+            self._set_unsure(f"{self._radio}: {state.health}")
         elif self._unsure.is_set():
-            self._news.set()
-
-    def _spawn(self, coroutine: Any) -> None:
-        task = asyncio.get_running_loop().create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+            self._wake.set()
 
     def figures(self) -> Figures:
         return {
             "commands": float(self._commands),
             "refused": float(self._refused),
             "halts": float(self._halts),
-            "dead_man_stops": float(self._let_go),
+            "dead_man_stops": float(self._dead_man_stops),
             "latency_ms": round(1000 * statistics.median(self._latencies), 2) if self._latencies else 0.0,
         }
 
 
 def _after(result: Any) -> float:
-    """Seconds until a packet is out, as a radio told it."""
+    """Seconds until a packet is out, as the radio answered."""
     after = result.get("after") if isinstance(result, dict) else None
     return float(after) if isinstance(after, int | float) and 0 <= after < 60 else 0.0
 
 
-def _settle(answer: asyncio.Future[Any], outcome: Any) -> None:
+def _resolve(answer: asyncio.Future[Any], outcome: Any) -> None:
     if answer.done():
         return
     if isinstance(outcome, Exception):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from decimal import Decimal
 
-from zscout.amounts import exact
-from zscout.drivers.base import Driver, ResourceController
+from zscout.drivers.driver import Driver, RcHandle
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
+from zscout.types import exact
 
 
 class VideoDriver(Driver):
@@ -16,9 +16,9 @@ class VideoDriver(Driver):
     sharable = True
 
     def __init__(self) -> None:
-        self._rc: ResourceController | None = None
+        self._rc: RcHandle | None = None
 
-    async def open(self, rc: ResourceController) -> None:
+    async def open(self, rc: RcHandle) -> None:
         self._rc = rc
 
     def vote(self, holders: list[ProposedHolder]) -> str:
@@ -50,7 +50,7 @@ class VideoDriver(Driver):
         return {"transmitters": float(len(held) - silent), "listeners": float(silent)}
 
     def _holders(self) -> list[Holder]:
-        return [] if self._rc is None else [held.holder for held in self._rc.holding.held.values()]
+        return [] if self._rc is None else [held.holder for held in self._rc.holds.held.values()]
 
 
 def _transmitters(params: Mapping[str, Decimal]) -> int:

@@ -18,23 +18,14 @@ os.environ.setdefault(
     "app:(worker_threads:2))",
 )
 
-from zscout.mesh.declared import Declared, Overheard, Publisher
-from zscout.mesh.exchange import Refused, Reply, Request
-from zscout.mesh.frames import Frame, FramePublisher, FrameWatch
-from zscout.mesh.session import Mesh, MeshError
-from zscout.mesh.settings import zenoh_config
-
-__all__ = [
-    "Declared",
-    "Frame",
-    "FramePublisher",
-    "FrameWatch",
-    "Mesh",
-    "MeshError",
-    "Overheard",
-    "Publisher",
-    "Refused",
-    "Reply",
-    "Request",
-    "zenoh_config",
-]
+from zscout.mesh.declared import Declaration as Declaration
+from zscout.mesh.declared import Publisher as Publisher
+from zscout.mesh.exchange import IncomingQuery as IncomingQuery
+from zscout.mesh.exchange import Refused as Refused
+from zscout.mesh.exchange import Reply as Reply
+from zscout.mesh.frames import FrameWatch as FrameWatch
+from zscout.mesh.protocol import Mesh as Mesh
+from zscout.mesh.protocol import MeshError as MeshError
+from zscout.mesh.settings import zenoh_config as zenoh_config
+from zscout.mesh.supervision import Supervisor as Supervisor
+from zscout.mesh.zenoh_mesh import ZenohMesh as ZenohMesh

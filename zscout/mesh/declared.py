@@ -1,20 +1,17 @@
-"""What a process has declared on the mesh, and how it is taken back."""
+"""What a process has declared on the mesh, and how it is undeclared."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 import msgspec
-import zenoh
 
 from zscout import messages
 from zscout.mesh.inbox import Backlog
+from zscout.mesh.transport import TransportPublisher, Undeclare
 from zscout.messages import Malformed
-
-log = logging.getLogger(__name__)
 
 S = TypeVar("S")
 
@@ -22,24 +19,21 @@ S = TypeVar("S")
 class Publisher:
     """Publishes messages of one kind on one key."""
 
-    def __init__(self, publisher: zenoh.Publisher) -> None:
+    def __init__(self, publisher: TransportPublisher) -> None:
         self._publisher = publisher
 
     def put(self, message: msgspec.Struct) -> None:
-        try:
-            self._publisher.put(messages.encode(message))
-        except zenoh.ZError as error:
-            log.warning("a publication on %s was not sent: %s", self._publisher.key_expr, error)
+        self._publisher.put(messages.encode(message))
 
     def close(self) -> None:
-        self._publisher.undeclare()  # type: ignore[no-untyped-call]
+        self._publisher.undeclare()
 
 
-class Declared:
-    """A declaration that can be taken back."""
+class Declaration:
+    """A declaration that can be undeclared."""
 
-    def __init__(self, undeclare: Callable[[], Any], state: Backlog | None = None) -> None:
-        self._undeclare: Callable[[], Any] | None = undeclare
+    def __init__(self, undeclare: Undeclare, state: Backlog | None = None) -> None:
+        self._undeclare: Undeclare | None = undeclare
         self._state = state or Backlog()
 
     @property
@@ -49,45 +43,47 @@ class Declared:
 
     def close(self) -> None:
         if self._undeclare is not None:
-            undeclare: Callable[[], Any] = self._undeclare
+            undeclare: Undeclare = self._undeclare
             self._undeclare = None
-            try:
-                undeclare()
-            except zenoh.ZError as error:
-                log.debug("undeclaring failed: %s", error)
+            undeclare()
 
 
-class Overheard(Declared, Generic[S]):
-    """Publications that wake nobody: the latest are kept, outside Python, until somebody looks."""
+class Overheard(Declaration, Generic[S]):
+    """The latest publications on a key, kept outside the event loop until they are taken."""
 
     def __init__(
-        self, subscriber: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]], kind: type[S], depth: int
+        self,
+        take: Callable[[], tuple[str, bytes] | None],
+        undeclare: Undeclare,
+        kind: type[S],
+        depth: int,
     ) -> None:
-        super().__init__(subscriber.undeclare)
-        self._subscriber, self._kind, self._depth = subscriber, kind, depth
+        super().__init__(undeclare)
+        self._take, self._kind, self._depth = take, kind, depth
 
     def take(self) -> list[S]:
-        """What came since the last look, oldest first; malformed ones are dropped without a word."""
+        """What was published since the last call, oldest first; malformed messages are dropped silently."""
         return [message for _, message in self.each()]
 
     def each(self) -> Iterator[tuple[str, S]]:
-        """The same one by one, each with its key; what is not asked for is kept for the next look. Ends after
-        as many as there is room for: more may come while one looks."""
+        """The same one by one, each with its key; what is not consumed is kept for the next call. Ends after
+        as many as there is room for: more may arrive meanwhile."""
         for _ in range(self._depth):
-            sample = self._subscriber.try_recv()
+            sample = self._take()
             if sample is None:
                 return
+            key, payload = sample
             try:
-                message: S = messages.decode(sample.payload.to_bytes(), self._kind, messages.MAX_STATE)
+                message: S = messages.decode(payload, self._kind, messages.MAX_STATE)
             except Malformed:
                 continue
-            yield str(sample.key_expr), message
+            yield key, message
 
 
 @dataclass(slots=True)
 class Shared:
-    """A subscription whose publications are read once for all handlers of this process."""
+    """A subscription whose publications are decoded once for all handlers of this process."""
 
     state: Backlog
     handlers: list[Callable[[str, Any], None]] = field(default_factory=list)
-    undeclare: Callable[[], Any] = lambda: None
+    undeclare: Undeclare = lambda: None

@@ -1,4 +1,4 @@
-"""One question and its answers, as messages."""
+"""One query and its replies, as messages."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import msgspec
-import zenoh
 
 from zscout import messages
+from zscout.mesh.transport import TransportQuery
 from zscout.messages import Malformed, Problem
-from zscout.scheduling.model import Ns, Term
+from zscout.types import Ns, Term
 
 log = logging.getLogger(__name__)
 
-JSON = zenoh.Encoding.APPLICATION_JSON
 R = TypeVar("R")
 
 
@@ -29,78 +28,49 @@ class Refused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Reply(Generic[R]):
-    """One answer to a query: a message, or a problem."""
+    """One reply to a query: a message, or a problem."""
 
     key: str
     message: R | None
     problem: Problem | None = None
 
 
-class Request(Generic[R]):
-    """A query that arrived: answer it once, now or later. Not answering at all reads as "unknown"."""
+class IncomingQuery(Generic[R]):
+    """A query that arrived: answer it once, now or later. No answer at all reads as "unknown"."""
 
     __slots__ = ("_query", "_reply_key", "arrived", "key", "message")
 
-    def __init__(self, query: zenoh.Query, key: str, reply_key: str, message: R, arrived: Ns) -> None:
-        self._query: zenoh.Query | None = query
+    def __init__(self, query: TransportQuery, key: str, reply_key: str, message: R, arrived: Ns) -> None:
+        self._query: TransportQuery | None = query
         self._reply_key = reply_key
         self.key = key
         self.message = message
         self.arrived = arrived
-        """When it came out of the network, on this host's clock."""
+        """When it came out of the network, by `Mesh.now`."""
 
     def answer(self, message: msgspec.Struct) -> None:
-        if self._query is not None:
-            encoding = encoding_of(type(message))
-            try:
-                self._query.reply(self._reply_key, messages.encode(message), encoding=encoding)
-            except zenoh.ZError as error:
-                log.debug("an answer on %s was not sent: %s", self.key, error)
-            self._drop()
+        query, self._query = self._query, None
+        if query is not None:
+            query.reply(self._reply_key, messages.encode(message), type(message))
 
     def refuse(self, problem: Problem) -> None:
-        if self._query is not None:
-            reply_problem(self._query, problem)
-            self._drop()
-
-    def _drop(self) -> None:
-        # A query that is kept after its reply makes the asker wait for its timeout.
-        if self._query is not None:
-            drop(self._query)
-            self._query = None
+        query, self._query = self._query, None
+        if query is not None:
+            refuse(query, problem)
 
 
-_ENCODINGS: dict[type, zenoh.Encoding] = {}
+def refuse(query: TransportQuery, problem: Problem) -> None:
+    query.reply_error(messages.encode(problem), Problem)
 
 
-def encoding_of(kind: type) -> zenoh.Encoding:
-    encoding = _ENCODINGS.get(kind)
-    if encoding is None:
-        encoding = _ENCODINGS[kind] = JSON.with_schema(messages.schema(kind))
-    return encoding
-
-
-def read_reply(reply: zenoh.Reply, kind: type[R], limit: int) -> Reply[R] | None:
-    sample = reply.ok
+def read_reply(key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -> Reply[R] | None:
     try:
-        if sample is not None:
-            return Reply(str(sample.key_expr), messages.decode(sample.payload.to_bytes(), kind, limit))
-        raw = reply.err.payload.to_bytes() if reply.err is not None else b""
-        if raw == b"Timeout":
+        if ok:
+            return Reply(key, messages.decode(payload, kind, limit))
+        if payload == b"Timeout":
             return None
-        problem: Problem = messages.decode(raw, Problem)
+        problem: Problem = messages.decode(payload, Problem)
         return Reply("", None, problem)
     except Malformed as error:
-        log.warning("an answer was not understood: %s", error)
+        log.warning("a reply was malformed: %s", error)
         return None
-
-
-def reply_problem(query: zenoh.Query, problem: Problem) -> None:
-    try:
-        query.reply_err(messages.encode(problem), encoding=encoding_of(Problem))
-    except zenoh.ZError as error:
-        log.debug("an error answer was not sent: %s", error)
-
-
-def drop(query: zenoh.Query) -> None:
-    query.drop()  # type: ignore[no-untyped-call]

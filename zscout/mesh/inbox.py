@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+from zscout.mesh.exchange import Refused
+
 log = logging.getLogger(__name__)
 
 INBOX_DEPTH = 20_000
@@ -44,14 +46,26 @@ class Inbox:
     after: list[Callable[[], None]] = field(default_factory=list)
     """What is called once the present burst has been handled."""
 
-    def offer(self, state: Backlog | None, call: Callable[..., None], *args: Any) -> bool:
-        if self.closed or len(self.items) >= INBOX_DEPTH:
+    def offer(self, state: Backlog, call: Callable[..., None], *args: Any) -> bool:
+        """Calls `call(*args)` in the event loop, unless too much waits there: whether it will."""
+        if self.closed or len(self.items) >= INBOX_DEPTH or state.pending >= state.depth:
             return False
-        if state is not None:
-            if state.pending >= state.depth:
-                return False
-            state.pending += 1
-        self.items.append((state, call, args))
+        state.pending += 1
+        return self._put(state, call, args)
+
+    def deliver(self, call: Callable[..., None], *args: Any) -> None:
+        """The same of what must not be lost, such as deaths and ends of queries. Of these there are as many
+        as there are processes and own queries."""
+        if not self.closed:
+            self._put(None, call, args)
+
+    def close(self) -> None:
+        """Nothing is called any more, what waits included."""
+        self.closed = True
+        self.items.clear()
+
+    def _put(self, *item: Any) -> bool:
+        self.items.append(item)
         if not self.scheduled:
             self.scheduled = True
             try:
@@ -65,7 +79,7 @@ class Inbox:
         self.draining = True
         try:
             for _ in range(BURST):
-                if not self.items:
+                if not self.items or self.closed:
                     break
                 state, call, args = self.items.popleft()
                 if state is not None:
@@ -79,7 +93,7 @@ class Inbox:
             self.draining = False
             # In this order: who offers something now either sees that nobody is coming, or is seen.
             self.scheduled = False
-            if self.items:
+            if self.items and not self.closed:
                 self.scheduled = True
                 self.loop.call_soon(self.drain)
 
@@ -87,5 +101,7 @@ class Inbox:
 def guarded(call: Callable[..., None], *args: Any) -> None:
     try:
         call(*args)
+    except Refused:  # by a supervised handler: it is logged there
+        pass
     except Exception:
         log.exception("a handler failed")

@@ -7,7 +7,7 @@ from typing import Any
 
 import zenoh
 
-from zscout.config import Mesh as MeshConfig
+from zscout.config.fleet import MeshConfig
 
 BLOCK_US = 100_000
 """The longest that a publication waits for a peer that does not read, before that peer is given up."""

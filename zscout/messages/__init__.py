@@ -6,236 +6,110 @@ places are arrays that compare element by element: `[counter, rcm]`, `[term, seq
 
 from __future__ import annotations
 
-from zscout.messages.base import (
-    MAX_COUNTER,
-    MAX_ERROR,
-    MAX_JUMP,
-    MAX_NEEDS,
-    MAX_PARAMS,
-    MAX_PAYLOAD,
-    MAX_STATE,
-    Amounts,
-    Bytes,
-    Elapsed,
-    Figure,
-    Malformed,
-    Message,
-    Problem,
-    Seconds,
-    ShortText,
-    State,
-    absurd,
-    decode,
-    encode,
-    names_once,
-    schema,
-)
-from zscout.messages.behaviors import (
-    MAX_BOXES,
-    MAX_DETAIL,
-    MAX_PEOPLE,
-    MAX_PLAN,
-    MAX_ROBOTS,
-    BehaviorSaid,
-    Box,
-    BuildingPlan,
-    BuildingPoses,
-    Placed,
-    PlanAsk,
-)
-from zscout.messages.components import (
-    MAX_CHECKPOINT,
-    MAX_COMPONENT_NAME,
-    MAX_MOVE,
-    MAX_OUTPUT,
-    MAX_PARAMS_SIZE,
-    MAX_PLACED,
-    MAX_TAIL,
-    ActivateComponent,
-    Checkpoint,
-    CheckpointComponent,
-    ComponentList,
-    ComponentName,
-    ComponentOperation,
-    ComponentSpec,
-    ComponentView,
-    DrainHost,
-    EndComponent,
-    HowEnded,
-    Incarnation,
-    ListComponents,
-    ListPlacements,
-    MigrateComponent,
-    MoveComponent,
-    Moved,
-    Output,
-    Phase,
-    PlaceComponent,
-    Placement,
-    Placements,
-    PlacementState,
-    PlacerOperation,
-    ReadOutput,
-    Restart,
-    RestoreComponent,
-    StartComponent,
-    StopComponent,
-    UncordonHost,
-)
-from zscout.messages.controllers import (
-    MAX_FIGURES,
-    MAX_FRAME,
-    Ballot,
-    Command,
-    Done,
-    EndedHold,
-    Figures,
-    FrameHead,
-    Proposal,
-    ProposedHolder,
-    RcAsk,
-    RcState,
-)
-from zscout.messages.hosts import (
-    MAX_COMPONENTS,
-    MAX_LABELS,
-    MAX_RANKED,
-    ComponentUse,
-    HostRanking,
-    LoadReport,
-    RankAsk,
-    RankedHost,
-)
-from zscout.messages.scheduling import (
-    Ask,
-    Cancel,
-    ClientRequests,
-    Foresee,
-    Foresight,
-    Grants,
-    HandOver,
-    Holder,
-    HoldView,
-    Notice,
-    OpenRequest,
-    Operation,
-    RcmState,
-    RcView,
-    Release,
-    Revocation,
-    StateAsk,
-    StoryLine,
-    WaitView,
-)
-
-__all__ = [
-    "MAX_BOXES",
-    "MAX_CHECKPOINT",
-    "MAX_COMPONENTS",
-    "MAX_COMPONENT_NAME",
-    "MAX_COUNTER",
-    "MAX_DETAIL",
-    "MAX_ERROR",
-    "MAX_FIGURES",
-    "MAX_FRAME",
-    "MAX_JUMP",
-    "MAX_LABELS",
-    "MAX_MOVE",
-    "MAX_NEEDS",
-    "MAX_OUTPUT",
-    "MAX_PARAMS",
-    "MAX_PARAMS_SIZE",
-    "MAX_PAYLOAD",
-    "MAX_PEOPLE",
-    "MAX_PLACED",
-    "MAX_PLAN",
-    "MAX_RANKED",
-    "MAX_ROBOTS",
-    "MAX_STATE",
-    "MAX_TAIL",
-    "ActivateComponent",
-    "Amounts",
-    "Ask",
-    "Ballot",
-    "BehaviorSaid",
-    "Box",
-    "BuildingPlan",
-    "BuildingPoses",
-    "Bytes",
-    "Cancel",
-    "Checkpoint",
-    "CheckpointComponent",
-    "ClientRequests",
-    "Command",
-    "ComponentList",
-    "ComponentName",
-    "ComponentOperation",
-    "ComponentSpec",
-    "ComponentUse",
-    "ComponentView",
-    "Done",
-    "DrainHost",
-    "Elapsed",
-    "EndComponent",
-    "EndedHold",
-    "Figure",
-    "Figures",
-    "Foresee",
-    "Foresight",
-    "FrameHead",
-    "Grants",
-    "HandOver",
-    "HoldView",
-    "Holder",
-    "HostRanking",
-    "HowEnded",
-    "Incarnation",
-    "ListComponents",
-    "ListPlacements",
-    "LoadReport",
-    "Malformed",
-    "Message",
-    "MigrateComponent",
-    "MoveComponent",
-    "Moved",
-    "Notice",
-    "OpenRequest",
-    "Operation",
-    "Output",
-    "Phase",
-    "PlaceComponent",
-    "Placed",
-    "Placement",
-    "PlacementState",
-    "Placements",
-    "PlacerOperation",
-    "PlanAsk",
-    "Problem",
-    "Proposal",
-    "ProposedHolder",
-    "RankAsk",
-    "RankedHost",
-    "RcAsk",
-    "RcState",
-    "RcView",
-    "RcmState",
-    "ReadOutput",
-    "Release",
-    "Restart",
-    "RestoreComponent",
-    "Revocation",
-    "Seconds",
-    "ShortText",
-    "StartComponent",
-    "State",
-    "StateAsk",
-    "StopComponent",
-    "StoryLine",
-    "UncordonHost",
-    "WaitView",
-    "absurd",
-    "decode",
-    "encode",
-    "names_once",
-    "schema",
-]
+from zscout.messages.base import MAX_COUNTER as MAX_COUNTER
+from zscout.messages.base import MAX_ERROR as MAX_ERROR
+from zscout.messages.base import MAX_JUMP as MAX_JUMP
+from zscout.messages.base import MAX_NEEDS as MAX_NEEDS
+from zscout.messages.base import MAX_PARAMS as MAX_PARAMS
+from zscout.messages.base import MAX_PAYLOAD as MAX_PAYLOAD
+from zscout.messages.base import MAX_STATE as MAX_STATE
+from zscout.messages.base import Amounts as Amounts
+from zscout.messages.base import Bytes as Bytes
+from zscout.messages.base import Figure as Figure
+from zscout.messages.base import Malformed as Malformed
+from zscout.messages.base import Message as Message
+from zscout.messages.base import Problem as Problem
+from zscout.messages.base import Seconds as Seconds
+from zscout.messages.base import State as State
+from zscout.messages.base import absurd as absurd
+from zscout.messages.base import decode as decode
+from zscout.messages.base import encode as encode
+from zscout.messages.base import names_once as names_once
+from zscout.messages.base import schema as schema
+from zscout.messages.behaviors import MAX_BOXES as MAX_BOXES
+from zscout.messages.behaviors import MAX_DETAIL as MAX_DETAIL
+from zscout.messages.behaviors import MAX_PEOPLE as MAX_PEOPLE
+from zscout.messages.behaviors import MAX_PLAN as MAX_PLAN
+from zscout.messages.behaviors import MAX_ROBOTS as MAX_ROBOTS
+from zscout.messages.behaviors import BehaviorSaid as BehaviorSaid
+from zscout.messages.behaviors import Box as Box
+from zscout.messages.behaviors import BuildingPlan as BuildingPlan
+from zscout.messages.behaviors import BuildingPoses as BuildingPoses
+from zscout.messages.behaviors import Placed as Placed
+from zscout.messages.behaviors import PlanAsk as PlanAsk
+from zscout.messages.components import MAX_CHECKPOINT as MAX_CHECKPOINT
+from zscout.messages.components import MAX_COMPONENT_NAME as MAX_COMPONENT_NAME
+from zscout.messages.components import MAX_MOVE as MAX_MOVE
+from zscout.messages.components import MAX_OUTPUT as MAX_OUTPUT
+from zscout.messages.components import MAX_PARAMS_SIZE as MAX_PARAMS_SIZE
+from zscout.messages.components import MAX_PLACED as MAX_PLACED
+from zscout.messages.components import MAX_TAIL as MAX_TAIL
+from zscout.messages.components import ActivateComponent as ActivateComponent
+from zscout.messages.components import Checkpoint as Checkpoint
+from zscout.messages.components import CheckpointComponent as CheckpointComponent
+from zscout.messages.components import ComponentList as ComponentList
+from zscout.messages.components import ComponentOperation as ComponentOperation
+from zscout.messages.components import ComponentSpec as ComponentSpec
+from zscout.messages.components import ComponentView as ComponentView
+from zscout.messages.components import DrainHost as DrainHost
+from zscout.messages.components import EndComponent as EndComponent
+from zscout.messages.components import HowEnded as HowEnded
+from zscout.messages.components import Incarnation as Incarnation
+from zscout.messages.components import ListComponents as ListComponents
+from zscout.messages.components import ListPlacements as ListPlacements
+from zscout.messages.components import MigrateComponent as MigrateComponent
+from zscout.messages.components import MoveComponent as MoveComponent
+from zscout.messages.components import Moved as Moved
+from zscout.messages.components import Output as Output
+from zscout.messages.components import Phase as Phase
+from zscout.messages.components import PlaceComponent as PlaceComponent
+from zscout.messages.components import Placement as Placement
+from zscout.messages.components import PlacementOperation as PlacementOperation
+from zscout.messages.components import Placements as Placements
+from zscout.messages.components import PlacerOperation as PlacerOperation
+from zscout.messages.components import ReadOutput as ReadOutput
+from zscout.messages.components import Restart as Restart
+from zscout.messages.components import RestoreComponent as RestoreComponent
+from zscout.messages.components import StartComponent as StartComponent
+from zscout.messages.components import StopComponent as StopComponent
+from zscout.messages.components import UncordonHost as UncordonHost
+from zscout.messages.controllers import MAX_FRAME as MAX_FRAME
+from zscout.messages.controllers import Ballot as Ballot
+from zscout.messages.controllers import Command as Command
+from zscout.messages.controllers import Done as Done
+from zscout.messages.controllers import EndedHold as EndedHold
+from zscout.messages.controllers import Figures as Figures
+from zscout.messages.controllers import FrameHead as FrameHead
+from zscout.messages.controllers import Proposal as Proposal
+from zscout.messages.controllers import ProposedHolder as ProposedHolder
+from zscout.messages.controllers import RcAsk as RcAsk
+from zscout.messages.controllers import RcState as RcState
+from zscout.messages.hosts import MAX_COMPONENTS as MAX_COMPONENTS
+from zscout.messages.hosts import MAX_LABELS as MAX_LABELS
+from zscout.messages.hosts import MAX_RANKED as MAX_RANKED
+from zscout.messages.hosts import ComponentUse as ComponentUse
+from zscout.messages.hosts import HostRanking as HostRanking
+from zscout.messages.hosts import LoadReport as LoadReport
+from zscout.messages.hosts import RankAsk as RankAsk
+from zscout.messages.hosts import RankedHost as RankedHost
+from zscout.messages.scheduling import Ask as Ask
+from zscout.messages.scheduling import Cancel as Cancel
+from zscout.messages.scheduling import ClientRequests as ClientRequests
+from zscout.messages.scheduling import Foresee as Foresee
+from zscout.messages.scheduling import Foresight as Foresight
+from zscout.messages.scheduling import Grants as Grants
+from zscout.messages.scheduling import HandOver as HandOver
+from zscout.messages.scheduling import Holder as Holder
+from zscout.messages.scheduling import HoldView as HoldView
+from zscout.messages.scheduling import Notice as Notice
+from zscout.messages.scheduling import OpenRequest as OpenRequest
+from zscout.messages.scheduling import Operation as Operation
+from zscout.messages.scheduling import RcmState as RcmState
+from zscout.messages.scheduling import RcView as RcView
+from zscout.messages.scheduling import ReasonInfo as ReasonInfo
+from zscout.messages.scheduling import ReasonParty as ReasonParty
+from zscout.messages.scheduling import Release as Release
+from zscout.messages.scheduling import Revocation as Revocation
+from zscout.messages.scheduling import StateAsk as StateAsk
+from zscout.messages.scheduling import StoryLine as StoryLine
+from zscout.messages.scheduling import WaitView as WaitView

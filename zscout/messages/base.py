@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import msgspec
 
-from zscout.scheduling.model import NO_TERM, Term
+from zscout.types import NO_TERM, Term
 
 MAX_PAYLOAD = 65_536
 """Bytes of one message that is not a state answer."""
@@ -18,9 +18,9 @@ MAX_STATE = 16_000_000
 MAX_NEEDS = 64
 MAX_PARAMS = 16
 MAX_COUNTER = 10**12
-"""A term whose counter is above this is believed by nobody."""
+"""A term whose counter is above this is rejected."""
 MAX_JUMP = 1_000_000
-"""A term whose counter is this far above all that was heard is an error, not an election."""
+"""A term whose counter is this far above all that were received is an error, not an election."""
 MAX_ERROR = 400
 """Characters in the text of an error: it may quote what was sent."""
 
@@ -29,7 +29,7 @@ State: TypeAlias = Literal["queued", "running", "ended"]
 Seconds: TypeAlias = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 """A duration that is computed with: bounded, so that it is still finite in nanoseconds."""
 Elapsed: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
-"""Likewise; of something that lies behind."""
+"""Likewise, of the past."""
 ShortText: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=130)]
 """A name, or `kind/name`."""
 Figure: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
@@ -41,7 +41,7 @@ class Message(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Problem(Message, frozen=True):
-    """Why something was refused. `term` is the term that the answerer has promised, where that is why."""
+    """Why something was refused. `term` is the term that the replier has promised, where that is why."""
 
     code: str
     message: str
@@ -55,12 +55,12 @@ _ONCE_ONLY: set[Any] = set()
 
 
 class Malformed(ValueError):
-    """A payload that is not the message it should be; says what and where."""
+    """A payload that is not the message it should be; the text names what and where."""
 
 
 def absurd(term: Term, known: Term) -> bool:
-    """Whether `term` is too far above `known`, the newest heard, to be believed. Who has heard of none yet
-    (`NO_TERM`) believes any up to MAX_COUNTER: a fleet may be old."""
+    """Whether `term` is too far above `known`, the newest received, to be accepted. Before the first one
+    (`NO_TERM`) any up to MAX_COUNTER is accepted: a fleet may be old."""
     bound = MAX_COUNTER if known == NO_TERM else min(MAX_COUNTER, known.counter + MAX_JUMP)
     return term.counter > bound
 
@@ -87,7 +87,7 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
 
 def names_once(kind: Any) -> None:
     """From now on a name that stands twice in one object of a `kind` is refused. The decoder alone takes the
-    last, which in a request would drop a need without a word; elsewhere the 6 us are not worth it."""
+    last, which in a request would silently drop a need; elsewhere the 6 us are not worth it."""
     _ONCE_ONLY.add(kind)
 
 

@@ -1,4 +1,4 @@
-"""What behaviors tell about themselves, and a simulated building about what is in it, for people to see."""
+"""What behaviors publish about themselves, and a simulated building about its contents, for people to see."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ class Placed(Message, frozen=True):
 
 
 class BuildingPoses(Message, frozen=True):
-    """Who is where in a simulated building, as only the simulation can know."""
+    """Where robots and people are in a simulated building: the ground truth."""
 
     time: Seconds
     """Of the building, in seconds since it began."""
     speed: Seconds = 1.0
-    """How many of the building's seconds pass in one of ours."""
+    """How many of the building's seconds pass in a real one."""
     robots: Annotated[list[Placed], Meta(max_length=MAX_ROBOTS)] = []
     people: Annotated[list[Placed], Meta(max_length=MAX_PEOPLE)] = []

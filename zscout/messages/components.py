@@ -1,4 +1,4 @@
-"""Components: what a node is told to start, move and stop, and what the placer is asked for."""
+"""Components: operations of nodes, to start, move and stop them, and of the placer."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 
-from zscout.balancing.model import Metric, Policy
 from zscout.messages.base import MAX_COUNTER, Bytes, Elapsed, Figure, Message, ShortText
 from zscout.messages.hosts import MAX_LABELS, MAX_RANKED
 from zscout.messages.scheduling import OpenRequest
-from zscout.scheduling.model import NO_TERM, Term
+from zscout.types import NO_TERM, Metric, Policy, Term
 
 MAX_COMPONENT_NAME = 48
 """Characters: its client's name is this, a point and the incarnation."""
@@ -23,7 +22,7 @@ MAX_MOVE = 6_000_000
 MAX_OUTPUT = 65_536
 """Bytes of output that a node keeps of each component."""
 MAX_TAIL = 2_000
-"""Characters of it that are told with an end."""
+"""Characters of it that are reported with an end."""
 MAX_PLACED = 10_000
 """Components of one fleet."""
 
@@ -62,7 +61,7 @@ class StartComponent(Message, frozen=True, tag_field="op", tag="start"):
     """Starts a component. Answered with a ComponentView once it runs (or stands by), or has failed.
 
     `standby`: it gets ready to take over from an earlier incarnation, and does not run before it is
-    activated, or is handed an ARC. Asking again for the same incarnation tells how that one stands."""
+    activated, or is handed an ARC. Idempotent: for the same incarnation, answered with its present state."""
 
     component: ComponentName
     incarnation: Incarnation
@@ -71,8 +70,8 @@ class StartComponent(Message, frozen=True, tag_field="op", tag="start"):
 
 
 class StopComponent(Message, frozen=True, tag_field="op", tag="stop"):
-    """Ends a component: asked first, killed after `grace` seconds. Answered with a ComponentView once it has
-    ended. Without `incarnation`, whichever there is; what is not there is ended already."""
+    """Ends a component, which is killed after `grace` seconds. Answered with a ComponentView once it has
+    ended. Without `incarnation`, whichever there is; what is not there has ended already."""
 
     component: ComponentName
     incarnation: Incarnation | None = None
@@ -86,7 +85,7 @@ class CheckpointComponent(Message, frozen=True, tag_field="op", tag="checkpoint"
 
 
 class ListComponents(Message, frozen=True, tag_field="op", tag="list"):
-    """Which components are on a host? Ended ones are told of for a while. Answered with a ComponentList."""
+    """Lists the components of a host, ended ones for a while. Answered with a ComponentList."""
 
     component: ComponentName | None = None
     """Only this one."""
@@ -202,8 +201,8 @@ class Moved(Message, frozen=True):
 
 
 class PlaceComponent(Message, frozen=True, tag_field="op", tag="place"):
-    """Has a component run somewhere. Asking again for the same tells how it stands. Answered with a
-    Placement once it runs or can't, or when `wait` seconds are over."""
+    """Has a component run somewhere. Idempotent. Answered with a Placement once it runs or can't, or when
+    `wait` seconds are over."""
 
     component: ComponentName
     spec: ComponentSpec
@@ -244,13 +243,8 @@ class ListPlacements(Message, frozen=True, tag_field="op", tag="list"):
     component: ComponentName | None = None
 
 
-PlacerOperation: TypeAlias = (
-    PlaceComponent | EndComponent | MigrateComponent | DrainHost | UncordonHost | ListPlacements
-)
-
-PlacementState: TypeAlias = Literal[
-    "waiting", "starting", "running", "moving", "backing_off", "stopping", "ended", "given_up"
-]
+PlacementOperation: TypeAlias = PlaceComponent | EndComponent | MigrateComponent
+PlacerOperation: TypeAlias = PlacementOperation | DrainHost | UncordonHost | ListPlacements
 
 
 class Placement(Message, frozen=True):
@@ -259,7 +253,7 @@ class Placement(Message, frozen=True):
 
     component: str
     spec: ComponentSpec
-    state: PlacementState
+    state: Literal["waiting", "starting", "running", "moving", "backing_off", "stopping", "ended", "given_up"]
     incarnation: Annotated[int, msgspec.Meta(ge=0)] = 0
     """0: it was never started."""
     host: str | None = None

@@ -1,4 +1,4 @@
-"""What RCs say and are told."""
+"""Votes, commands and states of RCs, and the heads of frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from zscout.messages.base import Amounts, Message, Seconds
 from zscout.messages.scheduling import Holder
-from zscout.scheduling.model import NO_TERM, Grant, Term
+from zscout.types import NO_TERM, Grant, Term
 
 MAX_FIGURES = 32
 MAX_FRAME = 2_000_000
@@ -24,7 +24,7 @@ class ProposedHolder(Message, frozen=True):
 
 
 class Proposal(Message, frozen=True):
-    """Would the RC carry exactly these holders?"""
+    """Asks an RC to vote on whether it would carry exactly these holders."""
 
     proposal: int
     term: Term
@@ -38,9 +38,9 @@ class Ballot(Message, frozen=True):
 
 
 class Command(Message, frozen=True):
-    """Do `do` under `grant`, unless it has waited longer than `ttl` seconds by then.
+    """An action `do` under `grant`, to be refused once it has waited longer than `ttl` seconds.
 
-    `do` names what to do in `name`; the rest is the driver's. Every RC knows `confirm`. Without a grant only
+    `do` has the action in `name`; the rest is the driver's. Every RC knows `confirm`. Without a grant only
     what stops a robot is done, by a radio, for the node of that robot's RC.
     """
 
@@ -57,7 +57,7 @@ class Done(Message, frozen=True):
 
 
 class RcAsk(Message, frozen=True):
-    """Asks an RC for its state. With `promise`, an RC that answers obeys no lower term again."""
+    """Queries the state of an RC. With `promise`, an RC that answers obeys no lower term again."""
 
     promise: Term | None = None
 
@@ -71,7 +71,7 @@ class EndedHold(Message, frozen=True):
 
 
 class RcState(Message, frozen=True):
-    """An RC as it is. `term`, `seq`: the newest publication heard, or term promised."""
+    """The state of an RC. `term`, `seq`: the newest publication received, or term promised."""
 
     rc: str
     host: str
@@ -89,7 +89,7 @@ class RcState(Message, frozen=True):
     """Whether it sees a leading RCM."""
     capacity: Amounts = {}
     figures: Figures = {}
-    """Rates, drops, latency and the like of the device, by name; they tell people, and decide nothing."""
+    """Rates, drops, latency and the like of the device, by name; for people, they decide nothing."""
 
 
 class FrameHead(Message, frozen=True):

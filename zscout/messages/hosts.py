@@ -6,8 +6,8 @@ from typing import Annotated
 
 import msgspec
 
-from zscout.balancing.model import Metric, Policy
 from zscout.messages.base import MAX_COUNTER, Bytes, Figure, Message, ShortText
+from zscout.types import Metric, Policy
 
 MAX_RANKED = 256
 """Hosts in one answer of the balancer."""

@@ -1,4 +1,4 @@
-"""What RCM and clients tell each other."""
+"""Operations of clients, and what the RCM answers and publishes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, TypeAlias
 import msgspec
 
 from zscout.messages.base import Amounts, Elapsed, Message, Seconds, State, names_once
-from zscout.scheduling.model import Grant, Place, Term
+from zscout.types import Grant, Place, Term
 
 MAX_OTHERS = 255
 """ARCs that one hand-over takes along, beside the one that it names first."""
@@ -30,6 +30,8 @@ class Ask(Message, frozen=True, tag_field="op", tag="request"):
     keep: bool = False
     place: Place | None = None
     waited: Elapsed = 0.0
+    estimate: bool = False
+    """Whether notices are to carry `starts_in` while it is queued."""
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -49,8 +51,8 @@ class Release(Message, frozen=True, tag_field="op", tag="release"):
 class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
     """The sender's ARC goes on in client `to`: under a new grant if it runs, at its place if it waits.
 
-    `others` go along in the same step; what is not open at the sender among them is passed over. Asking again
-    once it is done tells how the ARC `id` stands at `to`."""
+    `others` are handed over in the same step; those that are not open at the sender are ignored. Idempotent:
+    once it is done, answered with the present state of ARC `id` at `to`."""
 
     id: str
     to: str
@@ -58,7 +60,7 @@ class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
 
 
 class Foresee(Message, frozen=True, tag_field="op", tag="foresee"):
-    """Asks what would come of a request, without making it. Answered with a Foresight."""
+    """Asks for the forecast of a request without making it. Answered with a Foresight."""
 
     id: str
     arc: str
@@ -69,8 +71,8 @@ class Foresee(Message, frozen=True, tag_field="op", tag="foresee"):
 
 
 class Foresight(Message, frozen=True):
-    """What would come of a request, if nothing else came. `starts_in` is absent where it would not start as
-    things stand, or not within what can be foretold; `reason` then says what it would wait for."""
+    """The forecast of a request, if no other came. `starts_in` is absent where it would not start as things
+    stand, or not within the horizon of the forecast; `reason` then names what it would wait for."""
 
     id: str
     arc: str
@@ -84,8 +86,32 @@ Operation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
 names_once(Operation)
 
 
+class ReasonParty(Message, frozen=True):
+    """An ARC that is in another's way, or was preferred to it."""
+
+    id: str
+    arc: str
+    client: str
+    priority: int
+
+
+class ReasonInfo(Message, frozen=True):
+    """Why an ARC waits, or why a hold or a wait ended: what `reason` says, as data.
+
+    `count` counts `rcs`, of which the first three are named, or is a quota. `detail` is a host, a client or
+    an RC's own words, as `code` has it (`docs/protocol.md`)."""
+
+    code: str
+    rcs: list[str] = []
+    by: list[ReasonParty] = []
+    detail: str = ""
+    count: int = 0
+    pattern: str | None = None
+    """The pattern of its needs that is not met; the rest is said of one of the RCs that would meet it."""
+
+
 class Notice(Message, frozen=True):
-    """How one request stands: the answer to an operation, and what the client is told at each change.
+    """The state of one request: the answer to an operation, and published to its client at each change.
 
     Of two notices about one request the one with the greater `(term, step)` is the newer.
     """
@@ -99,7 +125,7 @@ class Notice(Message, frozen=True):
     priority: int = 0
     reason: str = ""
     outcome: str | None = None
-    """How the last hold, or the wait, came to its end."""
+    """How the last hold, or the wait, ended."""
     by: str | None = None
     """The ARC that it was taken for."""
     place: Place | None = None
@@ -112,13 +138,18 @@ class Notice(Message, frozen=True):
     """While it runs: the RC that meets each of its patterns."""
     remaining: Seconds | None = None
     """Seconds until its minimum runtime is over."""
+    starts_in: Seconds | None = None
+    """While it is queued, where the client asked for estimates: seconds until it will start if nothing else
+    comes; None where it will not as things stand, or not within what can be forecast."""
+    why: ReasonInfo | None = None
+    """What `reason` says, as data."""
 
 
 # From the RCM to all
 
 
 class Holder(Message, frozen=True):
-    """One holder of one RC, told so fully that a new RCM can carry its ARC on from the RCs' word alone.
+    """One holder of one RC, so complete that a new RCM can recover its ARC from the RCs' states alone.
 
     `rcs` names the whole gang, `bound` the RC that meets each of its patterns. `remaining` seconds of its
     minimum runtime are left, negative where it is over; with `keep` the hold does not end then."""
@@ -148,12 +179,14 @@ class Revocation(Message, frozen=True):
     outcome: str
     reason: str
     by: str | None = None
+    why: ReasonInfo | None = None
+    """What `reason` says, as data."""
 
 
 class Grants(Message, frozen=True):
     """A publication of the leading RCM. For each RC touched, all its holders from now on.
 
-    `prev` is the seq of the publication before: a receiver that heard another one has missed something.
+    `prev` is the seq of the publication before: a receiver whose last one was another has missed some.
     Without `rcs` and `revoked` it is a heartbeat; one comes at least every `every` seconds.
     """
 
@@ -169,12 +202,12 @@ class Grants(Message, frozen=True):
 
 
 class StateAsk(Message, frozen=True):
-    """Asks how things stand. `arc` (a name or an id) asks for the story of one ARC besides."""
+    """Queries the state of the RCM. `arc` (a name or an id) asks for the history of one ARC besides."""
 
     arc: str | None = None
     holds_only: bool = False
     forecast: bool = False
-    """Whether to foretell when who waits will start."""
+    """Whether to estimate when queued ARCs will start."""
 
 
 class HoldView(Message, frozen=True):
@@ -210,6 +243,8 @@ class WaitView(Message, frozen=True):
     preemptions: int = 0
     starts_in: Seconds | None = None
     """An estimate, where one was asked for: as if nothing else were to come."""
+    why: ReasonInfo | None = None
+    """What `reason` says, as data."""
 
 
 class RcView(Message, frozen=True):
@@ -228,7 +263,7 @@ class StoryLine(Message, frozen=True):
 
 
 class RcmState(Message, frozen=True):
-    """What the RCM knows. `seq` is the last that it published; `more` counts queued ARCs left out."""
+    """The state of the RCM. `seq` is the last that it published; `more` counts queued ARCs left out."""
 
     term: Term
     seq: int

@@ -1,7 +1,10 @@
 """The core of the RCM: events in, effects out, time given.
 
-Every decision of the RCM is made here and nowhere else; there is no clock, thread, socket or log inside.
-The RCM service, `zscout replay`, the study and the fault simulator drive this one class:
+Every decision of the RCM is made in this room, and this is its door; there is no clock, thread, socket or
+log inside. This module applies events and carries out what is decided; who starts, and who is preempted for
+it, is decided by the strategy's pass (`priority.py` has its steps), ARC by ARC (`admission_check.py`), by the
+rule of `Arc.preemptible_by`; what RCs voted stands in `votes.py`, who holds what in `state.py`. The RCM
+service, `zscout replay`, the study and the forecast drive this one class:
 
     effects = core.handle(now, Asked(request), ...)
 
@@ -14,311 +17,362 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.keyexpr import is_pattern
-from zscout.scheduling import priority
+from zscout.scheduling import events as on
+from zscout.scheduling.admission_check import AdmissionCheck
 from zscout.scheduling.effects import (
     Dropped,
     Effect,
     Granted,
+    HoldEnded,
     Outcome,
     Propose,
     Queued,
-    Revoked,
     WakeAt,
 )
-from zscout.scheduling.ends import Ends
-from zscout.scheduling.events import (
-    Asked,
-    Cancelled,
-    ClientLost,
-    Event,
-    HandedOver,
-    LeadTaken,
-    RcJoined,
-    RcLost,
-    RcReported,
-    Released,
-    Standing,
-    Tick,
-    Vote,
-    VoteOverdue,
-    Waiting,
-)
-from zscout.scheduling.floor import Floor, check
-from zscout.scheduling.model import (
-    NO_TERM,
-    QUANTUM,
-    Arc,
-    ArcId,
-    Grant,
-    Hold,
-    Ns,
-    Place,
-    Rc,
-    Request,
-    Term,
-)
-from zscout.scheduling.policy import DEFAULT, Policy
-from zscout.scheduling.priority import Strategy
-from zscout.scheduling.votes import HolderSet, Votes
+from zscout.scheduling.expiry import ExpiryQueue
+from zscout.scheduling.model import QUANTUM, Arc, ArcRequest, ArcState, Hold, Rc
+from zscout.scheduling.priority import Priority
+from zscout.scheduling.reason import Reason, ReasonCode
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.status import ArcStatus, RcStatus, Status
+from zscout.scheduling.strategy import Strategy
+from zscout.scheduling.votes import HolderSet
+from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
 
 
 class Core:
     """All scheduling state of one fleet, and the rules by which it changes."""
 
-    def __init__(self, strategy: Strategy = priority.run_pass, policy: Policy = DEFAULT) -> None:
-        self.strategy, self.policy = strategy, policy
-        self.floor = Floor(policy)
-        self.votes = Votes()
+    def __init__(self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT) -> None:
+        """The strategy is `priority` unless another is given."""
+        self.strategy, self.policy = strategy or Priority(), policy
+        self._state = SchedulerState(policy)
+        self._votes = self._state.votes
+        self._expiry = ExpiryQueue(self._state.running)
         self.term: Term = NO_TERM
         self.seq = 0
+        self.batches = 0
+        """How many batches of events were handled."""
         self._arrivals = 0
-        self._now: Ns = 0
-        self._cause = 0
         self._effects: list[Effect] = []
-        self._ends = Ends(self.floor.running)
         self._wake: Ns | None = None
-        self._again = False
+        self._run_again = False
         """Whether the strategy asked for another pass at once."""
 
     @property
-    def batches(self) -> int:
-        """How many batches of events were handled; effects name theirs in `cause`."""
-        return self._cause
+    def _now(self) -> Ns:
+        return self._state.now
 
-    def handle(self, now: Ns, *events: Event) -> list[Effect]:
-        """Applies one instant's events and runs a pass. `now` must not go backwards."""
+    def handle(self, now: Ns, *events: on.Event) -> list[Effect]:
+        """Applies one instant's events and runs a pass. Raises ValueError where `now` goes backwards.
+
+        1. End the holds whose minimum runtime is over.
+        2. Apply the events, in the order given.
+        3. Run a pass of the strategy, if anybody is queued (its steps: `priority.py`, `adaptive.py`).
+        4. Say when to wake."""
         if now < self._now:
             raise ValueError(f"time went backwards: {now} after {self._now}")
-        self._now = now
-        self._cause += 1
+        self._state.now = now
+        self.batches += 1
         self._effects = []
-        self._again = False
+        self._run_again = False
         self._expire()
         for event in events:
             self._apply(event)
-        if self.floor.queued:
-            self.strategy(self.floor, self.votes, now, self)
+        if self._state.queued:
+            self.strategy.run_pass(self._state, self)
         self._set_wake()
         return self._effects
 
-    # Events
+    # How things stand
 
-    def _apply(self, event: Event) -> None:
-        match event:
-            case Asked(request, place, since):
-                self._ask(request, place, since)
-            case Cancelled(arc, by):
-                self._give_up(arc, Outcome.CANCELLED, f"cancelled by {by}")
-            case Released(arc, by):
-                self._give_up(arc, Outcome.RELEASED, f"released by {by}")
-            case Vote(proposal, accept, reason):
-                self.votes.answer(proposal, accept=accept, reason=reason)
-            case VoteOverdue(proposal):
-                self.votes.overdue(proposal, self._now)
-            case RcJoined(rc, sharable):
-                if self.floor.rc(rc).present:
-                    self._lose(rc, "it started anew")
-                self.floor.join(rc, sharable=sharable)
-            case RcReported(rc, ended, rules_changed):
-                for arc in ended:
-                    if arc in self.floor.rc(rc).holders:
-                        self._end(self.floor.running[arc], Outcome.LOST, f"{rc} ended the hold")
-                if rules_changed:
-                    self.votes.forget_rc(rc)
-            case RcLost(rc, reason):
-                self._lose(rc, reason)
-            case ClientLost(client, reason):
-                for lost in self.arcs_of(client):
-                    self._give_up(lost.id, Outcome.CLIENT_LOST, reason)
-            case HandedOver(arc, to, renamed):
-                self._hand_over(arc, to, renamed)
-            case LeadTaken(term, standing, waiting):
-                self._lead(term, standing, waiting)
-            case Tick():
-                pass
+    def status(self, limit: int | None = None) -> Status:
+        """The whole fleet as of the last batch, with the best-ranked `limit` of the queue (all: None)."""
+        state = self._state
+        ranks = state.index.ranks[:limit]
+        return Status(
+            running=tuple(self._arc_status(arc) for arc in state.running.values()),
+            queued=tuple(self._arc_status(state.queued[rank[-1]]) for rank in ranks),
+            waiting=self.waiting,
+            rcs=tuple(
+                RcStatus(name, rc.present, rc.sharable, tuple(rc.holders))
+                for name, rc in sorted(state.rcs.items())
+            ),
+        )
 
-    def arcs_of(self, client: str) -> list[Arc]:
+    def arc(self, arc_id: ArcId) -> ArcStatus | None:
+        """One ARC as of the last batch; None if it neither waits nor runs."""
+        arc = self._state.arc(arc_id)
+        return None if arc is None else self._arc_status(arc)
+
+    def is_queued(self, arc_id: ArcId) -> bool:
+        return arc_id in self._state.queued
+
+    @property
+    def waiting(self) -> int:
+        """How many ARCs are queued."""
+        return len(self._state.queued)
+
+    def holders(self, rc: RcName) -> list[ArcStatus]:
+        """Who holds an RC."""
+        return [self._arc_status(arc) for arc in self._state.rc(rc).holders.values()]
+
+    def arcs_of(self, client: ClientId) -> list[ArcId]:
         """The ARCs of one client, those that wait first: so none of them profits from the others' end."""
-        return self.floor.arcs_of(client)
+        return [arc.id for arc in self._state.arcs_of(client)]
 
-    def reason(self, arc: Arc) -> str:
-        """Why a queued ARC waits, with all that is in its way as of the last batch; `arc.reason` is what was
-        told last. For who asks: nobody is told each time that one holder follows another far ahead of him."""
-        if arc.watched is None:
-            return arc.reason
-        visit = priority.Visit(self.floor, self.votes, self._now, arc)
-        return visit.obstacle(0) or visit.refusal() or arc.reason
+    def at_place(self, place: Place) -> list[ArcId]:
+        """The ARCs of this place: one, or more where clients claim the same after a takeover."""
+        state = self._state
+        return [arc.id for arc in (*state.running.values(), *state.queued.values()) if arc.place == place]
 
     def given(self, place: Place) -> bool:
         """Whether `place` may have been given; of earlier terms the core does not know."""
         return place.term != self.term or place.arrival <= self._arrivals
 
-    def _ask(self, request: Request, place: Place | None, since: Ns | None) -> None:
-        if self.floor.arc(request.arc) is not None:
+    def as_events(self, term: Term) -> tuple[list[on.Event], on.LeadTaken]:
+        """The events by which another core comes to stand as this one does, in a term of its own."""
+        state = self._state
+        joined: list[on.Event] = [
+            on.RcJoined(rc.name, rc.sharable) for rc in state.rcs.values() if rc.present
+        ]
+        standing = tuple(
+            on.RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
+            for arc in state.running.values()
+            if arc.hold is not None
+        )
+        waiting = tuple(
+            on.RecoveredRequest(arc.request, arc.place, arc.since) for arc in state.queued.values()
+        )
+        return joined, on.LeadTaken(term, standing, waiting)
+
+    def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
+        """Whether an RC would accept these holders, by the votes that it has given; True if none tells."""
+        answer = self._votes.known(rc, holders)
+        return answer is None or answer.accept
+
+    def _arc_status(self, arc: Arc) -> ArcStatus:
+        reason = arc.reason
+        if arc.state is ArcState.WATCHING:
+            check = AdmissionCheck(self._state, arc)
+            obstacle = check.obstacle(0)
+            reason = obstacle.reason if obstacle is not None else check.refusal() or reason
+        return ArcStatus(
+            arc.request,
+            arc.place,
+            arc.hold,
+            arc.needs,
+            arc.bound,
+            arc.since,
+            arc.preemptions,
+            self._state.index.ahead(arc) if arc.hold is None else None,
+            reason,
+            arc.reason,
+        )
+
+    # Events
+
+    def _apply(self, event: on.Event) -> None:
+        match event:
+            case on.Requested(request, place, since):
+                self._ask(request, place, since)
+            case on.Cancelled(arc, by):
+                self._end_request(arc, Outcome.CANCELLED, Reason(ReasonCode.CANCELLED, detail=by))
+            case on.Released(arc, by):
+                self._end_request(arc, Outcome.RELEASED, Reason(ReasonCode.RELEASED, detail=by))
+            case on.Vote(proposal, accept, reason):
+                self._votes.answer(proposal, accept=accept, reason=reason)
+            case on.VoteOverdue(proposal):
+                self._votes.overdue(proposal, self._now)
+            case on.RcJoined(rc, sharable):
+                if self._state.rc(rc).present:
+                    self._lose_rc(rc, "it started anew")
+                self._state.join(rc, sharable=sharable)
+            case on.RcReported(rc, ended, rules_changed):
+                for arc in ended:
+                    if arc in self._state.rc(rc).holders:
+                        self._end_hold(
+                            self._state.running[arc], Outcome.LOST, Reason(ReasonCode.RC_ENDED, (rc,))
+                        )
+                if rules_changed:
+                    self._votes.forget_rc(rc)
+            case on.RcLost(rc, reason):
+                self._lose_rc(rc, reason)
+            case on.ClientLost(client, reason):
+                for lost in self.arcs_of(client):
+                    why = Reason(ReasonCode.CLIENT_LOST, detail=reason)
+                    self._end_request(lost, Outcome.CLIENT_LOST, why)
+            case on.HandedOver(arc, to, renamed):
+                self._hand_over(arc, to, renamed)
+            case on.LeadTaken(term, standing, waiting):
+                self._take_lead(term, standing, waiting)
+            case on.Tick():
+                pass
+
+    def _ask(self, request: ArcRequest, place: Place | None, since: Ns | None) -> None:
+        if self._state.arc(request.arc) is not None:
             return
         since = self._now if since is None else min(since, self._now)
-        self.floor.enqueue(self._new_arc(request, place), since)
+        self._state.enqueue(self._new_arc(request, place), since)
 
-    def _new_arc(self, request: Request, place: Place | None) -> Arc:
+    def _new_arc(self, request: ArcRequest, place: Place | None) -> Arc:
         if place is None:
             self._arrivals += 1
             place = Place(self.term, self._arrivals)
         elif place.term == self.term:
             self._arrivals = max(self._arrivals, place.arrival)
-        band = self.policy.band(request.priority)
-        slots = tuple(filter(is_pattern, request.needs))
-        named = self.floor.mask([need for need in request.needs if need not in slots])
-        arc = Arc(request, place, named, band=band, slots=slots, named=named)
-        if slots:
-            self.floor.unbind(arc)
+        patterns = tuple(filter(is_pattern, request.needs))
+        named = self._state.mask([need for need in request.needs if need not in patterns])
+        arc = Arc(request, place, named, patterns, named)
+        if patterns:
+            self._state.unbind(arc)
         return arc
 
-    def _give_up(self, arc_id: ArcId, outcome: Outcome, reason: str) -> None:
-        arc = self.floor.arc(arc_id)
+    def _end_request(self, arc_id: ArcId, outcome: Outcome, reason: Reason) -> None:
+        arc = self._state.arc(arc_id)
         if arc is None:
             return
         if arc.hold is not None:
-            if outcome is Outcome.RELEASED and arc.overstays(self._now):
+            if outcome is Outcome.RELEASED and arc.past_min_runtime(self._now):
                 outcome = Outcome.COMPLETED
-            self._end(arc, outcome, reason, requeue=False)
+            self._end_hold(arc, outcome, reason, requeue=False)
             return
-        self.floor.drop(arc)
+        self._state.dequeue(arc)
         self._forget(arc)
-        self._effects.append(Dropped(self._cause, arc.id, arc.request.client, outcome, reason))
+        self._effects.append(Dropped(arc.id, arc.request.client, outcome, reason))
 
-    def _lose(self, name: str, reason: str) -> None:
+    def _lose_rc(self, name: str, reason: str) -> None:
         """An RC is gone: each gang it was part of ends as a whole and is queued with its place."""
-        rc = self.floor.rc(name)
+        rc = self._state.rc(name)
         for arc in list(rc.holders.values()):
-            self._end(arc, Outcome.LOST, f"{name} was lost: {reason}")
-        self.floor.leave(name)
-        self.votes.forget_rc(name)
+            self._end_hold(arc, Outcome.LOST, Reason(ReasonCode.RC_LOST, (name,), detail=reason))
+        self._state.leave(name)
+        self._votes.forget_rc(name)
 
     def _hand_over(self, arc_id: ArcId, to: str, renamed: ArcId) -> None:
-        arc, twin = self.floor.arc(arc_id), self.floor.arc(renamed)
+        arc, twin = self._state.arc(arc_id), self._state.arc(renamed)
         if arc is None or arc is twin:
             return
-        reason = f"handed over to {to}"
+        reason = Reason(ReasonCode.HANDED_OVER, detail=to)
         if twin is not None:
-            # Where a change of RCM hid the outcome, both clients may have told of the one ARC.
+            # Where a change of RCM hid the outcome, both clients may have reported the one ARC.
             if twin.place != arc.place:
                 return
             if twin.hold is not None or arc.hold is None:
-                self._give_up(arc_id, Outcome.HANDED_OVER, reason)
+                self._end_request(arc_id, Outcome.HANDED_OVER, reason)
                 return
-            self.floor.drop(twin)
+            self._state.dequeue(twin)
             self._forget(twin)
         if arc.hold is None:
-            self._effects.append(
-                Dropped(self._cause, arc.id, arc.request.client, Outcome.HANDED_OVER, reason)
-            )
+            self._effects.append(Dropped(arc.id, arc.request.client, Outcome.HANDED_OVER, reason))
         else:
             old = self._revocation(arc, arc.hold, Outcome.HANDED_OVER, reason, requeued=False)
             self._effects.append(old)
-        for rc in self.floor.of(self.floor.everywhere(arc) & self.floor.sharable):
-            self.votes.rename_arc(rc.name, arc.id, renamed)
-        self.floor.hand_over(arc, to, renamed)
+        for rc in self._state.rcs_in(self._state.possible_mask(arc) & self._state.sharable):
+            self._votes.rename_arc(rc.name, arc.id, renamed)
+        self._state.hand_over(arc, to, renamed)
         if arc.hold is not None:
             arc.hold = replace(arc.hold, grant=self._next_grant())
             if arc.hold.end > self._now:
-                self._ends.note(arc, arc.hold)
+                self._expiry.note(arc, arc.hold)
             self._effects.append(self._granted(arc, arc.hold))
         elif arc.reason:
-            self._effects.append(Queued(self._cause, arc.id, to, arc.reason))
+            self._effects.append(Queued(arc.id, to, arc.reason))
 
-    def _lead(self, term: Term, standing: tuple[Standing, ...], waiting: tuple[Waiting, ...]) -> None:
+    def _take_lead(
+        self, term: Term, standing: tuple[on.RecoveredHold, ...], waiting: tuple[on.RecoveredRequest, ...]
+    ) -> None:
         if term <= self.term:
             raise ValueError(f"the new term {term} is not above {self.term}")
         self.term, self.seq, self._arrivals = term, 0, 0
         # The newest grant is the truth where two claim one exclusive RC.
         for held in sorted(standing, key=lambda held: held.grant, reverse=True):
-            if self.floor.arc(held.request.arc) is not None:
+            if self._state.arc(held.request.arc) is not None:
                 continue
             arc = self._new_arc(held.request, held.place)
-            if arc.slots:
-                self.floor.bind(arc, held.bound)
-            hold = Hold(held.grant, held.start, held.end, self.policy.shield(owed=False))
-            absent = [rc.name for rc in self.floor.of(arc.mask & ~self.floor.present)]
-            taken = [rc.name for rc in self.floor.of(arc.mask & self.floor.busy)]
+            if arc.patterns:
+                self._state.bind(arc, held.bound)
+            hold = Hold(held.grant, held.start, held.end, self.policy.protected_below(starving=False))
+            absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
+            taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
             over = held.end <= self._now
             if not over or not (absent or taken):
-                self.floor.enqueue(arc, self._now)
+                self._state.enqueue(arc, self._now)
             if absent or taken:
-                reason = f"{absent[0]} was lost" if absent else f"{taken[0]} has a newer holder"
+                code = ReasonCode.RC_LOST if absent else ReasonCode.SUPERSEDED
+                reason = Reason(code, (*absent, *taken)[:1])
                 outcome = Outcome.COMPLETED if over and not arc.request.keep else Outcome.LOST
                 self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=not over))
             else:
-                self._take(arc, hold)
+                self._start_hold(arc, hold)
         self._expire()
         for one in waiting:
             self._ask(*one)
 
     def _expire(self) -> None:
-        for arc in self._ends.over(self._now):
+        for arc in self._expiry.over(self._now):
             if arc.request.keep:
-                self.floor.overstayed(arc)
+                self._state.min_runtime_over(arc)
             else:
-                self._end(arc, Outcome.COMPLETED, "its minimum runtime is over", requeue=False)
+                self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.EXPIRED), requeue=False)
 
-    # What a strategy may do (priority.Actions)
+    # What a strategy may do (strategy.Actions)
 
     def start(self, arc: Arc) -> None:
         grant = self._next_grant()
-        shield = self.policy.shield(owed=arc.owed)
-        hold = Hold(grant, self._now, self._now + arc.request.min_runtime, shield)
-        self._take(arc, hold)
+        protected_below = self.policy.protected_below(starving=self._state.index.is_starving(arc))
+        hold = Hold(grant, self._now, self._now + arc.request.min_runtime, protected_below)
+        self._start_hold(arc, hold)
         self._effects.append(self._granted(arc, hold))
 
-    def displace(self, arc: Arc, by: Arc) -> bool:
-        done = arc.overstays(self._now)
+    def preempt(self, arc: Arc, by: Arc) -> bool:
+        done = arc.past_min_runtime(self._now)
         outcome = Outcome.COMPLETED if done else Outcome.PREEMPTED
-        who = f"{by.name}, priority {by.request.priority}"
-        reason = f"its minimum runtime is over and {who}, needs its RCs" if done else f"preempted by {who}"
-        self._end(arc, outcome, reason, by=by.id)
-        return arc.id in self.floor.queued
+        reason = Reason(ReasonCode.DISPLACED if done else ReasonCode.PREEMPTED, by=(by.party,))
+        self._end_hold(arc, outcome, reason)
+        return arc.id in self._state.queued
 
-    def wait(self, arc: Arc, reason: str, *, settled: bool = True) -> None:
+    def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None:
         # A reason given before stands while votes are out: it would change back and forth otherwise.
         if reason == arc.reason or (not settled and arc.reason):
             return
         arc.reason = reason
-        self._effects.append(Queued(self._cause, arc.id, arc.request.client, reason, settled))
+        self._effects.append(Queued(arc.id, arc.request.client, reason, settled))
 
     def propose(self, rc: Rc, holders: HolderSet) -> None:
-        number = self.votes.open_question(rc.name, holders, self._now)
+        number = self._votes.open_question(rc.name, holders, self._now)
         if number is None:
             return
-        arcs = (self.floor.arc(holder) for holder in sorted(holders))
-        params = {arc.id: self.floor.params(arc, rc) for arc in arcs if arc is not None}
-        self._effects.append(Propose(self._cause, number, rc.name, params))
+        arcs = (self._state.arc(holder) for holder in sorted(holders))
+        params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
+        self._effects.append(Propose(number, rc.name, params))
 
-    def again(self) -> None:
-        self._again = True
+    def run_again(self) -> None:
+        self._run_again = True
 
     # Holds
 
-    def _take(self, arc: Arc, hold: Hold) -> None:
-        self.floor.start(arc, hold, self._now)
-        self._ends.note(arc, hold)
+    def _start_hold(self, arc: Arc, hold: Hold) -> None:
+        self._state.start(arc, hold)
+        self._expiry.note(arc, hold)
 
-    def _end(
-        self, arc: Arc, outcome: Outcome, reason: str, *, by: ArcId | None = None, requeue: bool = True
-    ) -> None:
-        """Ends a hold. What has had its minimum runtime is owed nothing and is not queued again."""
-        requeue = requeue and not arc.overstays(self._now)
-        hold = self.floor.stop(arc)
-        self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue, by=by))
+    def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
+        """Ends a hold. What has had its minimum runtime is not queued again."""
+        requeue = requeue and not arc.past_min_runtime(self._now)
+        hold = self._state.stop(arc)
+        self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))
         if requeue:
             arc.preemptions += outcome is Outcome.PREEMPTED
-            self.floor.enqueue(arc, self._now)
+            self._state.enqueue(arc, self._now)
         else:
             self._forget(arc)
 
     def _forget(self, arc: Arc) -> None:
-        self.floor.forget(arc)
-        for rc in self.floor.of(self.floor.everywhere(arc) & self.floor.sharable):
-            self.votes.forget_arc(rc.name, arc.id)
+        self._state.forget(arc)
+        for rc in self._state.rcs_in(self._state.possible_mask(arc) & self._state.sharable):
+            self._votes.forget_arc(rc.name, arc.id)
 
     def number(self) -> int:
         """The next number of this term. Grants take theirs here, and so does all else that is published."""
@@ -331,37 +385,22 @@ class Core:
     def _granted(self, arc: Arc, hold: Hold) -> Granted:
         end = None if arc.request.keep else hold.end
         rcs = tuple(sorted(arc.needs))
-        return Granted(self._cause, arc.id, arc.request.client, hold.grant, rcs, hold.start, end)
+        return Granted(arc.id, arc.request.client, hold.grant, rcs, hold.start, end)
 
     def _revocation(
-        self, arc: Arc, hold: Hold, outcome: Outcome, reason: str, *, requeued: bool, by: ArcId | None = None
-    ) -> Revoked:
+        self, arc: Arc, hold: Hold, outcome: Outcome, reason: Reason, *, requeued: bool
+    ) -> HoldEnded:
         self.number()
         rcs = tuple(sorted(arc.needs))
-        client = arc.request.client
-        return Revoked(self._cause, arc.id, client, hold.grant, rcs, outcome, reason, requeued, by)
+        by = reason.by[0].arc if reason.by else None
+        return HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
 
     def _set_wake(self) -> None:
-        at = self._ends.next()
-        if self.floor.queued:
+        at = self._expiry.next()
+        if self._state.queued:
             at = min(self._now + QUANTUM, at) if at is not None else self._now + QUANTUM
-        if self._again:
+        if self._run_again:
             at = self._now
-        if at != self._wake or self._again:
+        if at != self._wake or self._run_again:
             self._wake = at
-            self._effects.append(WakeAt(self._cause, at))
-
-    def validate(self) -> None:
-        """Checks all invariants; for tests and simulators, after every event."""
-        self.floor.validate()
-        for arc in self.floor.running.values():
-            check(
-                (arc.hold is not None and arc.hold.end - self._now >= 0) or arc.request.keep,
-                f"{arc.id} overran",
-            )
-            check(not arc.reason, f"{arc.id} runs and has a reason to wait")
-        for arc in self.floor.queued.values():
-            check(bool(arc.reason), f"{arc.id} waits without a reason")
-        for _, rc, holders in self.votes.out():
-            check(self.floor.rc(rc).present, f"a proposal is out at {rc}, which is absent")
-            check(all(self.floor.arc(arc) for arc in holders), f"a proposal at {rc} names an ARC that ended")
+            self._effects.append(WakeAt(at))

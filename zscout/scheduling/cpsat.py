@@ -11,7 +11,7 @@ import functools
 import importlib.util
 from typing import TYPE_CHECKING, Any, Final
 
-from zscout.scheduling.packing import Problem, numbers
+from zscout.scheduling.packing import PackingProblem, numbers
 
 if TYPE_CHECKING:
     from ortools.sat.python import cp_model
@@ -30,7 +30,7 @@ def available() -> bool:
     return importlib.util.find_spec("ortools") is not None
 
 
-def improve(problem: Problem, start: int, budget: float = BUDGET) -> int:
+def improve(problem: PackingProblem, start: int, budget: float = BUDGET) -> int:
     """A lawful set that is at least as good as `start`, which is lawful; the best one, if time allows."""
     found = _Solver(problem, start, budget).solve()
     best = max((problem.complete(found), found), key=problem.key)
@@ -39,7 +39,7 @@ def improve(problem: Problem, start: int, budget: float = BUDGET) -> int:
 
 
 class _Solver:
-    def __init__(self, problem: Problem, start: int, budget: float) -> None:
+    def __init__(self, problem: PackingProblem, start: int, budget: float) -> None:
         from ortools.sat.python import cp_model  # large: only who needs it loads it
 
         self.problem, self.found, self.left = problem, start, budget
@@ -48,7 +48,7 @@ class _Solver:
         self.takes = [self.model.new_bool_var(f"x{number}") for number in range(len(problem.items))]
         self._exclusive()
         self._vetoes()
-        self._standing()
+        self._keep_running()
 
     def solve(self) -> int:
         """The best set found, stage by stage: pairs by level, preemptions, ranks."""
@@ -57,11 +57,11 @@ class _Solver:
             pairs = sum(
                 item.width * take
                 for item, take in zip(problem.items, takes, strict=True)
-                if item.level == level and not item.spent
+                if item.level == level and not item.past_min_runtime
             )
             if not isinstance(pairs, int) and not self._stage(pairs):
                 return self.found
-        kept = sum(take for item, take in zip(problem.items, takes, strict=True) if item.owed)
+        kept = sum(take for item, take in zip(problem.items, takes, strict=True) if item.in_min_runtime)
         if not isinstance(kept, int) and not self._stage(kept):
             return self.found
         for begin in range(0, len(takes), CHUNK):
@@ -103,22 +103,22 @@ class _Solver:
                 self.model.add_at_most_one(cover)
 
     def _vetoes(self) -> None:
-        for bar in {bar for bars in self.problem.barred for bar in bars}:
-            self.model.add_bool_or(~self.takes[number] for number in numbers(bar))
+        for nogood in {nogood for nogoods in self.problem.nogoods for nogood in nogoods}:
+            self.model.add_bool_or(~self.takes[number] for number in numbers(nogood))
 
-    def _standing(self) -> None:
+    def _keep_running(self) -> None:
         """Who runs stays, unless one that goes before is in the way, or all others of a veto are."""
         problem = self.problem
-        for running in problem.standing:
+        for running in problem.running:
             mask = problem.masks[running]
             excuses = [
                 take
                 for other, take in enumerate(self.takes)
-                if other != running and problem.masks[other] & mask and problem.goes_before(other, running)
+                if other != running and problem.masks[other] & mask and problem.outranks(other, running)
             ]
-            for bar in problem.barred[running]:
-                others = [other for other in numbers(bar) if other != running]
-                if all(problem.goes_before(other, running) for other in others):
+            for nogood in problem.nogoods[running]:
+                others = [other for other in numbers(nogood) if other != running]
+                if all(problem.outranks(other, running) for other in others):
                     vetoed = self.model.new_bool_var("")
                     self.model.add_bool_and(self.takes[other] for other in others).only_enforce_if(vetoed)
                     excuses.append(vetoed)

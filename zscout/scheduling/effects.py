@@ -1,8 +1,4 @@
-"""What the RCM must do: the outputs of the core, in the order in which they must be done.
-
-Every effect names in `cause` the number of the event batch that led to it, so that the story of an ARC is
-a filter on the log.
-"""
+"""What the RCM must do: the outputs of the core, in the order in which they must be done."""
 
 from __future__ import annotations
 
@@ -11,7 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeAlias
 
-from zscout.scheduling.model import ArcId, ClientId, Grant, Ns, Params, RcName
+from zscout.scheduling.reason import Reason
+from zscout.types import ArcId, ClientId, Grant, Ns, Params, RcName
 
 
 class Outcome(StrEnum):
@@ -35,7 +32,6 @@ class Outcome(StrEnum):
 class Propose:
     """Ask a sharable RC whether it would carry exactly these holders, by ARC, with their parameters."""
 
-    cause: int
     proposal: int
     rc: RcName
     holders: Mapping[ArcId, Params]
@@ -45,7 +41,6 @@ class Propose:
 class Granted:
     """All of `rcs` are the ARC's until `end`; None where it may keep them past its minimum runtime."""
 
-    cause: int
     arc: ArcId
     client: ClientId
     grant: Grant
@@ -55,16 +50,15 @@ class Granted:
 
 
 @dataclass(frozen=True, slots=True)
-class Revoked:
+class HoldEnded:
     """A hold is over. `requeued` says whether its ARC waits again; `by` is the ARC it was taken for."""
 
-    cause: int
     arc: ArcId
     client: ClientId
     grant: Grant
     rcs: tuple[RcName, ...]
     outcome: Outcome
-    reason: str
+    reason: Reason
     requeued: bool
     by: ArcId | None = None
 
@@ -75,10 +69,9 @@ class Queued:
 
     `settled` is False while the RCM itself is still asking votes, so that the answer is near."""
 
-    cause: int
     arc: ArcId
     client: ClientId
-    reason: str
+    reason: Reason
     settled: bool = True
 
 
@@ -86,19 +79,17 @@ class Queued:
 class Dropped:
     """A waiting ARC left the queue without having run."""
 
-    cause: int
     arc: ArcId
     client: ClientId
     outcome: Outcome
-    reason: str
+    reason: Reason
 
 
 @dataclass(frozen=True, slots=True)
 class WakeAt:
     """Send a `Tick` at this time, or earlier; a later effect replaces it. None: nothing to wait for."""
 
-    cause: int
     at: Ns | None
 
 
-Effect: TypeAlias = Propose | Granted | Revoked | Queued | Dropped | WakeAt
+Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | WakeAt

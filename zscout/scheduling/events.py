@@ -7,15 +7,16 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
 from zscout.keyexpr import is_pattern, matcher
-from zscout.scheduling.model import ArcId, ClientId, Grant, Need, Ns, Place, RcName, Request, Term
+from zscout.scheduling.model import ArcRequest
+from zscout.types import ArcId, ClientId, Grant, Need, Ns, Place, RcName, Term
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """A program asks for an ARC. `place` is set when it had one under an earlier RCM; `since` is then when it
+class Requested:
+    """A program requests an ARC. `place` is set when it had one under an earlier RCM; `since` is then when it
     was last queued, on the core's clock, if that is known."""
 
-    request: Request
+    request: ArcRequest
     place: Place | None = None
     since: Ns | None = None
 
@@ -62,7 +63,7 @@ class RcJoined:
 
 @dataclass(frozen=True, slots=True)
 class RcReported:
-    """An RC tells of itself: holds that ended there, or that what it votes by has changed."""
+    """An RC reports that holds ended there, or that the rules it votes by have changed."""
 
     rc: RcName
     ended: tuple[ArcId, ...] = ()
@@ -96,10 +97,10 @@ class HandedOver:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class RecoveredHold:
     """A hold that stood when an RCM took the lead: its grant is kept, `end` is on the core's clock."""
 
-    request: Request
+    request: ArcRequest
     place: Place
     grant: Grant
     start: Ns
@@ -113,10 +114,10 @@ class Standing:
             raise ValueError(f"what ARC {self.request.arc} holds for its patterns is not told, or told wrong")
 
 
-class Waiting(NamedTuple):
-    """A request that waited when an RCM took the lead; `since` as in `Asked`."""
+class RecoveredRequest(NamedTuple):
+    """A request that waited when an RCM took the lead; `since` as in `Requested`."""
 
-    request: Request
+    request: ArcRequest
     place: Place
     since: Ns | None = None
 
@@ -126,8 +127,8 @@ class LeadTaken:
     """This RCM leads from now on, in `term`, over the holds and the queue that stood."""
 
     term: Term
-    standing: tuple[Standing, ...] = ()
-    waiting: tuple[Waiting, ...] = ()
+    standing: tuple[RecoveredHold, ...] = ()
+    waiting: tuple[RecoveredRequest, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +137,7 @@ class Tick:
 
 
 Event: TypeAlias = (
-    Asked
+    Requested
     | Cancelled
     | Released
     | Vote

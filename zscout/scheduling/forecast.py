@@ -2,21 +2,24 @@
 
 The forecast runs the very core and strategy that decide. RCs are taken to vote as they have voted; a question
 that was never asked is taken to be a yes. Higher priority that comes later makes it wrong, of course, and so
-does who gives back early: it is an estimate, and says so where it is shown.
+does who releases early: it is an estimate, and is shown as one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Granted, Outcome, Propose, Revoked, WakeAt
-from zscout.scheduling.events import Asked, Event, LeadTaken, RcJoined, Standing, Tick, Vote, Waiting
-from zscout.scheduling.model import ArcId, Ns, Request, Term
+from zscout.scheduling.effects import Granted, HoldEnded, Outcome, Propose
+from zscout.scheduling.events import Event, Requested, Tick, Vote
+from zscout.scheduling.instant import play_instant
+from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.reason import Reason
+from zscout.scheduling.strategies import STRATEGIES
+from zscout.types import ArcId, Ns, Term
 
-MAX_VISITS = 4_000
-"""Looks at a waiting ARC, all instants together: a forecast must not keep the RCM from its work."""
+MAX_CHECKS = 4_000
+"""Queued ARCs, summed over all instants: a forecast must not keep the RCM from its work."""
 
 
 @dataclass(slots=True)
@@ -26,11 +29,11 @@ class Forecast:
     starts: dict[ArcId, Ns] = field(default_factory=dict)
     """Those that are not in it never start as things stand, or not within what was played."""
     preempts: list[ArcId] = field(default_factory=list)
-    reason: str = ""
-    """What the newcomer waits for at first, in words; empty if it starts at once."""
+    reason: Reason | None = None
+    """What the newcomer waits for at first; None if it starts at once."""
 
 
-def forecast(core: Core, now: Ns, newcomer: Request | None = None) -> Forecast:
+def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecast:
     """Plays `core` forward from `now`, with `newcomer` asking at once. `core` is not touched."""
     return _Player(core, now).play(newcomer)
 
@@ -38,62 +41,53 @@ def forecast(core: Core, now: Ns, newcomer: Request | None = None) -> Forecast:
 class _Player:
     def __init__(self, core: Core, now: Ns) -> None:
         self.real, self.now = core, now
-        # It keeps unfinished searches: the forecast must not meddle with them.
-        self.core = Core(Adaptive() if isinstance(core.strategy, Adaptive) else core.strategy, core.policy)
+        # A strategy may keep unfinished searches: the forecast must not meddle with them.
+        self.core = Core(STRATEGIES[core.strategy.name](), core.policy)
         self.result = Forecast()
         self.ends: dict[ArcId, Ns] = {}
+        self.unserved: set[ArcId] = set()
+        """ARCs that are queued and have not started within what was played."""
 
-    def play(self, newcomer: Request | None) -> Forecast:
-        self._step(self._standing())
+    def play(self, newcomer: ArcRequest | None) -> Forecast:
+        joined, lead = self.real.as_events(Term(self.real.term.counter + 1, "forecast"))
+        self.ends = {held.request.arc: held.end for held in lead.standing}
+        self.unserved = {one.request.arc for one in lead.waiting}
+        self._step([*joined, lead])
         if newcomer is not None:
-            self._step([Asked(newcomer)], newcomer.arc)
-            waits = self.core.floor.queued.get(newcomer.arc)
-            self.result.reason = waits.reason if waits is not None else ""
-        visits = 0
-        while self.ends and self.core.floor.queued.keys() - self.result.starts.keys():
-            visits += len(self.core.floor.queued)
-            if visits > MAX_VISITS:
+            self.unserved.add(newcomer.arc)
+            self._step([Requested(newcomer)], newcomer.arc)
+            arc = self.core.arc(newcomer.arc)
+            self.result.reason = arc.reported if arc is not None else None
+        checks = 0
+        while self.ends and self.unserved:
+            checks += self.core.waiting
+            if checks > MAX_CHECKS:
                 break
             self.now = max(self.now, min(self.ends.values()))
             self._step([Tick()])
         return self.result
 
-    def _standing(self) -> list[Event]:
-        floor = self.real.floor
-        joined = [RcJoined(rc.name, rc.sharable) for rc in floor.rcs.values() if rc.present]
-        standing = tuple(
-            Standing(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
-            for arc in floor.running.values()
-            if arc.hold is not None
-        )
-        waiting = tuple(Waiting(arc.request, arc.place, arc.since) for arc in floor.queued.values())
-        self.ends = {held.request.arc: held.end for held in standing}
-        term = Term(self.real.term.counter + 1, "forecast")
-        return [*joined, LeadTaken(term, standing, waiting)]
-
     def _step(self, events: list[Event], newcomer: ArcId | None = None) -> None:
-        """One instant, with every vote that it takes."""
-        while events:
-            votes: list[Event] = []
-            again = False
-            for effect in self.core.handle(self.now, *events):
+        """One instant."""
+        for effects in play_instant(self.core, self.now, events, self._vote):
+            for effect in effects:
                 match effect:
                     case Granted(arc=arc, start=start):
                         self.result.starts.setdefault(arc, start)
-                        running = self.core.floor.running[arc]
-                        if running.hold is not None:
+                        self.unserved.discard(arc)
+                        running = self.core.arc(arc)
+                        if running is not None and running.hold is not None:
                             self.ends[arc] = running.hold.end
-                    case Revoked(arc=arc, outcome=outcome, by=by):
+                    case HoldEnded(arc=arc, outcome=outcome, by=by, requeued=requeued):
                         self.ends.pop(arc, None)
+                        if requeued and arc not in self.result.starts:
+                            self.unserved.add(arc)
                         if newcomer is not None and by == newcomer and outcome is Outcome.PREEMPTED:
                             self.result.preempts.append(arc)
-                    case Propose(proposal=proposal, rc=rc, holders=holders):
-                        known = self.real.votes.known(rc, frozenset(holders))
-                        votes.append(Vote(proposal, known is None or known.accept))
-                    case WakeAt(at=at):
-                        again = at == self.now
                     case _:
                         pass
-            # A kept hold goes on past its minimum runtime: what counts is when it begins to yield.
+            # A kept hold goes on past its minimum runtime: what counts is when it becomes preemptible.
             self.ends = {arc: end for arc, end in self.ends.items() if end > self.now}
-            events = votes or ([Tick()] if again else [])
+
+    def _vote(self, asked: Propose) -> Vote:
+        return Vote(asked.proposal, self.real.expects_yes(asked.rc, frozenset(asked.holders)))

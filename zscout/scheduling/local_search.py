@@ -3,14 +3,14 @@
 A step picks an RC at random that is free, or used below the highest level that could use it, and forces in
 the best item that covers it: those in its way leave, and whatever fits then comes in. What was moved a moment
 ago does not move again (tabu), so the search walks on from a local best. Every set that looks better than the
-best is made lawful first (`Problem.complete`), so that the result can be taken as it is.
+best is made lawful first (`PackingProblem.complete`), so that the result can be taken as it is.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from zscout.scheduling.packing import Problem, numbers
+from zscout.scheduling.packing import PackingProblem, numbers
 
 MAX_ITEMS: Final = 2_000
 """Items that the search looks at, best ranks first; the others only fill what it leaves."""
@@ -25,7 +25,7 @@ IDLE_FACTOR: Final = 40
 class LocalSearch:
     """A search that goes on in slices. `best` is always lawful, and at least as good as the start."""
 
-    def __init__(self, problem: Problem, start: int) -> None:
+    def __init__(self, problem: PackingProblem, start: int) -> None:
         self.problem = problem
         self.bound = problem.bound_of_all()
         self.best = problem.complete(start)
@@ -43,13 +43,13 @@ class LocalSearch:
         width = max((rcs[-1] + 1 for rcs in self._needs.values()), default=0)
         self._cover: list[list[int]] = [[] for _ in range(width)]
         for number in looked_at:
-            if not items[number].spent:
+            if not items[number].past_min_runtime:
                 for rc in self._needs[number]:
                     self._cover[rc].append(number)
         self._level = [item.level for item in items]
         self._top = [min((self._level[number] for number in cover), default=-1) for cover in self._cover]
         """The highest level that could use each RC; -1 for none."""
-        self._may_all = not problem.standing and not problem.vetoes
+        self._may_all = not problem.running and not problem.vetoes
         self._moved = [-TENURE] * len(items)
         self._random = 1
         self._improved_at = 0
@@ -81,7 +81,7 @@ class LocalSearch:
                 self._pool.append(rc)
 
     def run(self, steps: int) -> int:
-        """Goes on for at most so many steps; tells how many it took."""
+        """Goes on for at most so many steps; returns how many it took."""
         began = self.steps
         while self.steps - began < steps and not self.done:
             self.steps += 1
@@ -95,13 +95,13 @@ class LocalSearch:
         return self.steps - began
 
     def _keep(self) -> None:
-        lawful = self.problem.complete(self._chosen)
-        key = self.problem.key(lawful)
+        valid = self.problem.complete(self._chosen)
+        key = self.problem.key(valid)
         if key > self.best_key:
-            self.best, self.best_key = lawful, key
+            self.best, self.best_key = valid, key
             self._improved_at = self.steps
-        if lawful != self._chosen:
-            self._adopt(lawful)
+        if valid != self._chosen:
+            self._adopt(valid)
 
     def _pick(self, rc: int) -> int:
         """The item to force in at `rc`: that which gains most, the longest unmoved of equals; -1 for none."""
@@ -133,7 +133,7 @@ class LocalSearch:
         problem, level = self.problem, self._level[number]
         for other in out:
             item = problem.items[other]
-            if item.standing and (item.level < level or (item.level == level and not item.spent)):
+            if item.running and (item.level < level or (item.level == level and not item.past_min_runtime)):
                 return False
         if not problem.vetoes:
             return True

@@ -8,60 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from fractions import Fraction
-from typing import NamedTuple, TypeAlias
+from enum import StrEnum
+from typing import Final, TypeAlias
 
-ArcId: TypeAlias = str
-"""Names one request for as long as it lives; chosen by whoever feeds the core."""
-ClientId: TypeAlias = str
-"""Names the program behind requests: `<host>/<client>` on the mesh."""
-RcName: TypeAlias = str
-"""`kind/name` of a resource controller."""
-Need: TypeAlias = str
-"""What a request asks for: the name of an RC, or a pattern such as `framegrabber/*`."""
-Ns: TypeAlias = int
-"""Whole nanoseconds."""
-Params: TypeAlias = Mapping[str, Fraction]
-"""Bandwidth parameters of one ARC at one RC; only the RC knows what they mean."""
+from zscout.scheduling.reason import Party, Reason
+from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName
 
-SECOND: Ns = 1_000_000_000
 QUANTUM: Ns = SECOND
 """The paper's quantum: while anything waits, a pass runs at least this often."""
-
-
-class Term(NamedTuple):
-    """The reign of one RCM: compared by counter, then by the RCM's instance (design, section 5)."""
-
-    counter: int
-    rcm: str
-
-
-NO_TERM = Term(0, "")
-
-
-class Grant(NamedTuple):
-    """Identity of one hold: the term it was given in and its number there. A later grant compares greater."""
-
-    term: Term
-    seq: int
-
-
-class Place(NamedTuple):
-    """Place in the queue: term and arrival number of the first request; the smaller goes first."""
-
-    term: Term
-    arrival: int
-
 
 Rank: TypeAlias = tuple[int, Ns, Place, ArcId]
 """Sorts contenders, best first: priority (negated), minimum runtime, place, id."""
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ArcRequest:
     """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0).
 
-    A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`)."""
+    A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`). Raises ValueError where
+    there are no needs, the minimum runtime is not positive, or a parameter is negative."""
 
     arc: ArcId
     client: ClientId
@@ -85,94 +50,120 @@ class Request:
         return self.label or self.arc
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Hold:
     """A grant in force. `end` is when the minimum runtime is over; with `keep` the hold goes on past it."""
 
     grant: Grant
     start: Ns
     end: Ns
-    shield: int | None = None
-    """Below this priority nobody takes it before `end`; None: any higher priority does."""
+    protected_below: int | None = None
+    """Below this priority nobody preempts it before `end`; None: any higher priority does."""
+
+
+class ArcState(StrEnum):
+    """Where an ARC stands. All between NEW and RUNNING are queued; `queue_index.py` says what follows."""
+
+    NEW = "new"
+    READY = "ready"
+    """The next pass checks it, whatever happens."""
+    VOTING = "voting"
+    """Its last check waits for votes."""
+    DEFERRED = "deferred"
+    """Its last check was stopped by that of a higher rank, which waits for votes."""
+    WATCHING = "watching"
+    """One RC alone keeps it out."""
+    PARKED = "parked"
+    """An RC that does not answer proposals keeps it out."""
+    RUNNING = "running"
+    ENDED = "ended"
+
+
+_CHECKED: Final = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.WATCHING, ArcState.PARKED)
+_LEAVES: Final = (ArcState.RUNNING, ArcState.ENDED)
+TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
+    ArcState.NEW: (ArcState.READY,),
+    ArcState.READY: (*_CHECKED, *_LEAVES),
+    ArcState.VOTING: (*_CHECKED, *_LEAVES),
+    ArcState.DEFERRED: (*_CHECKED, *_LEAVES),
+    ArcState.WATCHING: (*_CHECKED, *_LEAVES),
+    # It is made ready before it is checked.
+    ArcState.PARKED: (ArcState.READY, *_LEAVES),
+    # Preempted, or an RC was lost: queued again.
+    ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),
+    ArcState.ENDED: (),
+}
 
 
 @dataclass(slots=True, eq=False)
 class Arc:
-    """A request the core follows, queued (`hold is None`) or running."""
+    """A request the core follows, queued or running."""
 
-    request: Request
+    request: ArcRequest
     place: Place
     mask: int
-    """Bits of the needed RCs, sharable or not (see `Floor.rc`); of a pattern, the RC that it is bound to."""
+    """Bits of the needed RCs (`SchedulerState.rc`); of a pattern, the bit of the RC that it is bound to."""
+    patterns: tuple[Need, ...] = ()
+    """Those of its needs that are patterns."""
+    named_mask: int = 0
+    """Bits of the others."""
+    state: ArcState = ArcState.NEW
     hold: Hold | None = None
-    reason: str = ""
-    """Why it waits, in the words last told; empty while it runs. `Core.reason` has those of now."""
+    """What it holds, exactly while it runs."""
+    reason: Reason | None = None
+    """Why it waits, as last reported; None while it runs. `Core.arc` has the reason of now."""
     since: Ns = 0
     """When it was last queued or granted."""
     preemptions: int = 0
-    turn: int = 0
+    entry: int = 0
     """Grows with each entry into the queue or among the running: who came there first."""
     rcs: tuple[Rc, ...] = ()
-    """Those of `mask`, in the order of the bits; set when the ARC comes to the floor."""
+    """Those of `mask`, in the order of the bits; set when the ARC is first queued."""
+    bound: Mapping[Need, RcName] = field(default_factory=dict)
+    """The RC that each pattern is bound to (`patterns.py`): while it runs, and for the time of a check. Empty
+    if there are none to be bound to."""
     id: ArcId = field(init=False)
     priority: int = field(init=False)
     rank: Rank = field(init=False)
     """Higher priority, then shorter minimum runtime, then earlier place goes first.
 
-    Clients tell their places after a takeover, so two may claim one: the id keeps the order total."""
-    watched: Rc | None = None
-    """While it waits: the RC whose situation alone keeps it out; None if it has to be looked at anyway."""
-    footprint: int = 0
-    """What it would take or free, as bits, from a visit that came to no end."""
-    hidden: int = 0
-    """Where a firm obstacle lay under what was off limits at that visit, as bits."""
-    asked: bool = False
-    """Whether that visit waits for votes of its own."""
-    band: int = 0
-    """Which priorities it waits its turn with (`Policy.band`)."""
-    slots: tuple[Need, ...] = ()
-    """Those of its needs that are patterns."""
-    named: int = 0
-    """Bits of the others."""
-    bound: Mapping[Need, RcName] = field(default_factory=dict)
-    """The RC that each pattern is bound to (`patterns.py`): while it runs, and for the time of a visit. Empty
-    if there are none to be bound to."""
+    Clients give their places after a takeover, so two may claim one: the id keeps the order total."""
+    party: Party = field(init=False)
+    """The ARC as reasons name it."""
     needs: Mapping[RcName, Params] = field(init=False)
     """By RC: what it holds, or would as it is bound."""
-    owed: bool = False
-    """Whether it has waited longer than the fleet's patience (`reservations.py`)."""
 
     def __post_init__(self) -> None:
         self.id, self.priority = self.request.arc, self.request.priority
         self.rank = (-self.priority, self.request.min_runtime, self.place, self.id)
+        self.party = Party(self.id, self.request.name, self.priority)
         self.needs = self.request.needs
-
-    @property
-    def name(self) -> str:
-        return self.request.name
 
     @property
     def unbound(self) -> bool:
         """Whether some pattern of its needs has no RC."""
-        return bool(self.slots) and not self.bound
+        return bool(self.patterns) and not self.bound
 
-    def overstays(self, now: Ns) -> bool:
-        """True when a kept hold has had its minimum runtime: equal priority may displace it then."""
+    def move_to(self, state: ArcState) -> None:
+        """Raises ValueError for a move that is not in `TRANSITIONS`."""
+        if state not in TRANSITIONS[self.state]:
+            raise ValueError(f"ARC {self.id} is {self.state} and can't become {state}")
+        self.state = state
+
+    def past_min_runtime(self, now: Ns) -> bool:
+        """True when a kept hold has had its minimum runtime: equal priority may preempt it then."""
         return self.hold is not None and self.request.keep and now >= self.hold.end
 
-    def yields_to(self, other: Arc, now: Ns) -> bool:
+    def preemptible_by(self, other: Arc, now: Ns) -> bool:
         """Whether `other` may take what this running ARC holds."""
-        return self.yields_at(other.priority, now)
+        if self.priority >= other.priority:
+            return self.priority == other.priority and self.past_min_runtime(now)
+        below = self.protected_below(now)
+        return below is None or other.priority >= below
 
-    def yields_at(self, priority: int, now: Ns) -> bool:
-        """Whether any ARC of this priority may."""
-        if self.priority >= priority:
-            return self.priority == priority and self.overstays(now)
-        return not self.shielded(now) or (self.hold is not None and priority >= (self.hold.shield or 0))
-
-    def shielded(self, now: Ns) -> bool:
-        """Whether its hold is out of reach for some of those above it in priority."""
-        return self.hold is not None and self.hold.shield is not None and now < self.hold.end
+    def protected_below(self, now: Ns) -> int | None:
+        """The priority below which nobody preempts its hold now; None: any higher priority does."""
+        return self.hold.protected_below if self.hold is not None and now < self.hold.end else None
 
 
 @dataclass(slots=True, eq=False)
@@ -184,7 +175,7 @@ class Rc:
     present: bool = False
     sharable: bool = False
     holders: dict[ArcId, Arc] = field(default_factory=dict)
-    wanted: int = 0
+    demand: int = 0
     """How many of the queued ARCs name it."""
     watchers: list[Rank] = field(default_factory=list)
-    """Ranks of the queued ARCs that watch this RC, best first."""
+    """Ranks of the queued ARCs that watch this RC (`queue_index.py`), best first."""

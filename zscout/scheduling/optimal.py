@@ -1,69 +1,80 @@
 """Strategy `optimal`: in each pass the best set of ARCs that could hold their RCs together.
 
-The set's value is the vector of (ARC, RC) pairs in use by priority, highest first (`packing.py`). Each part
-in play (`parts.py`) is decided for itself: by branch and bound where that is quick, else by CP-SAT if
-OR-tools is installed (the extra `optimal`), else by local search.
+A pass:
 
-Votes are asked as late as can be: the best set is sought as if every vote that is not known were a yes, and
-only what that set needs is asked. A veto rules that set of holders out, and every larger one; then the next
-best is sought. While votes are out nothing changes in that part.
+1. Take the candidates, in groups that have no RC in common (`conflict_groups.py`).
+2. Find the best set of each group as if every vote that is not known were a yes: by branch and bound where
+   that is quick, else by CP-SAT if OR-tools is installed (the extra `optimal`), else by local search.
+3. Ask the votes that the set needs and that are not known; until they are in, the group is off limits. A veto
+   rules out that set of holders and every larger one: then back to 2.
+4. Take the set: preempt who has to end, start who is to start.
+5. Run a pass of `priority` over the rest: it starts nobody, and reports what they wait for.
+
+The set's value is the vector of (ARC, RC) pairs in use by priority, highest first (`packing.py`).
 """
 
 from __future__ import annotations
 
 from typing import Final
 
+from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling import cpsat, priority
-from zscout.scheduling.floor import Floor
+from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups
 from zscout.scheduling.local_search import LocalSearch
-from zscout.scheduling.model import Ns
-from zscout.scheduling.packing import Problem, pack
-from zscout.scheduling.parts import Part, parts_in_play
-from zscout.scheduling.priority import Actions
-from zscout.scheduling.votes import Votes
+from zscout.scheduling.packing import PackingProblem, pack
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.strategy import Actions
 
 WORK: Final = 200_000
-"""Steps of branch and bound, times items, before a part counts as large: some 20 ms. What is not proven by
+"""Steps of branch and bound, times items, before a group counts as large: some 20 ms. What is not proven by
 then seldom is soon after."""
 MAX_PACKED: Final = 80
-"""Larger parts are not even tried by branch and bound: at 30x60 it takes 11 ms and CP-SAT 18, at 40x80 it
+"""Larger groups are not even tried by branch and bound: at 30x60 it takes 11 ms and CP-SAT 18, at 40x80 it
 seldom comes to a proof."""
 STEPS: Final = 6_000
-"""Steps of local search for a large part."""
+"""Steps of local search for a large group."""
 
 
 MAX_VETOES: Final = 256
-"""Vetoes on one part. A voter gives no reason that could be reckoned with, so a proof may take a question for
-each of very many sets; beyond so many vetoes `priority` decides the part."""
+"""Vetoes on one group. A voter gives no reason that could be reckoned with, so a proof may take a question
+for each of very many sets; beyond so many vetoes `priority` decides the group."""
 
 
-def run_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
-    """One pass at `now`."""
-    held = 0
-    for part in parts_in_play(floor, votes, now):
-        if not decide(part, actions):
-            held |= part.mask
-    # Nothing is left for it to start; it tells those who wait what they wait for.
-    priority.run_pass(floor, votes, now, actions, off_limits=held)
+class Optimal:
+    """The strategy; it keeps nothing from pass to pass."""
+
+    name: StrategyName = "optimal"
+
+    def run_pass(self, state: SchedulerState, actions: Actions) -> None:
+        held = 0
+        for group in conflict_groups(state):
+            if not decide(group, actions):
+                held |= group.mask
+        # Nothing is left for it to start; it reports to those who wait what they wait for.
+        priority.run_pass(state, actions, off_limits=held)
+
+    def news(self) -> str:
+        return ""
 
 
-def decide(part: Part, actions: Actions) -> bool:
-    """Takes the best set of a part, or leaves it to `priority`. False: votes are out; nothing changes yet."""
+def decide(group: ConflictGroup, actions: Actions) -> bool:
+    """Takes the best set of a group, or leaves it to `priority`. False: votes are out; nothing changes
+    yet."""
     questions = None
     while questions is None:
-        if len(part.barred) > MAX_VETOES:
+        if len(group.nogoods) > MAX_VETOES:
             return True
         # None: a veto that was known ruled it out, and each round bars at least one more set.
-        questions = part.ask(chosen := best(part.problem()))
+        questions = group.ask(chosen := best(group.problem()))
     if questions:
         for rc, holders in questions:
             actions.propose(rc, holders)
         return False
-    part.take(chosen, actions)
+    group.take(chosen, actions)
     return True
 
 
-def best(problem: Problem) -> int:
+def best(problem: PackingProblem) -> int:
     """The best set, or the best that was found within the budget: never less than the heuristic finds."""
     size = len(problem.items)
     packing = pack(problem, WORK // max(1, size) if size <= MAX_PACKED else 0)

@@ -18,22 +18,22 @@ from typing import NamedTuple
 NO_LIMIT = 1 << 60
 
 
-class Item(NamedTuple):
+class PackingItem(NamedTuple):
     """A contender: exclusive RCs as a bit mask, RCs in all, its level (0 is the highest), whether it runs.
 
-    `spent` marks one that runs on after its minimum runtime: it is worth nothing, yields to its own level as
-    well, and to no lower one."""
+    `past_min_runtime` marks one that runs on after its minimum runtime: it is worth nothing and may have to
+    end for its own level as well, but for no lower one."""
 
     mask: int
     width: int
     level: int
-    standing: bool = False
-    spent: bool = False
+    running: bool = False
+    past_min_runtime: bool = False
 
     @property
-    def owed(self) -> bool:
+    def in_min_runtime(self) -> bool:
         """Whether to end it is a preemption."""
-        return self.standing and not self.spent
+        return self.running and not self.past_min_runtime
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +48,12 @@ class Packing:
     nodes: int
 
 
-class Problem:
-    """Items in rank order, so levels never fall; and `barred`, bit sets of items that must not all be chosen.
+class PackingProblem:
+    """Items in rank order, so levels never fall; and `nogoods`, bit sets of items not to be chosen all.
 
     All running items fit together, or are barred from it by a veto."""
 
-    def __init__(self, items: Sequence[Item], barred: Iterable[int] = ()) -> None:
+    def __init__(self, items: Sequence[PackingItem], nogoods: Iterable[int] = ()) -> None:
         self.items = items
         self.levels = items[-1].level + 1 if items else 1
         base = sum(item.width for item in items) + 1
@@ -61,25 +61,28 @@ class Problem:
         """What one RC in use is worth at an item's level: more than all lower levels together."""
         self.masks = [item.mask for item in items]
         self.worth = [
-            0 if item.spent else item.width * unit for item, unit in zip(items, self.unit, strict=True)
-        ]
-        self.extra = [
-            0 if item.spent else (item.width - item.mask.bit_count()) * unit
+            0 if item.past_min_runtime else item.width * unit
             for item, unit in zip(items, self.unit, strict=True)
         ]
-        self.plain = self.levels == 1 and not any(self.extra) and not any(item.spent for item in items)
+        self.extra = [
+            0 if item.past_min_runtime else (item.width - item.mask.bit_count()) * unit
+            for item, unit in zip(items, self.unit, strict=True)
+        ]
+        self.plain = (
+            self.levels == 1 and not any(self.extra) and not any(item.past_min_runtime for item in items)
+        )
         """Whether an RC in use counts one, whoever uses it."""
-        self.barred: list[list[int]] = [[] for _ in items]
-        for bar in barred:
-            for number in numbers(bar):
-                self.barred[number].append(bar)
-        self.vetoes = any(self.barred)
-        self.standing = [number for number, item in enumerate(items) if item.standing]
+        self.nogoods: list[list[int]] = [[] for _ in items]
+        for nogood in nogoods:
+            for number in numbers(nogood):
+                self.nogoods[number].append(nogood)
+        self.vetoes = any(self.nogoods)
+        self.running = [number for number, item in enumerate(items) if item.running]
 
     def allowed(self, number: int, chosen: int) -> bool:
         """Whether no veto keeps an item out beside those chosen."""
         beside = chosen | 1 << number
-        return all(bar & ~beside for bar in self.barred[number])
+        return all(nogood & ~beside for nogood in self.nogoods[number])
 
     def bound(self, open_: Iterable[int]) -> int:
         """What these items can be worth together, at most. Levels must not fall."""
@@ -106,70 +109,76 @@ class Problem:
     def value(self, chosen: int) -> int:
         return sum(self.worth[number] for number in numbers(chosen))
 
-    def lost(self, chosen: int) -> int:
+    def preemptions(self, chosen: int) -> int:
         """How many would be preempted."""
-        return sum(1 for number in self.standing if self.items[number].owed and not chosen >> number & 1)
+        return sum(
+            1 for number in self.running if self.items[number].in_min_runtime and not chosen >> number & 1
+        )
 
     def key(self, chosen: int) -> tuple[int, int]:
         """Compares sets by value, then by preemptions; greater is better."""
-        return self.value(chosen), -self.lost(chosen)
+        return self.value(chosen), -self.preemptions(chosen)
 
     def complete(self, wish: int = 0) -> int:
         """A lawful set that nothing can be added to: level by level who runs, who is wished for, the rest by
         rank. Without a wish that is the heuristic's."""
         items, masks = self.items, self.masks
 
-        def turn(number: int) -> tuple[int, int]:
+        def order(number: int) -> tuple[int, int]:
             item = items[number]
-            if item.standing:
-                return item.level, 3 if item.spent else 0
+            if item.running:
+                return item.level, 3 if item.past_min_runtime else 0
             return item.level, 1 if wish >> number & 1 else 2
 
         used = chosen = 0
-        for number in sorted(range(len(items)), key=turn):
+        for number in sorted(range(len(items)), key=order):
             if not masks[number] & used and (not self.vetoes or self.allowed(number, chosen)):
                 used |= masks[number]
                 chosen |= 1 << number
         return chosen
 
-    def lawful(self, chosen: int) -> bool:
+    def valid(self, chosen: int) -> bool:
         """Whether nobody is left out who runs and fits beside the chosen above and the equals that run."""
-        for number in self.standing:
+        for number in self.running:
             if chosen >> number & 1:
                 continue
             beside, mask = 0, 0
             for other in numbers(chosen):
-                if self.goes_before(other, number):
+                if self.outranks(other, number):
                     beside |= 1 << other
                     mask |= self.masks[other]
             if not self.masks[number] & mask and self.allowed(number, beside):
                 return False
         return True
 
-    def goes_before(self, other: int, running: int) -> bool:
+    def outranks(self, other: int, running: int) -> bool:
         """Whether `running` may have to end because `other` was chosen."""
         them, item = self.items[other], self.items[running]
-        return them.level < item.level or (them.level == item.level and (them.standing or item.spent))
+        return them.level < item.level or (
+            them.level == item.level and (them.running or item.past_min_runtime)
+        )
 
 
-def pack(problem: Problem, nodes: int = NO_LIMIT) -> Packing:
+def pack(problem: PackingProblem, nodes: int = NO_LIMIT) -> Packing:
     """The best set, or the best that is found in so many steps, at least the heuristic's."""
     return _Search(problem, nodes).run()
 
 
 class _Search:
-    def __init__(self, problem: Problem, nodes: int) -> None:
+    def __init__(self, problem: PackingProblem, nodes: int) -> None:
         self.problem = problem
         self.limit = nodes
         items = problem.items
         # These stay wherever they fit, so there is nothing to decide about them. Others that run have to be
         # decided by rank, and the set as a whole is checked.
-        self.firm = [item.owed and not barred for item, barred in zip(items, problem.barred, strict=True)]
-        self.owed = [item.owed for item in items]
-        self.ends = any(self.owed)
-        self.checked = any(item.standing and not firm for item, firm in zip(items, self.firm, strict=True))
+        self.firm = [
+            item.in_min_runtime and not nogoods for item, nogoods in zip(items, problem.nogoods, strict=True)
+        ]
+        self.in_min_runtime = [item.in_min_runtime for item in items]
+        self.ends = any(self.in_min_runtime)
+        self.checked = any(item.running and not firm for item, firm in zip(items, self.firm, strict=True))
         self.best = -1
-        self.best_lost = 0
+        self.best_preemptions = 0
         self.chosen = 0
         self.nodes = 0
 
@@ -178,7 +187,7 @@ class _Search:
         whole = [number for number in range(len(problem.items)) if problem.allowed(number, 0)]
         whole.sort(key=lambda number: (problem.items[number].level, not self.firm[number]))
         bound = problem.bound(whole)
-        out = sum(self.owed) - sum(self.owed[number] for number in whole)
+        out = sum(self.in_min_runtime) - sum(self.in_min_runtime[number] for number in whole)
         todo = [(whole, 0, 0, out)]
         cut = False
         while todo and not cut:
@@ -194,7 +203,7 @@ class _Search:
         open_: list[int],
         chosen: int,
         value: int,
-        lost: int,
+        preemptions: int,
     ) -> bool:
         """Takes whatever comes first, down to a complete set; what else might be done is put on `todo`.
 
@@ -206,7 +215,7 @@ class _Search:
                 return True
             if self.best >= 0:
                 bound = value + problem.bound(open_)
-                if bound < self.best or (bound == self.best and lost >= self.best_lost):
+                if bound < self.best or (bound == self.best and preemptions >= self.best_preemptions):
                     return False
             head, *tail = open_
             mask = masks[head]
@@ -214,24 +223,24 @@ class _Search:
             rest = [number for number in tail if not masks[number] & mask]
             if problem.vetoes:
                 rest = [number for number in rest if problem.allowed(number, taken)]
-            dropped = lost
+            dropped = preemptions
             if self.ends and len(rest) < len(tail):
-                dropped += sum(self.owed[number] for number in set(tail).difference(rest))
+                dropped += sum(self.in_min_runtime[number] for number in set(tail).difference(rest))
             if not self.firm[head] and (len(rest) < len(tail) or self._in_the_way(head, taken, tail)):
-                todo.append((tail, chosen, value, lost + self.owed[head]))
-            open_, chosen, value, lost = rest, taken, value + worth[head], dropped
-        better = value > self.best or (value == self.best and lost < self.best_lost)
-        if better and (not self.checked or problem.lawful(chosen)):
-            self.best, self.best_lost, self.chosen = value, lost, chosen
+                todo.append((tail, chosen, value, preemptions + self.in_min_runtime[head]))
+            open_, chosen, value, preemptions = rest, taken, value + worth[head], dropped
+        better = value > self.best or (value == self.best and preemptions < self.best_preemptions)
+        if better and (not self.checked or problem.valid(chosen)):
+            self.best, self.best_preemptions, self.chosen = value, preemptions, chosen
         return False
 
     def _in_the_way(self, head: int, taken: int, tail: list[int]) -> bool:
         """Whether a veto on `head` can still bite, if all that are open were taken as well."""
-        bars = self.problem.barred[head]
-        if not bars:
+        nogoods = self.problem.nogoods[head]
+        if not nogoods:
             return False
         reach = taken | sum(1 << number for number in tail)
-        return any(not bar & ~reach for bar in bars)
+        return any(not nogood & ~reach for nogood in nogoods)
 
 
 def numbers(bits: int) -> Iterator[int]:

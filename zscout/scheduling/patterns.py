@@ -1,11 +1,11 @@
 """Needs by pattern: `framegrabber/*` is met by any one RC whose name it matches.
 
-While an ARC waits, each visit *binds* it: gives each of its patterns an RC of its own, the best choice of the
+While an ARC waits, each check *binds* it: gives each of its patterns an RC of its own, the best choice of the
 instant. So a bound ARC is like any other, and every strategy knows patterns. Where a bound RC keeps the ARC
-out, the visit goes on with the next best. A hold keeps its binding to its end.
+out, the check goes on with the next best. A hold keeps its binding to its end.
 
-How good a choice is (`Fitness`): an RC that is free, before one that somebody yields, before one that is
-kept for another or does not answer, before one that is held. The worst of an ARC's choices counts: of two
+How good a choice is (`Fitness`): an RC that is free, before one that can be preempted, before one that is
+reserved for another or does not answer, before one that is held. The worst of an ARC's choices counts: of two
 bindings, the one that gets by without the worse kind is taken, by augmenting paths (Kuhn's algorithm), so
 that an ARC never waits where some choice of free RCs would let it run. Between equals, the RC that fewest
 wait for by name: they have no other choice.
@@ -19,35 +19,32 @@ from collections.abc import Mapping
 from enum import IntEnum
 
 from zscout.keyexpr import check_need, is_pattern
-from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import Arc, Need, Ns, Params, Rc
+from zscout.scheduling.model import Arc, Rc
+from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Reservations
-from zscout.scheduling.visit import listed
-from zscout.scheduling.votes import Votes
+from zscout.scheduling.state import SchedulerState
+from zscout.types import Need, Params
 
 
 class Fitness(IntEnum):
     """How well an RC would do, the best first."""
 
     FREE = 0
-    SPOKEN_FOR = 1
+    CLAIMED = 1
     """Bound already to one that ranks before in this pass."""
-    YIELDED = 2
-    """Held by one that yields."""
-    KEPT = 3
-    """Kept for another, or what it says is not known and it is silent."""
+    PREEMPTIBLE = 2
+    """Held by one that is preempted for it."""
+    RESERVED = 3
+    """Reserved for another, or its vote is not known and it does not answer."""
     HELD = 4
-    """Held by one that does not yield, or it has refused."""
+    """Held by one that is not preempted for it, or it has refused."""
 
 
 class Binder:
     """Finds bindings at one instant. `claimed`: bits of the RCs that others are bound to already."""
 
-    def __init__(
-        self, floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None, claimed: int = 0
-    ) -> None:
-        self._floor, self._votes, self._now, self._reserved = floor, votes, now, reserved
-        self._claimed = claimed
+    def __init__(self, state: SchedulerState, reserved: Reservations | None = None, claimed: int = 0) -> None:
+        self._state, self._votes, self._reserved, self._claimed = state, state.votes, reserved, claimed
 
     def bind(self, arc: Arc, without: int = 0) -> bool:
         """Binds `arc` to the best RCs there are but those of `without`, a bit mask. False: there is no such
@@ -55,14 +52,14 @@ class Binder:
         chosen = self._choose(arc, without)
         if chosen is None:
             return False
-        self._floor.bind(arc, {need: rc.name for need, rc in chosen.items()})
+        self._state.bind(arc, {need: rc.name for need, rc in chosen.items()})
         return True
 
     def _choose(self, arc: Arc, without: int) -> dict[str, Rc] | None:
-        taken = without | arc.named
+        taken = without | arc.named_mask
         options: dict[str, list[tuple[tuple[int, float], Rc]]] = {}
-        for need in arc.slots:
-            matching = (rc for rc in self._floor.matching(need) if rc.present and not rc.bit & taken)
+        for need in arc.patterns:
+            matching = (rc for rc in self._state.matching(need) if rc.present and not rc.bit & taken)
             options[need] = sorted(((self._fitness(arc, rc), rc) for rc in matching), key=_by_fitness)
             if not options[need]:
                 return None
@@ -77,40 +74,40 @@ class Binder:
 
     def _fitness(self, arc: Arc, rc: Rc) -> tuple[int, float]:
         """How well `rc` would do, and what decides between equals."""
-        wanted = float(rc.wanted)
-        firm = [holder for holder in rc.holders.values() if not holder.yields_to(arc, self._now)]
+        demand = float(rc.demand)
+        firm = [holder for holder in rc.holders.values() if not holder.preemptible_by(arc, self._state.now)]
         if rc.sharable:
             answer = self._votes.known(rc.name, frozenset((*(holder.id for holder in firm), arc.id)))
             if answer is None and self._votes.silent(rc.name):
-                return Fitness.KEPT, wanted
+                return Fitness.RESERVED, demand
             if answer is not None and not answer.accept:
-                return Fitness.HELD, wanted
+                return Fitness.HELD, demand
             return Fitness.FREE, len(rc.holders) + (answer is None)
         if firm:
             return Fitness.HELD, max(0 if one.hold is None else one.hold.end for one in firm)
-        if self._reserved is not None and self._reserved.keeps(rc, arc):
-            return Fitness.KEPT, wanted
+        if self._reserved is not None and self._reserved.reserves(rc, arc):
+            return Fitness.RESERVED, demand
         if rc.holders:
-            return Fitness.YIELDED, max(one.priority for one in rc.holders.values())
-        return (Fitness.SPOKEN_FOR if rc.bit & self._claimed else Fitness.FREE), wanted
+            return Fitness.PREEMPTIBLE, max(one.priority for one in rc.holders.values())
+        return (Fitness.CLAIMED if rc.bit & self._claimed else Fitness.FREE), demand
 
 
-def bind_all(floor: Floor, votes: Votes, now: Ns, reserved: Reservations | None = None) -> None:
+def bind_all(state: SchedulerState, reserved: Reservations | None = None) -> None:
     """Binds all who wait by pattern, the best-ranked first, to different RCs as far as there are any."""
     claimed = 0
-    for arc in sorted(floor.flexible.values(), key=lambda arc: arc.rank):
-        if Binder(floor, votes, now, reserved, claimed).bind(arc):
-            claimed |= arc.mask & ~arc.named
+    for arc in sorted(state.by_pattern.values(), key=lambda arc: arc.rank):
+        if Binder(state, reserved, claimed).bind(arc):
+            claimed |= arc.mask & ~arc.named_mask
         else:
-            floor.unbind(arc)
+            state.unbind(arc)
 
 
-def nothing_left(floor: Floor, arc: Arc) -> str:
-    """Which patterns keep an ARC from being bound at all, in words."""
-    there = {need: sum(rc.present for rc in floor.matching(need)) for need in arc.slots}
+def no_match(state: SchedulerState, arc: Arc) -> Reason:
+    """Which patterns keep an ARC from being bound at all."""
+    there = {need: sum(rc.present for rc in state.matching(need)) for need in arc.patterns}
     # Those without any; else there are some for each, but not enough for all.
     short = sorted(need for need, count in there.items() if not count) or sorted(there)
-    return f"no RC on the mesh is left for {listed(short)}"
+    return of_rcs(ReasonCode.NO_MATCH, short)
 
 
 def check_patterns(needs: Mapping[Need, Params]) -> None:

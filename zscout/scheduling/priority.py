@@ -1,347 +1,336 @@
 """Strategy `priority`: the paper's heuristic, with votes that take their time.
 
-The pass visits queued ARCs in rank order. For each, `a`:
+A pass:
 
-1. An RC of `a` that is absent, or held by one that does not yield to `a`: `a` waits.
-2. Every sharable RC that `a` needs must accept `a` beside all who would still hold it when the blockers
-   (who hold an exclusive RC that `a` needs) and the candidates (who yield, and hold a sharable RC that `a`
-   needs) were gone. Otherwise `a` waits, and nobody is preempted.
-3. Reprieve: candidates keep their place in rank order as long as the votes allow. The others are preempted.
-4. `a` starts.
+1. Take the changes since the last pass: RCs freed, joined or lost, votes that came or fell.
+2. Collect whom to check: those who are ready, and the first watcher of each RC that was freed.
+3. Check them in rank order (`admission_check.py`). For each, `a`:
+   a. An RC of `a` is absent, or held by one that is not preempted for `a`: `a` waits.
+   b. Every sharable RC that `a` needs must accept `a` beside all who would still hold it if the blockers
+      (who hold an exclusive RC that `a` needs) and the candidates (who are preemptible, and hold a sharable
+      RC that `a` needs) were gone. Otherwise `a` waits, and nobody is preempted.
+   c. Reprieve: candidates stay, in rank order, as long as the votes allow. The others are preempted.
+   d. `a` starts.
+4. Index `a` by what it waits for, or preempt its victims and start it; what that changes calls others.
 
-A vote that is not known yet leaves the visit open. What an open visit would take or free is *off limits* for
-lower ranks, and so is what a visit stopped by that would take or free; all others go on. The pass can be
-run again from the top at any time: what a lower rank takes never makes a higher one possible (a lower rank
-only displaces those who would have yielded to the higher one as well, and votes are monotone), so an answer
-that arrives simply runs the next pass, and the outcome is that of votes given on the spot.
+A vote that is not known yet leaves a check undecided. What an undecided check would take or free is *off
+limits* for lower ranks, and so is what a check stopped by that would take or free; all others go on.
 
-**Who need not be visited** (`waits.py`). The outcome is that of a pass over the whole queue, because an ARC
-is passed over only where its visit would again come to "waits", stopping nobody and asking nothing:
+**Why a pass can be run again at any time.** What a lower rank takes never makes a higher one possible (a
+lower rank only preempts those who would have been preempted for the higher one as well, and votes are
+monotone). So an answer that arrives simply runs the next pass, and the outcome is that of votes given on
+the spot.
 
-- It *watches* an RC outside what is off limits. (a) An absent RC: until it joins. (b) An exclusive RC whose
-  holder does not yield to it: until that holder goes or overstays. Who takes the RC instead ranks above all
-  that still watch it below him, so it does not yield to them either: after the first watcher that takes the
-  RC, the others need no look. (c) A sharable RC that vetoed it beside the holders who do not yield: until
-  one of them goes or overstays, or the RC's rules change; more holders leave a veto standing, because what
-  an RC accepts it accepts of every subset. When the RC becomes off limits, its watchers below are visited.
-- It is *asleep* before a silent RC. Its visit reads nothing outside its footprint; it is visited when
-  anything within changes, is answered or becomes off limits, and when the silent RC may be asked again.
-- Who needs RCs by pattern is always visited, unless an RC that it names keeps it out.
-- It is *held back* from an RC that is kept for another (`reservations.py`); it watches that RC until other
-  claims stand there.
-- It is *open*, but nothing within its footprint has changed. Then it is stopped again, if what it would
-  take is off limits and what hides its firm obstacles still is, or it waits for the same votes as before.
+**Why the index may pass ARCs over** (`queue_index.py`). The outcome is that of a pass over the whole queue,
+because one is passed over only where its check would again come to "waits", stopping nobody and asking
+nothing:
+
+- It is WATCHING an RC outside what is off limits. (a) An absent RC: until it joins. (b) An exclusive RC
+  whose holder is not preempted for it: until that holder goes or passes its minimum runtime. Who takes the
+  RC instead ranks above all that still watch it below, so it is not preempted for them either: after the
+  first watcher that takes the RC, the others need no check. (c) A sharable RC that vetoed it beside the
+  holders that are not preempted: until one of them goes or passes its minimum runtime, or the RC's rules
+  change; more holders leave a veto standing, because what an RC accepts it accepts of every subset. (d) An
+  RC that is reserved for another (`reservations.py`): until other reservations stand there. When the RC
+  becomes off limits, its watchers below are checked.
+- It is PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked
+  when anything within changes, is answered or becomes off limits, and when that RC may be asked again.
+- It is VOTING or DEFERRED, but nothing within its footprint has changed: if what it would take is off limits
+  and what hides its firm obstacles still is, or it waits for the same votes as before.
+
+An ARC with patterns is always checked, unless an RC that it names keeps it out.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from operator import attrgetter
-from typing import Literal, Protocol, TypeAlias
+from typing import Final, Literal, TypeAlias
 
-from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import Arc, Need, Ns, Rank, Rc, RcName
-from zscout.scheduling.patterns import Binder, nothing_left
-from zscout.scheduling.reservations import Bar, Reservations
-from zscout.scheduling.visit import Admitted, Open, Refused, Visit, absence, listed, over_quota
-from zscout.scheduling.votes import HolderSet, Votes
+from zscout.config.scheduling_policy import StrategyName, owner_of
+from zscout.scheduling.admission_check import Admissible, AdmissionCheck, Inadmissible, VotesNeeded
+from zscout.scheduling.model import Arc, ArcState, Rank, Rc
+from zscout.scheduling.patterns import Binder, no_match
+from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
+from zscout.scheduling.reservations import ReservationConflict, Reservations
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.strategy import Actions
+from zscout.types import Need, RcName
 
-__all__ = ["UNSETTLED", "Actions", "Strategy", "Visit", "absence", "run_full_pass", "run_pass"]
+VOTING: Final = Reason(ReasonCode.VOTING)
+MAX_BINDINGS: Final = 16
+"""Bindings that one check tries."""
+MAX_REPORTED: Final = 4
+"""How many of those who watch an RC have a new holder reported at once; `Core.arc` gives it to the rest. In a
+long queue every grant would else be news to everyone."""
 
-UNSETTLED = "votes are out"
-TRIES = 16
-"""Bindings that one visit tries."""
-TOLD = 4
-"""How many of those who watch an RC are told at once that its holder is another; the rest see it when they
-ask. In a long queue every grant would else be news to everyone."""
-
-
-class Actions(Protocol):
-    """What a strategy may do to the floor; each call is carried out at once and told as an effect."""
-
-    def start(self, arc: Arc) -> None: ...
-    def displace(self, arc: Arc, by: Arc) -> bool:
-        """Takes everything from a running ARC for `by`; True if it is queued again."""
-        ...
-
-    def wait(self, arc: Arc, reason: str, *, settled: bool = True) -> None: ...
-    def propose(self, rc: Rc, holders: HolderSet) -> None: ...
-    def again(self) -> None:
-        """Asks for another pass at once: the strategy needs more time, and others shall have their turn."""
-        ...
+_Verdict: TypeAlias = (
+    Inadmissible | VotesNeeded | Admissible | ReservationConflict | Literal["off limits", "over quota"]
+)
 
 
-_Verdict: TypeAlias = Refused | Open | Admitted | Bar | Literal["off limits", "over quota"]
+class Priority:
+    """The strategy, on its own."""
 
-Strategy: TypeAlias = Callable[[Floor, Votes, Ns, Actions], None]
-"""One pass: reads the floor and the votes, and acts."""
+    name: StrategyName = "priority"
+
+    def run_pass(self, state: SchedulerState, actions: Actions) -> None:
+        run_pass(state, actions)
+
+    def news(self) -> str:
+        return ""
+
+
+class FullPriority(Priority):
+    """The same as if every RC had been freed before each pass: whoever waits is checked, or the first who
+    watches the same RC, for what keeps that one out keeps out all below it. For tests and benchmarks."""
+
+    def run_pass(self, state: SchedulerState, actions: Actions) -> None:
+        state.index.freed = state.all_rcs()
+        Pass(state, actions, reported=0).run(state.index.ready.values())
 
 
 def run_pass(
-    floor: Floor,
-    votes: Votes,
-    now: Ns,
-    actions: Actions,
-    *,
-    off_limits: int = 0,
-    reserved: Reservations | None = None,
+    state: SchedulerState, actions: Actions, *, off_limits: int = 0, reserved: Reservations | None = None
 ) -> None:
-    """One pass over the queue at `now`, as far as something has changed for those who wait.
+    """One pass over the queue, as far as something has changed for those who wait.
 
-    `off_limits`: bits of RCs that another strategy is still deciding about. `reserved`: what is kept for
-    others; the paper's own strategy knows no such thing."""
-    Pass(floor, votes, now, actions, reserved=reserved).run(
-        sorted(floor.waits.open.values(), key=attrgetter("rank")), off_limits
-    )
-
-
-def run_full_pass(floor: Floor, votes: Votes, now: Ns, actions: Actions) -> None:
-    """The same pass as if every RC had been freed: whoever waits is looked at, himself or by way of the first
-    who watches the same RC, for what keeps him out keeps out all below him. For tests and benchmarks."""
-    floor.waits.freed = floor.known()
-    Pass(floor, votes, now, actions, told=0).run(floor.waits.open.values())
+    `off_limits`: bits of RCs that another strategy is still deciding about. `reserved`: what is reserved for
+    starving ARCs; the paper's own strategy knows no such thing."""
+    Pass(state, actions, reserved=reserved).run(state.index.ready.values(), off_limits)
 
 
 class Pass:
-    """Visits in rank order: those who are open, and those who watch what has been freed."""
+    """Checks in rank order: those who are ready, and those who watch what has been freed."""
 
     def __init__(
         self,
-        floor: Floor,
-        votes: Votes,
-        now: Ns,
+        state: SchedulerState,
         actions: Actions,
         *,
-        told: int = TOLD,
+        reported: int = MAX_REPORTED,
         reserved: Reservations | None = None,
     ) -> None:
-        self.floor, self.votes, self.now, self.actions = floor, votes, now, actions
-        self.told = told
-        self.reserved = reserved
-        self.waits = floor.waits
+        self.state, self.actions, self.reserved = state, actions, reserved
+        self.votes, self.index = state.votes, state.index
         self.off_limits = 0
         self.changed = 0
         """Bits of the RCs at which something is new since the last pass began."""
-        self._coming: list[tuple[Rank, int, Arc, Rc | None]] = []
-        """Heap of who is next, beside the open. By way of an RC come its watchers, one after the other."""
-        self._walks: dict[int, int] = {}
-        """By bit of each RC whose watchers come: how many more of them are told of a new holder."""
-        self._done = 0
+        self._reported = reported
+        self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
+        """Who is next, beside the ready ones. By way of an RC come its watchers, one after the other."""
+        self._reports_left: dict[int, int] = {}
+        """By bit of each RC whose watchers come: to how many more of them a new holder is reported."""
+        self._changed_here = 0
         """Bits of the RCs at which this pass itself has changed something."""
 
-    def run(self, open_arcs: Iterable[Arc], off_limits: int = 0) -> None:
-        """Visits `open_arcs` and whom changes call; `off_limits` are bits of RCs."""
-        opened = sorted(open_arcs, key=attrgetter("rank"))
-        self._note_votes()
-        self._rouse(None)
-        self._bar(off_limits, None)
-        coming, at, last = self._coming, 0, None
-        while coming or at < len(opened):
-            if at < len(opened) and (not coming or opened[at].rank <= coming[0][0]):
-                arc, rc = opened[at], None
+    def run(self, ready_arcs: Iterable[Arc], off_limits: int = 0) -> None:
+        """Checks `ready_arcs` and whom changes call; `off_limits` are bits of RCs."""
+        ready = sorted(ready_arcs, key=attrgetter("rank"))
+        self._take_votes()
+        self._take_changes(None)
+        self._put_off_limits(off_limits, None)
+        heap, at, last = self._heap, 0, None
+        while heap or at < len(ready):
+            if at < len(ready) and (not heap or ready[at].rank <= heap[0][0]):
+                arc, rc = ready[at], None
                 at += 1
             else:
-                _, _, arc, rc = heapq.heappop(coming)
-                if rc is not None and not self._worth_a_look(rc, arc):
+                _, _, arc, rc = heapq.heappop(heap)
+                if rc is not None and not self._needs_check(rc, arc):
                     continue
             # One may come by several ways, but then at once: ranks are unique.
             if arc.rank != last:
                 last = arc.rank
-                if not arc.footprint or not self._stopped_again(arc):
-                    self._visit(arc)
+                if arc.id not in self.index.footprints or not self._still_deferred(arc):
+                    self._check(arc)
             if rc is not None:
-                self._walk_on(rc, last)
-        # Those who were visited before a change further down have not seen it.
-        self.waits.stirred |= self._done
+                self._call_next_watcher(rc, last)
+        # Those who were checked before a change further down have not seen it.
+        self.index.touched |= self._changed_here
 
-    def _visit(self, arc: Arc) -> None:
-        if arc.slots:
-            self._visit_flexible(arc)
+    def _check(self, arc: Arc) -> None:
+        if arc.patterns:
+            self._check_patterns(arc)
         else:
-            visit = Visit(self.floor, self.votes, self.now, arc)
-            self._carry_out(arc, visit, self._judge(arc, visit))
+            check = AdmissionCheck(self.state, arc)
+            self._apply(arc, check, self._verdict(arc, check))
 
-    def _visit_flexible(self, arc: Arc) -> None:
+    def _check_patterns(self, arc: Arc) -> None:
         """Tries one binding after the other, the best first, until one lets the ARC start or asks votes."""
-        binder = Binder(self.floor, self.votes, self.now, self.reserved)
-        without, tries = 0, 0
+        binder = Binder(self.state, self.reserved)
+        without, tried = 0, 0
         best: tuple[Mapping[Need, RcName], _Verdict] | None = None
-        while tries < TRIES and binder.bind(arc, without):
-            tries += 1
-            visit = Visit(self.floor, self.votes, self.now, arc)
-            verdict = self._judge(arc, visit)
-            blame = self._blame(arc, verdict)
+        while tried < MAX_BINDINGS and binder.bind(arc, without):
+            tried += 1
+            check = AdmissionCheck(self.state, arc)
+            verdict = self._verdict(arc, check)
+            blamed = self._blamed(arc, verdict)
             best = best or (arc.bound, verdict)
-            if not blame:
+            if not blamed:
                 best = arc.bound, verdict
                 break
-            without |= blame
+            without |= blamed
         if best is None:
-            self.floor.unbind(arc)
-            self.waits.reopen(arc)
-            self.actions.wait(arc, nothing_left(self.floor, arc))
+            self.state.unbind(arc)
+            self.index.make_ready(arc)
+            self.actions.wait(arc, no_match(self.state, arc))
             return
-        self.floor.bind(arc, best[0])
-        self._carry_out(arc, Visit(self.floor, self.votes, self.now, arc), best[1])
+        self.state.bind(arc, best[0])
+        self._apply(arc, AdmissionCheck(self.state, arc), best[1])
 
-    def _blame(self, arc: Arc, verdict: _Verdict) -> int:
+    def _blamed(self, arc: Arc, verdict: _Verdict) -> int:
         """Bits of those RCs of a binding that keep the ARC out, where others might not."""
         match verdict:
-            case Refused(rc) | Bar(rc, _, None):
+            case Inadmissible(rc) | ReservationConflict(rc, _, None):
                 bits = rc.bit
             case "off limits":
                 bits = self.off_limits
                 for rc in arc.rcs:
                     if any(holder.mask & self.off_limits for holder in rc.holders.values()):
                         bits |= rc.bit
-            case Open(questions):
+            case VotesNeeded(questions):
                 bits = sum(rc.bit for rc, _ in questions if self.votes.silent(rc.name))
             case _:
                 bits = 0
-        return bits & arc.mask & ~arc.named
+        return bits & arc.mask & ~arc.named_mask
 
-    def _judge(self, arc: Arc, visit: Visit) -> _Verdict:
-        """What a visit comes to, as things stand."""
-        refused = visit.obstacle_outside(self.off_limits)
-        if refused is not None:
-            return refused
-        if self.floor.room(arc) == 0:
+    def _verdict(self, arc: Arc, check: AdmissionCheck) -> _Verdict:
+        """What a check comes to, as things stand."""
+        obstacle = check.obstacle(self.off_limits)
+        if obstacle is not None:
+            return obstacle
+        if self.state.quota_left(arc) == 0:
             return "over quota"
-        bar = self.reserved.bar(arc) if self.reserved is not None else None
-        if bar is not None:
-            return bar
-        if self.off_limits and visit.footprint() & self.off_limits:
+        conflict = self.reserved.conflict(arc) if self.reserved is not None else None
+        if conflict is not None:
+            return conflict
+        if self.off_limits and check.footprint() & self.off_limits:
             return "off limits"
-        return visit.decide()
+        return check.decide()
 
-    def _carry_out(self, arc: Arc, visit: Visit, verdict: _Verdict) -> None:
+    def _apply(self, arc: Arc, check: AdmissionCheck, verdict: _Verdict) -> None:
         match verdict:
-            case Refused(rc, reason):
-                self._watch(arc, rc)
-                self.actions.wait(arc, self._in_words(arc, rc, reason))
-            case Bar(rc, _, ask) if ask is not None:
-                self.waits.reopen(arc)
-                self.actions.wait(arc, UNSETTLED, settled=False)
+            case ReservationConflict(rc, _, ask) if ask is not None:
+                self.index.make_ready(arc)
+                self.actions.wait(arc, VOTING, settled=False)
                 self.actions.propose(rc, ask)
-            case Bar(rc):
-                self._watch(arc, rc)
-                self.actions.wait(arc, self._in_words(arc, rc, verdict.reason))
-            case "over quota":
-                # Whoever of its owner's ends may let it go: no RC tells.
-                self.waits.reopen(arc)
-                self.actions.wait(arc, over_quota(self.floor, arc))
-            case "off limits":
-                self._put_off(arc, visit, asked=False)
-                self.actions.wait(arc, UNSETTLED, settled=False)
-            case Open(questions) if silent := [ask for ask in questions if self.votes.silent(ask[0].name)]:
-                if arc.slots:
-                    self.waits.reopen(arc)
+            case Inadmissible(rc, reason) | ReservationConflict(rc, reason):
+                pattern = next((need for need, name in arc.bound.items() if name == rc.name), None)
+                if pattern is None:
+                    self.index.watch(arc, rc)
+                    self.actions.wait(arc, reason)
                 else:
-                    self.waits.sleep(arc, visit.footprint())
-                self.actions.wait(arc, f"{listed([rc.name for rc, _ in silent])} does not answer")
+                    # The ARC could do with another RC.
+                    self.index.make_ready(arc)
+                    self.actions.wait(arc, reason._replace(pattern=pattern))
+            case "over quota":
+                # Whoever of its owner's ends may let it go: no RC shows that.
+                self.index.make_ready(arc)
+                owner, quota = owner_of(arc.request.client), self.state.policy.max_running_per_host
+                self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=owner, number=quota or 0))
+            case "off limits":
+                self._defer(arc, check, ArcState.DEFERRED)
+                self.actions.wait(arc, VOTING, settled=False)
+            case VotesNeeded(asked) if silent := [one for one in asked if self.votes.silent(one[0].name)]:
+                if arc.patterns:
+                    self.index.make_ready(arc)
+                else:
+                    self.index.park(arc, check.footprint())
+                self.actions.wait(arc, of_rcs(ReasonCode.SILENT, [rc.name for rc, _ in silent]))
                 for rc, holders in silent:
                     self.actions.propose(rc, holders)
-            case Open(questions):
-                self._put_off(arc, visit, asked=True)
-                self.actions.wait(arc, UNSETTLED, settled=False)
+            case VotesNeeded(questions):
+                self._defer(arc, check, ArcState.VOTING)
+                self.actions.wait(arc, VOTING, settled=False)
                 for rc, holders in questions:
                     self.actions.propose(rc, holders)
-            case Admitted(victims):
+            case Admissible(victims):
                 for victim in victims:
-                    if self.actions.displace(victim, by=arc):
-                        heapq.heappush(self._coming, (victim.rank, 0, victim, None))
+                    if self.actions.preempt(victim, by=arc):
+                        heapq.heappush(self._heap, (victim.rank, 0, victim, None))
                 self.actions.start(arc)
-                self._done |= self._rouse(arc.rank)
+                self._changed_here |= self._take_changes(arc.rank)
 
-    def _watch(self, arc: Arc, rc: Rc) -> None:
-        """`rc` keeps `arc` out, by itself unless the ARC could do with another."""
-        if arc.slots and rc.bit & ~arc.named:
-            self.waits.reopen(arc)
+    def _defer(self, arc: Arc, check: AdmissionCheck, state: ArcState) -> None:
+        footprint = check.footprint()
+        if arc.patterns:
+            # It is checked again whatever happens: another RC may do.
+            self.index.make_ready(arc)
         else:
-            self.waits.watch(arc, rc)
+            self.index.defer(arc, state, footprint, check.hidden())
+        self._put_off_limits(footprint, arc.rank)
 
-    def _in_words(self, arc: Arc, rc: Rc, reason: str) -> str:
-        need = next((need for need, name in arc.bound.items() if name == rc.name), None)
-        return reason if need is None else f"no {need} is to be had: {reason}"
-
-    def _put_off(self, arc: Arc, visit: Visit, *, asked: bool) -> None:
-        footprint = visit.footprint()
-        if arc.slots:
-            # It is looked at again whatever happens: another RC may do.
-            self.waits.reopen(arc)
-        else:
-            self.waits.reopen(arc, footprint, hidden=visit.hidden(), asked=asked)
-        self._bar(footprint, arc.rank)
-
-    def _stopped_again(self, arc: Arc) -> bool:
-        """Whether a visit that came to no end comes to none again, seen without repeating it."""
-        if arc.footprint & self.changed or arc.hidden & ~self.off_limits:
+    def _still_deferred(self, arc: Arc) -> bool:
+        """Whether a check that could not be decided can't be again, seen without repeating it."""
+        footprint = self.index.footprints[arc.id]
+        if footprint & self.changed or self.index.hidden[arc.id] & ~self.off_limits:
             return False
-        if not (arc.asked or arc.footprint & self.off_limits):
+        if arc.state is not ArcState.VOTING and not footprint & self.off_limits:
             return False
-        self._bar(arc.footprint, arc.rank)
+        self._put_off_limits(footprint, arc.rank)
         return True
 
-    def _bar(self, footprint: int, rank: Rank | None) -> None:
+    def _put_off_limits(self, footprint: int, rank: Rank | None) -> None:
         """Puts all of `footprint` off limits for those below `rank`; for all of them without a rank."""
         new = footprint & ~self.off_limits
         if new:
             self.off_limits |= new
-            self._call(new, new, rank)
+            self._call_concerned(new, new, rank)
 
-    def _note_votes(self) -> None:
-        waits, votes, rc = self.waits, self.votes, self.floor.rc
-        for name in votes.forgotten:
-            waits.freed |= rc(name).bit
-        for name in (*votes.heard, *votes.due(self.now)):
-            waits.stirred |= rc(name).bit
-        votes.forgotten.clear()
-        votes.heard.clear()
+    def _take_votes(self) -> None:
+        index, votes, rc = self.index, self.votes, self.state.rc
+        for name in votes.invalidated:
+            index.freed |= rc(name).bit
+        for name in (*votes.answered, *votes.due(self.state.now)):
+            index.touched |= rc(name).bit
+        votes.invalidated.clear()
+        votes.answered.clear()
 
-    def _rouse(self, rank: Rank | None) -> int:
+    def _take_changes(self, rank: Rank | None) -> int:
         """Calls whom the latest changes concern, below `rank`; returns where something changed."""
-        waits = self.waits
-        freed, touched = waits.freed, waits.freed | waits.stirred
-        waits.freed = waits.stirred = 0
+        index = self.index
+        freed, touched = index.freed, index.freed | index.touched
+        index.freed = index.touched = 0
         self.changed |= touched
-        self._call(freed, touched, rank)
+        self._call_concerned(freed, touched, rank)
         return touched
 
-    def _call(self, walks: int, touched: int, rank: Rank | None) -> None:
-        waits = self.waits
-        for rc in self.floor.of(walks & waits.watched):
-            known = rc.bit in self._walks
-            self._walks[rc.bit] = self.told
+    def _call_concerned(self, watched: int, touched: int, rank: Rank | None) -> None:
+        index = self.index
+        for rc in self.state.rcs_in(watched & index.watched):
+            known = rc.bit in self._reports_left
+            self._reports_left[rc.bit] = self._reported
             if not known:
-                self._walk_on(rc, rank)
-        if waits.asleep:
-            for arc in list(waits.asleep.values()):
-                if arc.footprint & touched and (rank is None or arc.rank > rank):
-                    waits.reopen(arc)
-                    heapq.heappush(self._coming, (arc.rank, 0, arc, None))
+                self._call_next_watcher(rc, rank)
+        if index.parked:
+            for arc in list(index.parked.values()):
+                if index.footprints[arc.id] & touched and (rank is None or arc.rank > rank):
+                    index.make_ready(arc)
+                    heapq.heappush(self._heap, (arc.rank, 0, arc, None))
 
-    def _walk_on(self, rc: Rc, rank: Rank | None) -> None:
+    def _call_next_watcher(self, rc: Rc, rank: Rank | None) -> None:
         """The next watcher of `rc` below `rank` comes."""
-        following = self.waits.after(rc, rank)
+        following = self.index.next_watcher(rc, rank)
         if following is None:
-            del self._walks[rc.bit]
+            del self._reports_left[rc.bit]
         else:
-            heapq.heappush(self._coming, (following, rc.bit, self.floor.queued[following[3]], rc))
+            heapq.heappush(self._heap, (following, rc.bit, self.state.queued[following[3]], rc))
 
-    def _worth_a_look(self, rc: Rc, arc: Arc) -> bool:
-        """False ends the walk: `rc` has a holder again who yields to nobody from `arc` downwards."""
+    def _needs_check(self, rc: Rc, arc: Arc) -> bool:
+        """False ends it: `rc` has a holder again that is preempted for nobody from `arc` downwards."""
         if not self._keeps_out(rc, arc):
             return True
-        if not self._walks[rc.bit]:
-            del self._walks[rc.bit]
+        if not self._reports_left[rc.bit]:
+            del self._reports_left[rc.bit]
             return False
-        self._walks[rc.bit] -= 1
+        self._reports_left[rc.bit] -= 1
         return True
 
     def _keeps_out(self, rc: Rc, arc: Arc) -> bool:
-        """Whether `rc`, exclusive and not off limits, has a holder who does not yield to `arc`."""
+        """Whether `rc`, exclusive and not off limits, has a holder that is not preempted for `arc`."""
         if rc.sharable or not rc.holders or rc.bit & self.off_limits:
             return False
         (holder,) = rc.holders.values()
-        return not holder.yields_to(arc, self.now)
+        return not holder.preemptible_by(arc, self.state.now)

@@ -6,14 +6,14 @@ import heapq
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from zscout.scheduling import priority
+from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Outcome, Propose, Revoked, WakeAt
-from zscout.scheduling.events import Asked, Event, RcJoined, Released, Tick, Vote
-from zscout.scheduling.model import ArcId, Ns, RcName
-from zscout.scheduling.policy import DEFAULT, Policy
-from zscout.scheduling.priority import Strategy
+from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Propose
+from zscout.scheduling.events import Event, RcJoined, Released, Requested, Tick, Vote
+from zscout.scheduling.instant import play_instant
+from zscout.scheduling.strategy import Strategy
 from zscout.scheduling.workload import Workload, excess
+from zscout.types import ArcId, Ns, RcName
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +42,8 @@ def replay(
     workload: Workload,
     watch: Watcher | None = None,
     *,
-    strategy: Strategy = priority.run_pass,
-    policy: Policy = DEFAULT,
+    strategy: Strategy | None = None,
+    policy: SchedulingPolicy = DEFAULT,
 ) -> Replay:
     """Runs the workload to its end. `watch` sees the core after each batch, for tests and recorders.
 
@@ -77,7 +77,7 @@ class _Player:
             now = min(coming)
             events: list[Event] = []
             while arrivals and arrivals[0][0] == now:
-                events.append(Asked(heapq.heappop(arrivals)[2]))
+                events.append(Requested(heapq.heappop(arrivals)[2]))
             self._step(now, events or [Tick()])
         asked = {arrival.request.arc for arrival in self.workload.arrivals}
         served = {hold.arc for hold in self.holds if hold.outcome is Outcome.COMPLETED}
@@ -85,26 +85,20 @@ class _Player:
         return Replay(tuple(holds), tuple(sorted(asked - served)))
 
     def _step(self, now: Ns, events: list[Event]) -> None:
-        """One instant, with every vote that it takes."""
-        batch: list[Event] = events
-        while batch:
-            effects = self.core.handle(now, *batch)
+        """One instant."""
+        for effects in play_instant(self.core, now, events, self._vote):
             if self.watch is not None:
                 self.watch(now, self.core, effects)
-            votes: list[Event] = []
-            again = False
             for effect in effects:
                 match effect:
                     case Granted(arc=arc):
                         self.open[arc] = effect
-                    case Revoked(arc=arc, outcome=outcome, rcs=rcs):
+                    case HoldEnded(arc=arc, outcome=outcome, rcs=rcs):
                         start = self.open.pop(arc).start
                         self.holds.append(HoldRecord(arc, start, now, outcome, rcs))
-                    case Propose(proposal=proposal, rc=rc, holders=holders):
-                        reason = excess(self.capacity[rc], holders.items())
-                        votes.append(Vote(proposal, accept=not reason, reason=reason))
-                    case WakeAt(at=at):
-                        again = at == now
                     case _:
                         pass
-            batch = votes or ([Tick()] if again else [])
+
+    def _vote(self, asked: Propose) -> Vote:
+        reason = excess(self.capacity[asked.rc], asked.holders.items())
+        return Vote(asked.proposal, accept=not reason, reason=reason)

@@ -1,4 +1,4 @@
-"""Bounded waiting: an ARC that has waited for the fleet's patience is *due*, and nobody may pass it any more.
+"""Bounded waiting: once an ARC has waited for the fleet's patience it is *due*, and nobody may pass it.
 
 Shortest-first starves, and so does the larger set of ARCs where it is preferred to a smaller one. The remedy
 is that of batch schedulers, reservation with conservative backfill (Mu'alem and Feitelson, IEEE TPDS 12(6),
@@ -6,10 +6,11 @@ is that of batch schedulers, reservation with conservative backfill (Mu'alem and
 which the ARC is due, so that until then nobody is held back who would be over by then. Minimum runtimes are
 exact, so reservations are.
 
-Half its patience ahead, an ARC is *owed* its RCs. In the order of priority, then of waiting, each of the owed
-is given the earliest time, from when it is due, at which its RCs are free of those who hold them and do not
-yield, and of those who were owed before it. An ARC of equal or lower priority that shares an RC with it may
-start only if it is over by then, or if the RC is sharable and accepts it beside everyone concerned.
+From half its patience on, an ARC is *starving*. In the order of priority, then of waiting, each of the
+starving is given the earliest time, from when it is due, at which its RCs are free of those who hold them
+and are not preempted for it, and of those who were starving before it. An ARC of equal or lower priority
+that shares an RC with it may start only if it is over by then, or if the RC is sharable and accepts it
+beside everyone concerned.
 
 `docs/scheduling.md` states the promise that follows, and what else was tried.
 """
@@ -19,72 +20,62 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-from zscout.scheduling.floor import Floor
-from zscout.scheduling.model import Arc, Ns, Rc
-from zscout.scheduling.policy import owner_of
-from zscout.scheduling.votes import HolderSet, Votes
+from zscout.config.scheduling_policy import owner_of
+from zscout.scheduling.model import Arc, Rc
+from zscout.scheduling.reason import Reason, ReasonCode
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.votes import HolderSet
+from zscout.types import Ns
 
-MAX_OWED: Final = 16
-"""ARCs that are kept a place at one time; those owed after them follow as these start."""
+MAX_STARVING: Final = 16
+"""ARCs that have reservations at one time; those that starve after them follow as these start."""
 
 
-class Claim(NamedTuple):
-    """An RC is kept for `creditor` from `start` on."""
+class Reservation(NamedTuple):
+    """An RC is reserved for `arc` from `start` on."""
 
-    creditor: Arc
+    arc: Arc
     start: Ns
 
 
-class Bar(NamedTuple):
-    """An ARC would be in the way of a claim at `rc`, unless a vote that is not known yet says otherwise."""
+class ReservationConflict(NamedTuple):
+    """An ARC would be in the way of a reservation at `rc`, unless the vote on `ask` says otherwise."""
 
     rc: Rc
-    creditor: Arc
+    reason: Reason
     ask: HolderSet | None = None
 
-    @property
-    def reason(self) -> str:
-        return f"{self.rc.name} is kept for {self.creditor.name}, whose time to wait is over before this ends"
 
+def reservations(state: SchedulerState, patience: Ns, last: Reservations | None) -> Reservations:
+    """What is reserved now: the `last` that was found, if nothing has changed that it depends on.
 
-def reservations(
-    floor: Floor, votes: Votes, now: Ns, patience: Ns, last: Reservations | None
-) -> Reservations:
-    """What is kept at `now`: the `last` that was found, if nothing has changed that it depends on."""
-    floor.waits.ripen(now - patience // 2, floor.queued)
-    if last is not None and last.go_on(now):
+    Time alone changes nothing: one that is to start later is reserved the same RCs, and nobody could be over
+    before one that is due already."""
+    state.index.mark_starving(state.now - patience // 2, state.queued)
+    if last is not None and last.made_of == _versions(state):
         return last
-    return Reservations(floor, votes, now, patience)
+    return Reservations(state, patience)
 
 
-def _inputs(floor: Floor, votes: Votes) -> tuple[int, int, int]:
-    return floor.changes, votes.changes, floor.waits.owed_changes
+def _versions(state: SchedulerState) -> tuple[int, int, int]:
+    return state.version, state.votes.version, state.index.starving_version
 
 
 class Reservations:
-    """What is kept for whom at one instant: for those of `floor.waits.owed`."""
+    """What is reserved for whom, of those starving."""
 
-    def __init__(self, floor: Floor, votes: Votes, now: Ns, patience: Ns) -> None:
+    def __init__(self, state: SchedulerState, patience: Ns) -> None:
         """`patience` in ns."""
-        self._floor, self._votes, self._now = floor, votes, now
-        self._patience = patience
-        self.claims: dict[int, list[Claim]] = {}
-        """By bit of the RC, the first owed first; of an exclusive RC only the first."""
+        self._state, self._votes, self._patience = state, state.votes, patience
+        self.by_rc: dict[int, list[Reservation]] = {}
+        """By bit of the RC, the first that starved first; of an exclusive RC only the first."""
         self.bits = 0
-        """RCs with claims."""
+        """RCs with reservations."""
         self._free: dict[int, Ns] = {}
-        """By bit: when those owed before are done with the RC."""
-        self._made_of = _inputs(floor, votes)
-        for _, _, arc in floor.waits.owed[:MAX_OWED]:
-            self._reserve(floor.queued[arc])
-
-    def go_on(self, now: Ns) -> bool:
-        """Goes on to `now`. False: something has changed since this was found.
-
-        Time alone changes nothing: who is to start later is kept the same place, and nobody could be over
-        before one that is due already."""
-        self._now = now
-        return self._made_of == _inputs(self._floor, self._votes)
+        """By bit: when those reserved for before are done with the RC."""
+        self.made_of = _versions(state)
+        for _, _, arc in state.index.starving[:MAX_STARVING]:
+            self._reserve(state.queued[arc])
 
     def _reserve(self, arc: Arc) -> None:
         rcs = self._rcs(arc)
@@ -93,43 +84,43 @@ class Reservations:
         start = max(self._within_quota(arc), *(self._free_from(rc, arc) for rc in rcs))
         if math.isinf(start):
             return
-        claim = Claim(arc, max(int(start), self.due(arc)))
+        reservation = Reservation(arc, max(int(start), self.due(arc)))
         for rc in rcs:
-            claims = self.claims.setdefault(rc.bit, [])
-            if rc.sharable or not claims:
-                claims.append(claim)
-            self._free[rc.bit] = max(self._free.get(rc.bit, 0), claim.start + arc.request.min_runtime)
+            reserved = self.by_rc.setdefault(rc.bit, [])
+            if rc.sharable or not reserved:
+                reserved.append(reservation)
+            self._free[rc.bit] = max(self._free.get(rc.bit, 0), reservation.start + arc.request.min_runtime)
             self.bits |= rc.bit
 
     def _rcs(self, arc: Arc) -> list[Rc]:
         """What it is to have: of those that meet a pattern, the one that has room for it first. An RC that is
         not there stands for a pattern that none is left for."""
-        rcs = list(self._floor.of(arc.named)) if arc.slots else list(arc.rcs)
-        for need in arc.slots:
-            left = [rc for rc in self._floor.matching(need) if rc.present and rc not in rcs]
+        rcs = list(self._state.rcs_in(arc.named_mask)) if arc.patterns else list(arc.rcs)
+        for need in arc.patterns:
+            left = [rc for rc in self._state.matching(need) if rc.present and rc not in rcs]
             nothing = Rc(need, 0)
             rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc), rc.bit), default=nothing))
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:
         """When its owner has room for `arc`."""
-        if self._floor.room(arc) != 0:
-            return self._now
+        if self._state.quota_left(arc) != 0:
+            return self._state.now
         owner = owner_of(arc.request.client)
-        own = (one for one in self._floor.running.values() if owner_of(one.request.client) == owner)
+        own = (one for one in self._state.running.values() if owner_of(one.request.client) == owner)
         return min(math.inf if one.hold is None or one.request.keep else one.hold.end for one in own)
 
     def _free_from(self, rc: Rc, arc: Arc) -> float:
-        """When `rc` has room for `arc` at the latest; infinite where nobody can tell."""
-        firm = [holder for holder in rc.holders.values() if not holder.yields_to(arc, self._now)]
+        """When `rc` has room for `arc` at the latest; infinite where that is not known."""
+        firm = [holder for holder in rc.holders.values() if not holder.preemptible_by(arc, self._state.now)]
         if rc.sharable:
-            sharing = (claim.creditor.id for claim in self.claims.get(rc.bit, ()))
+            sharing = (reservation.arc.id for reservation in self.by_rc.get(rc.bit, ()))
             if self._accepts(rc, frozenset((*(holder.id for holder in firm), *sharing, arc.id))):
-                return self._now
+                return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
             if self._votes.silent(rc.name) or (alone is not None and not alone.accept):
                 return math.inf
-        start: float = self._free.get(rc.bit, self._now)
+        start: float = self._free.get(rc.bit, self._state.now)
         for holder in firm:
             start = max(start, _end(holder, arc))
         return start
@@ -138,50 +129,56 @@ class Reservations:
         """When its patience is over."""
         return arc.since + self._patience
 
-    def first(self, arc: Arc) -> bool:
+    def goes_first(self, arc: Arc) -> bool:
         """Whether `arc` goes before those of its equals that could start as well. Of exclusive RCs, nobody is
         left who could take any; but of several that a sharable RC accepts beside `arc`, each by itself, it
         may not accept all."""
-        return arc.owed and bool(arc.mask & self._floor.sharable) and self.due(arc) <= self._now
+        state = self._state
+        return state.index.is_starving(arc) and bool(arc.mask & state.sharable) and self.due(arc) <= state.now
 
-    def bar(self, arc: Arc) -> Bar | None:
+    def conflict(self, arc: Arc) -> ReservationConflict | None:
         """What `arc` would be in the way of if it started now."""
         if not arc.mask & self.bits:
             return None
-        for rc in self._floor.of(arc.mask & self.bits):
+        for rc in self._state.rcs_in(arc.mask & self.bits):
             before: list[Arc] = []
-            bars: Claim | None = None
-            for claim in self.claims[rc.bit]:
-                if claim.creditor is arc:
+            blocking: Reservation | None = None
+            for reservation in self.by_rc[rc.bit]:
+                if reservation.arc is arc:
                     break
-                before.append(claim.creditor)
-                if bars is None and self._delays(arc, claim):
-                    bars = claim
-            if bars is None:
+                before.append(reservation.arc)
+                if blocking is None and self._delays(arc, reservation):
+                    blocking = reservation
+            if blocking is None:
                 continue
+            reason = Reason(ReasonCode.RESERVED, (rc.name,), (blocking.arc.party,))
             if not rc.sharable:
-                return Bar(rc, bars.creditor)
+                return ReservationConflict(rc, reason)
             together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
             if not self._accepts(rc, together):
                 known = self._votes.known(rc.name, together)
                 asked = known is None and not self._votes.silent(rc.name)
-                return Bar(rc, bars.creditor, together if asked else None)
+                return ReservationConflict(rc, reason, together if asked else None)
         return None
 
-    def keeps(self, rc: Rc, arc: Arc) -> bool:
-        """Whether `rc`, exclusive, is kept for another who goes before `arc`."""
-        claims = self.claims.get(rc.bit, ())
-        return any(claim.creditor is not arc and self._delays(arc, claim) for claim in claims)
+    def reserves(self, rc: Rc, arc: Arc) -> bool:
+        """Whether `rc`, exclusive, is reserved for another that goes before `arc`."""
+        reserved = self.by_rc.get(rc.bit, ())
+        return any(one.arc is not arc and self._delays(arc, one) for one in reserved)
 
-    def _delays(self, arc: Arc, claim: Claim) -> bool:
-        """Whether `arc`, started now, would hold what the claim is for when it begins, and must not."""
-        return arc.band <= claim.creditor.band and self._now + arc.request.min_runtime > claim.start
+    def _delays(self, arc: Arc, reservation: Reservation) -> bool:
+        """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
+        band = self._state.policy.band
+        return (
+            band(arc.priority) <= band(reservation.arc.priority)
+            and self._state.now + arc.request.min_runtime > reservation.start
+        )
 
     def changed(self, earlier: Reservations) -> int:
-        """Bits of the RCs at which other claims stand now than then."""
+        """Bits of the RCs at which other reservations stand now than then."""
         bits = 0
-        for bit in self.claims.keys() | earlier.claims.keys():
-            if self.claims.get(bit) != earlier.claims.get(bit):
+        for bit in self.by_rc.keys() | earlier.by_rc.keys():
+            if self.by_rc.get(bit) != earlier.by_rc.get(bit):
                 bits |= bit
         return bits
 
@@ -191,7 +188,7 @@ class Reservations:
 
 
 def _end(holder: Arc, arc: Arc) -> float:
-    """When a holder is gone, or yields. What a higher priority keeps has no end that is known."""
+    """When a holder is gone, or preemptible. What a higher priority keeps has no end that is known."""
     if holder.hold is None or (holder.request.keep and holder.priority > arc.priority):
         return math.inf
     return holder.hold.end

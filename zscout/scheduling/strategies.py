@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from zscout.scheduling import optimal, priority
+from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.adaptive import Adaptive
-from zscout.scheduling.policy import StrategyName
-from zscout.scheduling.priority import Strategy
+from zscout.scheduling.optimal import Optimal
+from zscout.scheduling.priority import Priority
+from zscout.scheduling.strategy import Strategy
 
 STRATEGIES: Final[Mapping[StrategyName, Callable[[], Strategy]]] = {
-    "priority": lambda: priority.run_pass,
-    "optimal": lambda: optimal.run_pass,
+    "priority": Priority,
+    "optimal": Optimal,
     "adaptive": Adaptive,
 }
-"""Each makes a strategy for one core: `adaptive` keeps unfinished searches."""
+"""Each makes a strategy for one core."""

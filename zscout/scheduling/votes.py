@@ -1,4 +1,4 @@
-"""What sharable RCs have said: the answers that stand, and the questions that are out.
+"""How sharable RCs have voted: the answers that stand, and the proposals that are out.
 
 An RC accepts or vetoes a set of holders. What it accepts, it accepts of every subset; so a veto holds for
 every superset, and one answer settles many questions. Answers stand until the RC's rules change.
@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from zscout.scheduling.model import QUANTUM, ArcId, Ns, RcName
+from zscout.scheduling.model import QUANTUM
+from zscout.types import ArcId, Ns, RcName
 
 HolderSet: TypeAlias = frozenset[ArcId]
 
@@ -29,7 +30,7 @@ class Answer:
 YES = Answer(accept=True)
 
 
-class Ballot:
+class RcVotes:
     """One RC's answers. `silent` after an overdue vote: nobody waits for this RC until it answers."""
 
     def __init__(self) -> None:
@@ -128,15 +129,15 @@ class Votes:
     """All ballots of a fleet. Proposals are numbered; an answer to a number that is not out is ignored."""
 
     def __init__(self) -> None:
-        self._ballots: dict[RcName, Ballot] = {}
+        self._ballots: dict[RcName, RcVotes] = {}
         self._out: dict[int, tuple[RcName, HolderSet]] = {}
         self._next = 1
         self._silent: set[RcName] = set()
-        self.changes = 0
+        self.version = 0
         """Grows with all that changes what is known."""
-        self.heard: set[RcName] = set()
+        self.answered: set[RcName] = set()
         """RCs that answered, or fell silent, since somebody last took note and emptied this."""
-        self.forgotten: set[RcName] = set()
+        self.invalidated: set[RcName] = set()
         """RCs whose answers no longer stand, likewise."""
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
@@ -184,8 +185,8 @@ class Votes:
         self._close(ballot, holders)
         ballot.silent = False
         self._silent.discard(rc)
-        self.heard.add(rc)
-        self.changes += 1
+        self.answered.add(rc)
+        self.version += 1
         if accept:
             ballot.accept(holders)
         else:
@@ -193,7 +194,7 @@ class Votes:
         return True
 
     def overdue(self, proposal: int, now: Ns) -> bool:
-        """Marks the RC silent. The question stays out: its answer is welcome whenever it comes."""
+        """Marks the RC silent. The proposal stays open: an answer counts until the query for it ends."""
         if proposal not in self._out:
             return False
         rc, holders = self._out[proposal]
@@ -201,8 +202,8 @@ class Votes:
         if proposal != ballot.out[holders][-1]:
             return False
         ballot.overdue.add(holders)
-        self.heard.add(rc)
-        self.changes += 1
+        self.answered.add(rc)
+        self.version += 1
         self._silent.add(rc)
         if not ballot.silent:
             ballot.silent = True
@@ -210,9 +211,9 @@ class Votes:
         return True
 
     def forget_rc(self, rc: RcName) -> None:
-        """The RC left, came anew or changed its rules: nothing it said stands, nothing asked is awaited."""
-        self.forgotten.add(rc)
-        self.changes += 1
+        """The RC left, came anew or changed its rules: no vote of it stands, no proposal is out."""
+        self.invalidated.add(rc)
+        self.version += 1
         self._silent.discard(rc)
         ballot = self._ballots.pop(rc, None)
         if ballot is not None:
@@ -225,12 +226,12 @@ class Votes:
         if ballot is None:
             return
         ballot.forget(arc)
-        self.changes += 1
+        self.version += 1
         for holders in [holders for holders in ballot.out if arc in holders]:
             self._close(ballot, holders)
 
     def rename_arc(self, rc: RcName, arc: ArcId, renamed: ArcId) -> None:
-        """An ARC goes on by another name: what was said of it stands, what is asked stays asked."""
+        """An ARC goes on by another name: its votes stand, its proposals stay out."""
         ballot = self._ballots.get(rc)
         if ballot is not None:
             for number in ballot.rename(arc, renamed):
@@ -241,13 +242,13 @@ class Votes:
         for number, (rc, holders) in self._out.items():
             yield number, rc, holders
 
-    def _ballot(self, rc: RcName) -> Ballot:
+    def _ballot(self, rc: RcName) -> RcVotes:
         ballot = self._ballots.get(rc)
         if ballot is None:
-            ballot = self._ballots[rc] = Ballot()
+            ballot = self._ballots[rc] = RcVotes()
         return ballot
 
-    def _close(self, ballot: Ballot, holders: HolderSet) -> None:
+    def _close(self, ballot: RcVotes, holders: HolderSet) -> None:
         ballot.overdue.discard(holders)
         for number in ballot.out.pop(holders, ()):
             del self._out[number]

@@ -6,7 +6,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-from zscout.scheduling.model import ArcId, Ns, Params, RcName, Request
+from zscout.scheduling.model import ArcRequest
+from zscout.types import (
+    ArcId,
+    Ns,
+    Params,
+    RcName,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +29,7 @@ class Arrival:
     """An ARC that asks at `at` ns."""
 
     at: Ns
-    request: Request
+    request: ArcRequest
 
 
 @dataclass(frozen=True, slots=True)

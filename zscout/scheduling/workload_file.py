@@ -1,4 +1,4 @@
-"""Workload files: what `zscout replay FILE` reads (design, section 3), strictly and exactly.
+"""Workload files: what `zscout replay FILE` reads, strictly and exactly.
 
     [[rc]]
     name = "radio/rf0"
@@ -25,11 +25,19 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
+from zscout.config.strict import (
+    Where,
+    amounts,
+    check_unique,
+    parse_toml,
+    quoted,
+    seconds_to_ns,
+)
 from zscout.keyexpr import is_pattern
-from zscout.scheduling.model import Params, RcName, Request
+from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.patterns import check_patterns
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
-from zscout.strict import Where, amounts, check_unique, parse_toml, quoted, seconds_to_ns
+from zscout.types import Params, RcName
 
 MAX_BYTES: Final = 64_000_000
 """Largest workload file that is worth reading; for whoever opens it."""
@@ -67,7 +75,7 @@ class _File(Struct, frozen=True, forbid_unknown_fields=True):
 def parse_workload(text: str, source: str) -> Workload:
     """The workload that `text` describes: times in whole ns, amounts exact, RCs and ARCs in the file's order.
 
-    `source` names the file in errors. Raises `zscout.strict.BadInput` at the first thing that is wrong."""
+    `source` names the file in errors. Raises BadInput at the first thing that is wrong."""
     file = parse_toml(text, source, _File)
     top = Where(source)
     check_unique((rc.name for rc in file.rc), top / "rc", "name")
@@ -109,7 +117,7 @@ def _arrival(arc: _Arc, where: Where) -> Arrival:
         check_patterns(needs)
     except ValueError as error:
         raise (where / "needs").bad(str(error), "see zscout request --help") from None
-    return Arrival(at, Request(arc.name, arc.name, needs, arc.priority, min_runtime))
+    return Arrival(at, ArcRequest(arc.name, arc.name, needs, arc.priority, min_runtime))
 
 
 def _check_texts(names: Iterable[str], where: Where) -> None:

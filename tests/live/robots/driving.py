@@ -10,9 +10,9 @@ import sys
 from contextlib import suppress
 from typing import Any
 
-from zscout.behaviors.arc import Revoked, holds
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import OpenArc
+from zscout.behaviors.client.arc import Revoked, holds
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 
 LEFT, RIGHT = 0.3, -0.3

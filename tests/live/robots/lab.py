@@ -10,16 +10,22 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from tests.components.kit import ROOT
+from tests.behaviors.components.kit import ROOT
 from tests.live.lab import START, Lab
-from zscout import clock
-from zscout.behaviors.client import Client
-from zscout.behaviors.tree import Saying, Scene
-from zscout.packets import Drive, Halt, Packet
-from zscout.scheduling.model import Ns
-from zscout.simulation.node_file import node_file
-from zscout.simulation.plan import Furniture, Light, Noise, Plan, Robot
-from zscout.simulation.serve import Served
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.tree import BehaviorContext, BehaviorStatus
+from zscout.drivers.packets import DrivePacket, HaltPacket, Packet
+from zscout.lab.building.node_file import node_file
+from zscout.lab.building.plan import (
+    Furniture,
+    Light,
+    Noise,
+    Plan,
+    Robot,
+)
+from zscout.lab.building.serve import Served
+from zscout.mesh import clock
+from zscout.types import Ns
 
 P = TypeVar("P", bound=Packet)
 
@@ -100,13 +106,13 @@ class Building(Served):
         """Waits for a drive packet, heard from number `since` on, with these fields; returns it."""
 
         def found() -> list[Heard]:
-            return like(self.packets(Drive, robot, since=since), **fields)
+            return like(self.packets(DrivePacket, robot, since=since), **fields)
 
         await comes_true(lambda: bool(found()), f"{robot} to drive with {fields}")
         return found()[0]
 
     async def halts(self, robot: str, *, since: int) -> None:
-        await comes_true(lambda: bool(self.packets(Halt, robot, since=since)), f"{robot} to be halted")
+        await comes_true(lambda: bool(self.packets(HaltPacket, robot, since=since)), f"{robot} to be halted")
 
     async def stands(self, robot: str) -> float:
         """Waits until its wheels stand; returns since when, in the building's seconds."""
@@ -119,7 +125,7 @@ def like(heard: Iterable[Heard], **fields: float) -> list[Heard]:
     return [
         one
         for one in heard
-        if isinstance(one.packet, Drive)
+        if isinstance(one.packet, DrivePacket)
         and all(abs(getattr(one.packet, name) - value) < 0.01 for name, value in fields.items())
     ]
 
@@ -142,13 +148,15 @@ class RobotLab(Lab):
         chosen = [table for table in tables if table.partition('name = "')[2].partition("/")[0] in kinds]
         self.node(host, extra=extra + "\n" + "".join(f"[[rc]]{table}" for table in chosen))
 
-    def scene(self, client: Client, heard: Callable[[Saying], None], *, speed: float | None = None) -> Scene:
+    def context(
+        self, client: Client, heard: Callable[[BehaviorStatus], None], *, speed: float | None = None
+    ) -> BehaviorContext:
         """What a behavior in the test's own loop runs on. `speed` is the building's unless told otherwise."""
 
         async def safe_point() -> None:
             pass
 
-        return Scene(client, safe_point, heard, speed=speed or self.building.speed)
+        return BehaviorContext(client, safe_point, heard, speed=speed or self.building.speed)
 
     async def __aenter__(self) -> Self:
         await self._stack.enter_async_context(self.building)

@@ -11,16 +11,16 @@ import pytest
 
 from tests.live.bench import comes_to
 from tests.live.robots.lab import RobotLab, comes_true
-from zscout import clock
-from zscout.behaviors.client import Client
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.perception.lens import COLUMNS, ROWS
 from zscout.behaviors.sensor_net.blindness import SILENT
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot
 from zscout.behaviors.sensor_net.scout import PATIENCE, Scout
-from zscout.behaviors.tree import Saying
-from zscout.packets import Drive
-from zscout.scheduling.model import SECOND
-from zscout.vision.lens import COLUMNS, ROWS
+from zscout.behaviors.tree import BehaviorStatus
+from zscout.drivers.packets import DrivePacket
+from zscout.mesh import clock
+from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 
@@ -31,9 +31,11 @@ class Placed:
     """`place_robot` for scout33 in the test's own loop, and all that it says."""
 
     def __init__(self, lab: RobotLab, client: Client, *, speed: float | None = None) -> None:
-        self.said: list[Saying] = []
+        self.said: list[BehaviorStatus] = []
         self.behavior = PlaceRobot("scout33", RobotNeeds("robot/scout33"))
-        self.task = asyncio.create_task(self.behavior.play(lab.scene(client, self.said.append, speed=speed)))
+        self.task = asyncio.create_task(
+            self.behavior.perform(lab.context(client, self.said.append, speed=speed))
+        )
         self._building = lab.building
 
     async def says(self, doing: str, detail: str = "", *, since: int = 0) -> None:
@@ -51,7 +53,7 @@ class Placed:
             lambda: body.camera not in (None, left) and body.warmth(building.time) == 1, "a picture"
         )
         since = len(building.heard)
-        await self._comes(lambda: bool(building.packets(Drive, "scout33", since=since)), "it to drive")
+        await self._comes(lambda: bool(building.packets(DrivePacket, "scout33", since=since)), "it to drive")
         assert body.camera is not None
         return body.camera
 

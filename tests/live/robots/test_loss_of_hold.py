@@ -14,13 +14,13 @@ import pytest
 from tests.live.lab import START
 from tests.live.robots.driving import LASTS, LEFT, RIGHT, Turning
 from tests.live.robots.lab import RobotLab, comes_true
-from zscout import clock
-from zscout.behaviors.client import Client
-from zscout.behaviors.request import OpenArc
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
+from zscout.drivers.packets import DrivePacket, HaltPacket
+from zscout.mesh import clock
 from zscout.messages import RcState
-from zscout.packets import Drive, Halt
-from zscout.scheduling.model import SECOND
+from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 
@@ -66,7 +66,7 @@ class Losses:
         if halted:
             await building.halts("scout33", since=first)
         # A drive that was under way when the hold was lost may arrive; what it says ends by itself.
-        drives = building.packets(Drive, "scout33", since=first)
+        drives = building.packets(DrivePacket, "scout33", since=first)
         last = max([lost, *(one.time for one in drives)])
         assert stood <= last + LASTS + RUN_DOWN, way
         assert last <= lost + UNDER_WAY, f"{way}: driven {last - lost:.2f} s after the loss"
@@ -117,7 +117,7 @@ class Losses:
         # What it was told last is not known: it is halted before anybody may drive it.
         await building.halts("scout33", since=since)
         first = next(one.packet for one in building.heard[since:] if one.packet.robot == 33)
-        assert isinstance(first, Halt)
+        assert isinstance(first, HaltPacket)
         await turning.end()
 
     async def node_killed(self) -> None:

@@ -11,15 +11,21 @@ import pytest
 from tests.live.lab import START
 from tests.live.placing import Placing
 from tests.live.robots.lab import RobotLab, comes_true
+from zscout.behaviors.components.sensor_net import PlaceSensorNetComponent
 from zscout.behaviors.piloting import Pilot
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
 from zscout.behaviors.teleop import Teleop
-from zscout.behaviors.tree import Saying
-from zscout.components.sensor_net import PlaceSensorNetComponent
+from zscout.behaviors.tree import BehaviorStatus
+from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket
+from zscout.lab.building.plan import (
+    Furniture,
+    Light,
+    Noise,
+    Plan,
+    Robot,
+)
 from zscout.messages import BehaviorSaid, ComponentList, ListComponents, MigrateComponent, Placement
-from zscout.packets import Camera, Drive, Halt
-from zscout.simulation.plan import Furniture, Light, Noise, Plan, Robot
 
 pytestmark = pytest.mark.live
 
@@ -67,11 +73,11 @@ def test_a_net_at_work(tmp_path: Path) -> None:
                 BehaviorSaid,
                 lambda key, word: said.append((keys.sender_of(key).host, word)),
             )
-            own: list[Saying] = []
+            own: list[BehaviorStatus] = []
             root = PlaceSensorNetComponent({"robots": ROBOTS, "wanted": 1, "speed": SPEED}).root
             assert isinstance(root, PlaceSensorNet)
             net = root.net
-            playing = asyncio.create_task(root.play(lab.scene(client, own.append)))
+            playing = asyncio.create_task(root.perform(lab.context(client, own.append)))
 
             def words(robot: str, host: str, since: int) -> list[str]:
                 return [w.doing for at, w in said[since:] if w.robot == robot and at == host]
@@ -103,16 +109,17 @@ def test_a_net_at_work(tmp_path: Path) -> None:
             assert after.grant != before.grant
             assert after.client != before.client
             # Not let go for a moment: neither halted nor its camera switched off.
-            assert not building.packets(Halt, "scout33", since=heard)
+            assert not building.packets(HaltPacket, "scout33", since=heard)
             assert building.world.bodies["scout33"].camera is not None
-            switched = [one.packet for one in building.packets(Camera, "scout33", since=heard)]
-            assert all(isinstance(packet, Camera) and packet.channel for packet in switched)
+            switched = [one.packet for one in building.packets(CameraPacket, "scout33", since=heard)]
+            assert all(isinstance(packet, CameraPacket) and packet.channel for packet in switched)
 
             # Its battery is gone: the spare takes its place.
             heard, killed = len(building.heard), building.time
             building.kill("scout33")
             await comes_true(
-                lambda: playing.done() or bool(building.packets(Drive, "scout35", since=heard)), "the spare"
+                lambda: playing.done() or bool(building.packets(DrivePacket, "scout35", since=heard)),
+                "the spare",
             )
             assert not playing.done()
             assert net.members[ROBOTS[0]].standing == "lost"

@@ -13,10 +13,10 @@ import pytest
 from tests.live.robots.driving import LEFT, RIGHT, Turning
 from tests.live.robots.lab import RobotLab, like
 from tests.live.robots.terminal import Terminal, all_read_keys
-from zscout import clock
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
-from zscout.packets import Halt
-from zscout.scheduling.model import SECOND
+from zscout.drivers.packets import HaltPacket
+from zscout.mesh import clock
+from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 
@@ -55,7 +55,7 @@ class Shift:
         how()
         await self.building.drives("scout33", since=first, **BEHAVIOR)
         heard = self.building.heard[first:]
-        halted = next((one for one in heard if isinstance(one.packet, Halt)), None)
+        halted = next((one for one in heard if isinstance(one.packet, HaltPacket)), None)
         resumed = next(one for one in like(heard, **BEHAVIOR))
         assert halted is not None, "it was not stopped"
         assert halted.at <= resumed.at

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from zscout import clock
-from zscout.behaviors.arc import Held
-from zscout.behaviors.client import CommandRefused
-from zscout.packets import MAX_PACKET
-from zscout.scheduling.model import SECOND, Ns
+from zscout.behaviors.client.arc import Held
+from zscout.behaviors.client.client import CommandRefused
+from zscout.drivers.packets import MAX_PACKET
+from zscout.types import SECOND, Ns
 
 GONE: Final = frozenset({"ended", "free", "not_holder", "wrong_client"})
-"""Refusals that mean: this hold is over, and the client will hear of it presently."""
+"""Refusals that mean: this hold is over, and the client's notice is on its way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +49,11 @@ class HeldRobot:
         self._still = False
         """Whether the last that was sent is a stop."""
         self._transmits: bool | None = None
-        """As it was last told; None: it was told nothing yet, or may not have heard."""
+        """As it was last commanded; None: it was not yet, or may not have received it."""
         self.sent = self.refused = 0
 
     async def camera(self, on: bool, *, remind: bool = False) -> bool:
-        """Switches its transmitter on, to the channel that is held, or off. It is told once, unless `remind`:
+        """Switches its transmitter on, to the channel that is held, or off. Sent once, unless `remind`:
         call this again until it is True."""
         if on != self._transmits or remind:
             self._transmits = on if await self._command({"name": "camera", "on": on}) else None
@@ -64,13 +63,13 @@ class HeldRobot:
         """Turns the wheels (-1 to 1 of top speed) for `lasts` seconds at most, unless the next command comes
         before. False: not sent, because it was too early for another one.
 
-        Wheels that are to stand are told to stop at once, and only once."""
+        Wheels that are to stand are stopped at once, by one command."""
         if left == 0 and right == 0:
             if self._still:
                 return True
             self._still = await self._command({"name": "stop"})
             return self._still
-        now = clock.now()
+        now = self.held.now()
         if now < self._next:
             return False
         # A command that comes late does not make the next one late as well.

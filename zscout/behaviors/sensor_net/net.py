@@ -1,9 +1,9 @@
-"""Which robots of a sensor net are at it, and who stands in for one that is lost. Pure; time is passed in.
+"""Which robots of a sensor net are active, and which replaces one that is lost. Pure; time is passed in.
 
-    events   told(robot, word)        what the robot's own behavior said of itself
+    events   report(robot, doing)     the status of the robot's own behavior
              there(robots)            which robots are on the mesh
              failed(robot, why)       its behavior could not be started, or was given up
-    effects  Start(robot), Stop(robot)
+    effects  StartRobot, StopRobot
 
 `wanted` robots are to be placed. They are started in the order in which they were named; one that is lost
 (its camera shows nothing, it is gone from the mesh for PATIENCE, or its behavior can't be had) is replaced by
@@ -23,25 +23,25 @@ RETRY: Final = 60.0
 """Seconds after which one that failed may be tried again, where there is nobody else."""
 
 HIDDEN: Final = frozenset({"hidden", "watch", "alert", "blind"})
-"""Words of a robot that has found its place."""
+"""Status of a robot that has found its place."""
 PAUSED: Final = frozenset({"wait", "lost", ""})
-"""Words that tell nothing of where it stands."""
+"""Status that leaves open where it stands."""
 
 Standing: TypeAlias = Literal["free", "active", "lost"]
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class StartRobot:
     robot: str
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class StopRobot:
     robot: str
     why: str
 
 
-Effect: TypeAlias = Start | Stop
+Effect: TypeAlias = StartRobot | StopRobot
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ class Member:
     lost_at: float = 0.0
 
 
-class Net:
+class SensorNet:
     """The state of a sensor net."""
 
     def __init__(self, robots: Sequence[str], wanted: int | None = None) -> None:
@@ -87,8 +87,8 @@ class Net:
     def _active(self) -> list[Member]:
         return [member for member in self.members.values() if member.standing == "active"]
 
-    def told(self, now: float, robot: str, doing: str, *, alert: bool = False) -> list[Effect]:
-        """A robot's behavior says what it does. Words of robots that are not at it are old: ignored."""
+    def report(self, now: float, robot: str, doing: str, *, alert: bool = False) -> list[Effect]:
+        """The status of a robot's behavior; of a robot that is not active it is old, and ignored."""
         member = self.members.get(robot)
         if member is None or member.standing != "active":
             return []
@@ -127,7 +127,7 @@ class Net:
     def _lose(self, now: float, member: Member, why: str) -> list[Effect]:
         member.standing, member.why, member.lost_at = "lost", why, now
         member.hidden, member.doing = False, ""
-        return [Stop(member.robot, why), *self._fill(now)]
+        return [StopRobot(member.robot, why), *self._fill(now)]
 
     def _fill(self, now: float) -> list[Effect]:
         effects: list[Effect] = []
@@ -136,7 +136,7 @@ class Net:
             if member is None:
                 break
             member.standing, member.why, member.doing = "active", "", ""
-            effects.append(Start(member.robot))
+            effects.append(StartRobot(member.robot))
         return effects
 
     def _next(self, now: float) -> Member | None:

@@ -2,7 +2,7 @@
 
 Sensing and acting go through ARCs only. To hide, and to watch, it holds robot, radio, video channel and
 framegrabber for a slot, and keeps them while nobody of its rank waits: with more robots than framegrabbers
-they take turns. Hiding ranks above watching. What to do with what is seen is `Scout`'s to decide.
+they take turns. Hiding ranks above watching. `Scout` decides what to do with what is seen.
 """
 
 from __future__ import annotations
@@ -12,18 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from zscout import clock
-from zscout.behaviors.arc import Held, Revoked, holds
-from zscout.behaviors.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.client.arc import Held, Revoked, holds
+from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.sensor_net.camera_feed import CameraFeed, CameraPicture
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 from zscout.behaviors.sensor_net.scout import PATIENCE, Scout, Task
-from zscout.behaviors.sensor_net.sight import Look, Sight
-from zscout.behaviors.tree import Behavior, Scene
+from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
+from zscout.mesh.supervision import supervised
 from zscout.messages import Box
-from zscout.scheduling.model import SECOND
 
 LOOK: Final = 0.5
-"""Seconds that one look waits for a picture."""
+"""Seconds that a picture is waited for."""
 AGAIN: Final = 1.0
 """Seconds before it asks again after a refusal."""
 GIVEN_UP: Final = 60.0
@@ -32,7 +31,7 @@ IDLE: Final = 0.1
 """Seconds from one safe point to the next while it waits."""
 
 
-class Blind(Exception):
+class CameraBlind(Exception):
     """The robot that is held is not seen."""
 
 
@@ -63,106 +62,103 @@ class PlaceRobot(Behavior):
         }
         for task in self._tasks.values():
             self.add(task)
-        self._clock = 0.0
-        """Seconds of the robot's world that this behavior has lived; carried from host to host."""
-        self._clock_at = 0
+        self._clock = CarriedClock()
         self._holding = False
 
-    async def run(self, scene: Scene) -> None:
-        self._clock_at = clock.now()
-        idle = asyncio.create_task(self._idle(scene))
-        try:
-            await self._take_turns(scene)
-        finally:
-            idle.cancel()
+    async def run(self, context: BehaviorContext) -> None:
+        self._now(context)
+        async with supervised(self.path) as supervisor:
+            supervisor.spawn(self._idle(context))
+            await self._take_turns(context)
 
-    async def _take_turns(self, scene: Scene) -> None:
+    async def _take_turns(self, context: BehaviorContext) -> None:
         while True:
             try:
-                await self._tasks[self.scout.task].play(scene)
-            except Blind as blind:
+                await self._tasks[self.scout.task].perform(context)
+            except CameraBlind as blind:
                 lost = self.scout.blindness.dead
-                self.say("lost" if lost else "wait", str(blind), robot=self.needs.robot)
-                await asyncio.sleep((GIVEN_UP if lost else AGAIN) / scene.speed)
+                self.report("lost" if lost else "wait", str(blind), robot=self.needs.robot)
+                await asyncio.sleep((GIVEN_UP if lost else AGAIN) / context.speed)
             except (Revoked, CommandRefused, RequestRefused) as error:
-                self.say("wait", str(error), robot=self.needs.robot)
+                self.report("wait", str(error), robot=self.needs.robot)
                 await asyncio.sleep(AGAIN)
 
-    async def _idle(self, scene: Scene) -> None:
+    async def _idle(self, context: BehaviorContext) -> None:
         """While the robot is not held nothing changes here, however long that takes: a time to be moved."""
         while True:
             if not self._holding:
-                await scene.safe_point()
+                await context.safe_point()
             await asyncio.sleep(IDLE)
 
-    async def hold(self, scene: Scene, task: RobotTask) -> None:
+    async def hold(self, context: BehaviorContext, task: RobotTask) -> None:
         """Asks for all that `task` needs and plays it under the hold, anew when that was taken away, until it
         is over or has had its slot. Raises Blind, and what a request raises."""
         priority, slot = self.slots.of(task.task)
-        video = self.scout.blindness.choose(self._now(scene), await channels_of(scene.client))
-        task.say("wait", "for its turn", robot=self.needs.robot)
+        video = self.scout.blindness.choose(self._now(context), await channels_of(context.client))
+        task.report("wait", "for its turn", robot=self.needs.robot)
         async for attempt in holds(
-            scene.client,
+            context.client,
             f"{self.name}-{task.task}",
             self.needs.needs(video=video),
             priority=priority,
-            min_runtime=round(slot / scene.speed, 3),
+            min_runtime=round(slot / context.speed, 3),
             keep=True,
         ):
             async with attempt as held:
                 channel = held.rc(video or self.needs.video)
                 # Whoever waited for the hold may be about to be moved: nothing changes before that is over.
-                await scene.safe_point()
-                await self._play(scene, task, held, video)
+                await context.safe_point()
+                await self._use(context, task, held, video)
             if self.scout.silent and attempt.arc is not None and attempt.arc.open:
                 # It was taken away because the receiver is dead: the same needs would be given the same one.
-                await scene.client.end(attempt.arc)
+                await context.client.end(attempt.arc)
                 self.scout.silent = False
-                raise Blind(f"{channel} shows nothing at all")
+                raise CameraBlind(f"{channel} shows nothing at all")
 
-    async def _play(self, scene: Scene, task: RobotTask, held: Held, video: str | None) -> None:
+    async def _use(self, context: BehaviorContext, task: RobotTask, held: Held, video: str | None) -> None:
         robot = HeldRobot(held, self.needs, video=video)
         self._holding = True
-        self.scout.held(self._now(scene))
+        self.scout.held(self._now(context))
         try:
-            with Sight(scene.client, robot.framegrabber, held.grant) as sight:
+            with CameraFeed(context.client, robot.framegrabber, held.grant) as feed:
                 await robot.camera(True)
-                while await self._look(scene, task, robot, await sight.look(LOOK / scene.speed)):
-                    await scene.safe_point()
-                    await robot.camera(True, remind=self.scout.blindness.remind(self._now(scene)))
+                while await self._handle_picture(
+                    context, task, robot, await feed.next_picture(LOOK / context.speed)
+                ):
+                    await context.safe_point()
+                    await robot.camera(True, remind=self.scout.blindness.remind(self._now(context)))
         finally:
-            self.scout.released(self._now(scene))
+            self.scout.released(self._now(context))
             self._holding = False
-            task.say("wait", "the hold is over", robot=self.needs.robot)
+            task.report("wait", "the hold is over", robot=self.needs.robot)
 
-    async def _look(self, scene: Scene, task: RobotTask, robot: HeldRobot, look: Look | None) -> bool:
+    async def _handle_picture(
+        self, context: BehaviorContext, task: RobotTask, robot: HeldRobot, picture: CameraPicture | None
+    ) -> bool:
         """Does what one picture asks for, or none; whether the task goes on."""
-        step = self.scout.see(self._now(scene), look.picture if look else None, robot.video)
+        step = self.scout.see(self._now(context), picture.picture if picture else None, robot.video)
         if step.blind:
-            raise Blind(f"no picture on {robot.video} for {PATIENCE:g} s")
+            raise CameraBlind(f"no picture on {robot.video} for {PATIENCE:g} s")
         await robot.drive(step.left, step.right, step.lasts)
-        task.say(
+        task.report(
             step.doing,
             step.detail,
             robot=robot.robot,
             camera=robot.framegrabber if step.boxes or step.quiet else "",
             alert=step.alert,
-            boxes=_in_frame(look, step.boxes),
+            boxes=_in_frame(picture, step.boxes),
         )
         return not step.over
 
-    def _now(self, scene: Scene) -> float:
-        at = clock.now()
-        self._clock += (at - self._clock_at) / SECOND * scene.speed
-        self._clock_at = at
-        return self._clock
+    def _now(self, context: BehaviorContext) -> float:
+        return self._clock.read(context.client.mesh.now(), context.speed)
 
     def memory(self) -> dict[str, Any]:
-        return {"scout": self.scout.memory(), "clock": self._clock}
+        return {"scout": self.scout.memory(), "clock": self._clock.seconds}
 
     def recall(self, memory: dict[str, Any]) -> None:
         self.scout.recall(memory["scout"])
-        self._clock = float(memory["clock"])
+        self._clock.seconds = float(memory["clock"])
 
 
 class RobotTask(Behavior):
@@ -172,13 +168,13 @@ class RobotTask(Behavior):
         super().__init__(task)
         self.task, self.of = task, of
 
-    async def run(self, scene: Scene) -> None:
-        await self.of.hold(scene, self)
+    async def run(self, context: BehaviorContext) -> None:
+        await self.of.hold(context, self)
 
 
-def _in_frame(look: Look | None, boxes: Sequence[Box]) -> list[Box]:
+def _in_frame(picture: CameraPicture | None, boxes: Sequence[Box]) -> list[Box]:
     """Boxes of the picture, in pixels of the frame."""
-    across, down = look.scale if look is not None else (1.0, 1.0)
+    across, down = picture.scale if picture is not None else (1.0, 1.0)
     return [(round(x * across), round(y * down), round(w * across), round(h * down)) for x, y, w, h in boxes]
 
 

@@ -11,15 +11,17 @@ import base64
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
 
-from zscout.behaviors.sensor_net.alerts import Alerts
+from zscout.behaviors.perception.garble import garbled
+from zscout.behaviors.perception.hiding.hider import Hider
+from zscout.behaviors.perception.lens import Picture
+from zscout.behaviors.perception.motion import Box, MotionDetector
 from zscout.behaviors.sensor_net.blindness import Blindness
-from zscout.hiding.hider import Hider
-from zscout.vision.garble import garbled
-from zscout.vision.lens import Picture
-from zscout.vision.motion import Box, MotionDetector
 
 PATIENCE: Final = 10.0
 """Seconds from the beginning of a hold, or from the last picture, until the robot counts as not seen."""
+
+QUIET: Final = 2.0
+"""Seconds without motion after which the next one is another event."""
 
 Task: TypeAlias = Literal["hide", "watch"]
 
@@ -45,6 +47,40 @@ class Step:
     """The task of this hold is done: give it back, and ask for the other."""
     blind: bool = False
     """No picture for too long: give the hold back."""
+
+
+class Alerts:
+    """One alert for each time that something moves."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._last: float | None = None
+        """When motion was seen last, within one event."""
+
+    @property
+    def moving(self) -> bool:
+        return self._last is not None
+
+    def see(self, now: float, moving: bool) -> str:
+        """`start` where an event begins, `end` where it is over, else an empty word."""
+        if moving:
+            began, self._last = self._last is None, now
+            self.count += began
+            return "start" if began else ""
+        if self._last is not None and now - self._last >= QUIET:
+            self._last = None
+            return "end"
+        return ""
+
+    def rest(self) -> None:
+        """Nobody watches any more: whatever comes next is another event."""
+        self._last = None
+
+    def memory(self) -> dict[str, Any]:
+        return {"count": self.count}
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        self.count = int(memory["count"])
 
 
 class Scout:
@@ -85,9 +121,10 @@ class Scout:
 
     def see(self, now: float, picture: Picture | None, channel: str) -> Step:
         """Takes the newest picture, or None if none came, from the robot on this video channel."""
-        good = picture is not None and not garbled(picture)
+        defect = garbled(picture) if picture is not None else None
+        good = picture is not None and defect is None
         blind = self.blindness.see(now, good, channel, came=picture is not None)
-        act = self.hider.see(now, picture)
+        act = self.hider.see(now, picture, defect)
         step = Step(
             act.left, act.right, act.lasts, act.doing, act.why, blind=blind, over=self.task != self._task
         )

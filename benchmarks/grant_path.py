@@ -1,0 +1,94 @@
+"""The path of a grant: which modules execute from `zscout request robot/x -- true` to its body, hop by hop.
+
+A node leads, another runs the RC. Profilers in these and in the command record every call in their main
+threads; Zenoh's own threads only put what arrives into the inbox. What also runs while nobody asks for
+anything (heartbeats, timers) is left out. Messages are structs without functions of their own: the modules
+that define them are not seen here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+import tempfile
+from pathlib import Path
+
+from benchmarks.grant_trace import Call
+from tests.live.lab import START, Lab
+
+RC = "robot/x"
+IDLE = 3.0
+"""Seconds of which what runs in them counts as no part of a grant."""
+MS = 1_000_000
+ASKING = ("zscout.behaviors.client.request_sender", "RequestSender.ask")
+"""Where the request leaves the client."""
+
+
+async def trace(folder: Path) -> dict[str, list[Call]]:
+    """The calls in each of the three processes."""
+    hook, traces = folder / "hook", folder / "traces"
+    hook.mkdir()
+    traces.mkdir()
+    (hook / "sitecustomize.py").write_text(
+        "from pathlib import Path\nfrom benchmarks.grant_trace import install\n"
+        f"install(Path({str(traces)!r}))\n"
+    )
+    async with Lab(folder, candidates=["lead"]) as lab:
+        lab.env = lab.env | {"PYTHONPATH": f"{hook}:{Path(__file__).parents[1]}"}
+        quiet = "load = false"
+        sides = {"leader": lab.node("lead", extra=quiet), "RC": lab.node("device", RC, extra=quiet)}
+        client = await lab.client("watching")
+        await lab.ready(client, RC)
+        await client.close()
+        lab.clients.clear()
+        await asyncio.sleep(IDLE)
+        zscout = str(Path(sys.executable).with_name("zscout"))
+        command = lab.spawn([zscout, "request", RC, "--", "true"], log="client.log")
+        code = await asyncio.to_thread(command.wait, START)
+        assert code == 0, lab.log("client")
+        for node in sides.values():
+            node.send_signal(signal.SIGTERM)
+            await asyncio.to_thread(node.wait, START)
+        sides = {"client": command, **sides}
+        return {
+            side: json.loads((traces / f"{process.pid}.json").read_text()) for side, process in sides.items()
+        }
+
+
+def path(calls: dict[str, list[Call]]) -> list[tuple[float, str, str, str]]:
+    """Each module once for each side: ms since the request left, side, module, the function of it that ran
+    first; in the order of time."""
+    start = next(at for at, *where in calls["client"] if tuple(where) == ASKING)
+    end = calls["client"][-1][0]
+    found = []
+    for side, some in calls.items():
+        idle = {
+            (module, name)
+            for at, module, name in some
+            if side != "client" and start - IDLE * 1e9 < at < start
+        }
+        seen = set()
+        for at, module, name in some:
+            if start <= at < end and (module, name) not in idle and module not in seen:
+                seen.add(module)
+                found.append(((at - start) / MS, side, module, name))
+    return sorted(found)
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory(prefix="zscout-path-") as name:
+        calls = asyncio.run(trace(Path(name)))
+    hops = path(calls)
+    for at, side, module, function in hops:
+        print(
+            f"{at:7.1f} ms  {side:7}{module.removeprefix('zscout.').replace('.', '/') + '.py':46} {function}"
+        )
+    before = {module for at, module, _ in calls["client"]} - {"", *(module for _, _, module, _ in hops)}
+    print(f"{len({module for _, _, module, _ in hops})} modules from the query to the body")
+    print(f"{len(before)} more in the command before its query: {', '.join(sorted(before))}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,335 @@
+"""A client with an RCM and RCs on a mesh in memory, in virtual time: from a request to its end."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from tests.mesh.kit import run, until
+from zscout.behaviors.client.arc import Revoked, hold, holds
+from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.client.request import OpenArc
+from zscout.config.fleet import default_fleet
+from zscout.drivers.generic import ExclusiveDriver
+from zscout.drivers.resource_controller import ResourceController
+from zscout.keyexpr import Sender
+from zscout.mesh import ZenohMesh
+from zscout.mesh.memory import MemoryMesh, MemoryNetwork
+from zscout.mesh.stall import StallWatch
+from zscout.messages import Grants
+from zscout.services.rcm.candidate import Candidate
+from zscout.types import SECOND
+
+RC, OTHER = "robot/x", "robot/y"
+ECHO = {"name": "echo", "value": 7}
+FLEET = default_fleet()
+
+
+class SmallFleet:
+    """Candidates, RC and OTHER on a host of their own, and clients, each with its place on one network."""
+
+    def __init__(self) -> None:
+        self.network = MemoryNetwork(lease=FLEET.mesh.lease)
+        self.candidates: dict[str, Candidate] = {}
+        self.clients: list[Client] = []
+        self.devices = self.mesh("devices", "node")
+        stall = StallWatch()
+        self.rcs = [
+            ResourceController(
+                self.devices,
+                name,
+                ExclusiveDriver(),
+                hold_lease=FLEET.timing.hold_lease / SECOND,
+                stall=stall,
+            )
+            for name in (RC, OTHER)
+        ]
+
+    def mesh(self, host: str, name: str) -> MemoryMesh:
+        return self.network.open(FLEET.name, Sender(host, name))
+
+    def candidate(self, host: str) -> Candidate:
+        candidate = self.candidates[host] = Candidate(self.mesh(host, "node"), FLEET)
+        candidate.start()
+        return candidate
+
+    def client(self, name: str) -> Client:
+        client = Client(self.mesh("h", name), FLEET).start()
+        self.clients.append(client)
+        return client
+
+    def leader(self) -> MemoryMesh:
+        (leader,) = [one.mesh for one in self.candidates.values() if one.rcm is not None]
+        assert isinstance(leader, MemoryMesh)
+        return leader
+
+    async def holders(self, rc: str = RC) -> list[str]:
+        state = await self.clients[0].state()
+        assert state is not None
+        return [view.arc for view in state.holds if rc in view.needs]
+
+
+@asynccontextmanager
+async def small_fleet(*clients: str) -> AsyncIterator[tuple[SmallFleet, list[Client]]]:
+    fleet = SmallFleet()
+    for rc in fleet.rcs:
+        await rc.start()
+    fleet.candidate("h0")
+    made = [fleet.client(name) for name in clients]
+    await until(lambda: made[0].leader == "h0")
+    try:
+        yield fleet, made
+    finally:
+        for client in fleet.clients:
+            await client.close()
+        for candidate in fleet.candidates.values():
+            await candidate.stop()
+        for rc in fleet.rcs:
+            await rc.stop()
+
+
+def test_a_request_is_granted_obeyed_and_given_back() -> None:
+    async def test() -> None:
+        async with small_fleet("one", "two") as (_, (one, two)):
+            async with hold(one, "first", {RC: {}}, min_runtime=60) as held:
+                assert (await held.command(RC, ECHO)).result == 7
+                waits = await two.request("second", {RC: {}}, min_runtime=60)
+                assert (waits.state, waits.ahead) == ("queued", 0)
+            grant = await two.granted(waits)
+            assert grant is not None
+            with pytest.raises(CommandRefused) as refused:
+                await held.command(RC, ECHO)
+            assert refused.value.code == "ended"
+
+    run(test())
+
+
+def test_a_hold_ends_after_its_minimum_runtime_without_an_error() -> None:
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            began = one.mesh.now()
+            async with hold(one, "first", {RC: {}}, min_runtime=5):
+                await asyncio.sleep(3600)
+            assert 5 <= (one.mesh.now() - began) / SECOND < 5.1
+            assert await fleet.holders() == []
+
+    run(test())
+
+
+def test_who_is_preempted_goes_on_when_it_is_granted_again() -> None:
+    async def test() -> None:
+        async with small_fleet("low", "high") as (_, (low, high)):
+            entered: list[str] = []
+
+            async def work() -> None:
+                async for attempt in holds(low, "low", {RC: {}}, min_runtime=60):
+                    async with attempt:
+                        entered.append("in")
+                        await asyncio.sleep(3600)
+
+            working = asyncio.create_task(work())
+            await until(lambda: entered)
+            async with hold(high, "high", {RC: {}}, priority=5, min_runtime=1):
+                await asyncio.sleep(0.5)
+                assert entered == ["in"]
+            await working
+            assert entered == ["in", "in"]
+
+    run(test())
+
+
+def test_one_entry_that_is_preempted_raises() -> None:
+    async def test() -> None:
+        async with small_fleet("low", "high") as (_, (low, high)):
+
+            async def work() -> None:
+                async with hold(low, "low", {RC: {}}, min_runtime=60):
+                    taker.append(await high.request("high", {RC: {}}, priority=5, min_runtime=60))
+                    await asyncio.sleep(3600)
+
+            taker: list[OpenArc] = []
+            with pytest.raises(Revoked) as revoked:
+                await work()
+            assert (revoked.value.outcome, revoked.value.by) == ("preempted", f"h/high/{taker[0].id}")
+
+    run(test())
+
+
+def test_a_bad_request_is_refused_and_forgotten() -> None:
+    async def test() -> None:
+        async with small_fleet("one") as (_, (one,)):
+            with pytest.raises(RequestRefused) as refused:
+                await one.request("bad", {RC: {}}, priority=10**9)
+            assert refused.value.code == "bad_request"
+            assert one.open_requests() == []
+
+    run(test())
+
+
+def test_holds_and_places_outlive_a_change_of_leader() -> None:
+    async def test() -> None:
+        async with small_fleet("one", "two", "three") as (fleet, (one, two, three)):
+            fleet.candidate("h1")
+            async with hold(one, "first", {RC: {}}, min_runtime=60) as held:
+                waits = [await client.request("next", {RC: {}}, min_runtime=60) for client in (two, three)]
+                places, term = [arc.place for arc in waits], one.term
+                fleet.network.kill(fleet.leader())
+                del fleet.candidates["h0"]
+                await until(lambda: one.leader == "h1" and all(c.term > term for c in (one, two, three)))
+                assert held.active
+                assert (await held.command(RC, ECHO)).result == 7
+                # Each asks again, and keeps its place.
+                await asyncio.sleep(7)
+                assert [(arc.state, arc.place) for arc in waits] == [("queued", place) for place in places]
+            assert await two.granted(waits[0]) is not None
+
+    run(test())
+
+
+def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -> None:
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            arc = await one.request("first", {RC: {}}, min_runtime=600)
+            assert await one.granted(arc) is not None
+            await fleet.candidates.pop("h0").stop()
+            await until(lambda: arc.state == "asking", within=FLEET.timing.hold_lease / SECOND + 1)
+            assert arc.ending is not None
+            assert arc.ending.outcome == "lost"
+            fleet.candidate("h1")
+            assert await one.granted(arc) is not None
+
+    run(test())
+
+
+def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() -> None:
+    """What a component's move rests on: nobody of equal priority gets in between."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new", "rival") as (fleet, (old, new, rival)):
+            arc = await old.request("tally", {RC: {}}, min_runtime=3600)
+            await old.granted(arc)
+            waits = await rival.request("rival", {RC: {}}, min_runtime=1)
+            holders: list[str] = []
+            states: list[str] = [waits.state]
+            rival.watch(lambda arc: states.append(arc.state))
+            rival.mesh.subscribe(
+                rival.mesh.keys.grants,
+                Grants,
+                lambda _, grants: holders.extend(holder.arc for holder in grants.rcs.get(RC, [])),
+            )
+            fleet.network.link(fleet.leader(), fleet.devices).delay = 0.05
+            for source, target in [(old, new), (new, old)] * 3:
+                source.pause()
+                target.expect(source.open_requests())
+                await source.hand_over_all(target.mesh.me)
+                moved = await target.request("tally", {RC: {}}, min_runtime=3600)
+                grant = await target.granted(moved)
+                assert grant is not None
+                assert (await target.command(RC, grant, ECHO)).result == 7
+                source.resume()
+            await asyncio.sleep(10)
+            assert (set(states), set(holders)) == ({"queued"}, {"tally"})
+
+    run(test())
+
+
+def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
+    async def test() -> None:
+        async with small_fleet("one", "two") as (fleet, (one, two)):
+            arc = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
+            await one.granted(arc)
+            waits = await two.request("second", {RC: {}}, min_runtime=600)
+            link = fleet.network.link(one.mesh, fleet.leader())
+            link.loss = 1.0
+            await one.end(arc)
+            link.loss = 0.0
+            assert await fleet.holders() == ["first"]
+            await until(lambda: waits.state == "running", within=7)
+
+    run(test())
+
+
+def test_a_request_that_is_cancelled_before_its_answer_is_withdrawn() -> None:
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            fleet.network.link(fleet.leader(), one.mesh).delay = 0.2
+            asking = asyncio.create_task(one.request("first", {RC: {}}, min_runtime=600, keep=True))
+            await asyncio.sleep(0.1)
+            assert granted(fleet) == ["first"]
+            asking.cancel()
+            await asyncio.gather(asking, return_exceptions=True)
+            await asyncio.sleep(1)
+            assert granted(fleet) == []
+
+    def granted(fleet: SmallFleet) -> list[str]:
+        (candidate,) = fleet.candidates.values()
+        assert candidate.rcm is not None
+        return [arc.name for arc in candidate.rcm.core.holders(RC)]
+
+    run(test())
+
+
+def test_a_client_that_is_cancelled_while_it_leaves_leaves_all_the_same() -> None:
+    async def test() -> None:
+        async with small_fleet("watch", "one") as (fleet, (_, one)):
+            arc = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
+            await one.granted(arc)
+            closed: list[bool] = []
+            close = one.mesh.close
+
+            async def closing() -> None:
+                await close()
+                closed.append(True)
+
+            one.mesh.close = closing  # type: ignore[method-assign]
+            fleet.network.link(one.mesh, fleet.leader()).loss = 1.0
+            leaving = asyncio.create_task(one.close())
+            await asyncio.sleep(0.1)
+            leaving.cancel()
+            await asyncio.gather(leaving, return_exceptions=True)
+            await until(lambda: closed, within=1)
+            await asyncio.sleep(FLEET.mesh.lease)
+            assert await fleet.holders() == []
+
+    run(test())
+
+
+def test_a_client_whose_own_work_fails_ends_its_holds_and_leaves() -> None:
+    async def test() -> None:
+        async with small_fleet("watch", "one") as (fleet, (_, one)):
+
+            async def broken(_arc: OpenArc) -> None:
+                raise RuntimeError("broken")
+
+            async def work() -> None:
+                async with hold(one, "first", {RC: {}}, min_runtime=600):
+                    one._sender.ask = broken  # type: ignore[method-assign, assignment]
+                    await asyncio.sleep(3600)
+
+            with pytest.raises(Revoked, match="this client failed: RuntimeError"):
+                await work()
+            await asyncio.sleep(FLEET.mesh.lease)
+            assert await fleet.holders() == []
+
+    run(test())
+
+
+def test_connecting_can_be_awaited_entered_and_run_as_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test() -> None:
+        async with small_fleet("watch") as (fleet, _):
+
+            async def opened(name: str, me: Sender, *_: object) -> MemoryMesh:
+                return fleet.network.open(name, me)
+
+            monkeypatch.setattr(ZenohMesh, "open", opened)
+            async with Client.connect("entered", fleet=FLEET, host="h") as entered:
+                await until(lambda: entered.leader == "h0")
+            awaited = await Client.connect("awaited", fleet=FLEET, host="h")
+            task = await asyncio.create_task(Client.connect("task", fleet=FLEET, host="h"))
+            async with awaited, task:
+                assert [client.mesh.me.client for client in (awaited, task)] == ["awaited", "task"]
+
+    run(test())

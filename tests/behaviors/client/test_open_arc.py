@@ -1,0 +1,270 @@
+"""A request as its client sees it: which words count, and what is kept of how a hold ended."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from dataclasses import replace
+from decimal import Decimal
+from types import SimpleNamespace
+from typing import Any, cast
+
+import msgspec
+import pytest
+
+from zscout.behaviors.client.arc import Held, Revoked
+from zscout.behaviors.client.client import Client, CommandRefused
+from zscout.behaviors.client.request import OpenArc, RequestStore
+from zscout.config.fleet import default_fleet
+from zscout.keyexpr import BadName, Keys, Sender
+from zscout.mesh import Mesh
+from zscout.messages import Amounts, Notice, OpenRequest, Problem
+from zscout.types import (
+    SECOND,
+    Grant,
+    Place,
+    Term,
+)
+
+OLD, TERM = Term(1, "zz"), Term(2, "aa")
+FIRST, SECOND_GRANT = Grant(TERM, 1), Grant(TERM, 9)
+NOW = 1000 * SECOND
+NOBODY = cast("Client", None)
+"""For what asks nobody on the mesh."""
+
+
+def arc(*needs: str) -> OpenArc:
+    wanted: dict[str, Amounts] = {need: {} for need in needs or ("robot/x",)}
+    return OpenArc("id", "survey", wanted, priority=0, min_runtime=Decimal(5))
+
+
+def notice(step: int, state: Any = "queued", **details: Any) -> Notice:
+    told = Notice("id", "survey", "h/c", state, TERM, step)
+    return msgspec.structs.replace(told, **details)
+
+
+RUNS = notice(2, "running", grant=FIRST, remaining=5.0, place=Place(TERM, 1))
+TAKEN = notice(3, outcome="preempted", reason="preempted by op", by="h/c/op", grant=FIRST)
+WAITS = notice(4, reason="needs robot/x")
+AGAIN = notice(5, "running", grant=SECOND_GRANT, remaining=5.0)
+
+
+def runs(bound: dict[str, str], step: int = 2, grant: Grant = FIRST) -> Notice:
+    return notice(step, "running", grant=grant, remaining=5.0, bound=bound)
+
+
+@pytest.mark.parametrize(
+    ("words", "state", "grant", "ending"),
+    [
+        ([RUNS], "running", FIRST, None),
+        ([RUNS, TAKEN], "queued", None, ("preempted", "preempted by op", "h/c/op")),
+        # The reason to wait does not hide why the hold was taken away.
+        ([RUNS, TAKEN, WAITS], "queued", None, ("preempted", "preempted by op", "h/c/op")),
+        ([RUNS, TAKEN, WAITS, AGAIN], "running", SECOND_GRANT, ("preempted", "preempted by op", "h/c/op")),
+        ([RUNS, WAITS], "queued", None, ("lost", "needs robot/x", None)),
+        ([RUNS, AGAIN], "running", SECOND_GRANT, ("lost", "it was granted anew", None)),
+        ([RUNS, notice(3, "ended", outcome="completed")], "ended", None, ("completed", "", None)),
+        ([RUNS, notice(1)], "running", FIRST, None),
+        ([RUNS, RUNS], "running", FIRST, None),
+        ([RUNS, notice(99, term=OLD)], "running", FIRST, None),
+        ([RUNS, notice(3, "ended", outcome="released"), AGAIN], "ended", None, ("released", "", None)),
+    ],
+)
+def test_words_of_the_rcm(words: list[Notice], state: str, grant: Grant | None, ending: Any) -> None:
+    known = arc()
+    for number, word in enumerate(words):
+        known.take(word, NOW + number)
+    assert (known.state, known.grant, known.ending) == (state, grant, ending)
+    assert known.open_request(NOW).grant == grant
+    assert known.place == Place(TERM, 1)
+
+
+def test_what_meets_a_pattern_is_what_the_newest_hold_says() -> None:
+    known = arc("fg/*", "fg/*#2", "robot/x")
+    assert known.take(runs({"fg/*": "fg/b", "fg/*#2": "fg/a"}), NOW)
+    first = Held(NOBODY, known, FIRST)
+    assert (first.rcs, first.rc("fg/*"), first.rc("fg/*#2")) == (["fg/a", "fg/b", "robot/x"], "fg/b", "fg/a")
+    assert (first.rc("robot/x"), first.rc("fg/a")) == ("robot/x", "fg/a")
+    known.take(TAKEN, NOW)
+    known.take(runs({"fg/*": "fg/c", "fg/*#2": "fg/a"}, step=5, grant=SECOND_GRANT), NOW)
+    again = Held(NOBODY, known, SECOND_GRANT)
+    assert (again.rcs, again.rc("fg/*")) == (["fg/a", "fg/c", "robot/x"], "fg/c")
+    assert first.rc("fg/*") == "fg/b"
+    assert known.ask(NOW).needs.keys() == {"fg/*", "fg/*#2", "robot/x"}
+    for unasked in ("fg/*#3", "video/*", "robot/y", "fg/b"):
+        with pytest.raises(KeyError, match=re.escape(f"{unasked} is no need of survey; it asked for fg/*,")):
+            again.rc(unasked)
+
+
+@pytest.mark.parametrize(
+    "bound",
+    [
+        {},
+        {"fg/*": "fg/a"},
+        {"fg/*": "fg/a", "fg/*#2": "fg/a"},
+        {"fg/*": "fg/a", "fg/*#2": "robot/x"},
+        {"fg/*": "fg/a", "fg/*#2": "fg/*"},
+        {"fg/*": "fg/a", "fg/*#2": "fg/../b"},
+        {"fg/*": "fg/a", "fg/*#3": "fg/b"},
+    ],
+)
+def test_a_hold_that_is_not_what_was_asked_for_is_not_believed(bound: dict[str, str]) -> None:
+    known = arc("fg/*", "fg/*#2", "robot/x")
+    assert not known.take(runs(bound), NOW)
+    assert (known.state, known.grant, known.rcs, known.bound) == ("asking", None, [], {})
+
+
+def test_no_binding_makes_another_rc_of_one_that_was_named() -> None:
+    known = arc("robot/x")
+    assert known.take(runs({"robot/x": "robot/y"}), NOW)
+    assert (known.rcs, known.bound) == (["robot/x"], {})
+
+
+def test_what_the_client_ends_itself() -> None:
+    lost, given_up = arc(), arc()
+    for known in (lost, given_up):
+        known.take(RUNS, NOW)
+    lost.lose("no RCM was heard", NOW)
+    assert (lost.state, lost.grant, lost.open, lost.ending) == (
+        "asking",
+        None,
+        True,
+        ("lost", "no RCM was heard", None),
+    )
+    given_up.finish("released", "given up", NOW)
+    assert (given_up.open, given_up.ending) == (False, ("released", "given up", None))
+    assert not given_up.take(AGAIN, NOW)
+
+
+def test_a_body_is_told_why_it_ended_whatever_came_after() -> None:
+    known = arc()
+    for word in (RUNS, TAKEN, WAITS):
+        known.take(word, NOW)
+    revoked = Revoked(known)
+    assert (revoked.outcome, revoked.by, str(revoked)) == ("preempted", "h/c/op", "preempted by op")
+
+
+def test_what_was_refused_before_any_hold_is_told_as_well() -> None:
+    known = arc()
+    known.take(notice(1, "ended", outcome="cancelled", reason="cancelled by an operator"), NOW)
+    revoked = Revoked(replace(known))
+    assert (revoked.outcome, str(revoked)) == ("cancelled", "cancelled by an operator")
+
+
+EXPECTED = OpenRequest("id", "survey", {"robot/x": {}}, 3, Decimal(5), True, Place(TERM, 1), 2.0, FIRST)
+
+
+def test_what_is_expected_is_nobodys_until_there_is_word_of_it() -> None:
+    known = OpenArc.expected(EXPECTED, NOW)
+    assert (known.state, known.open, known.grant, known.place) == ("expected", False, None, Place(TERM, 1))
+    assert known.open_request(NOW).waited == 2.0
+    # The old client's end of it is not the new one's.
+    assert not known.take_first(notice(9, "ended", outcome="handed_over"), NOW)
+    # Nor is what was said of it when it was here before.
+    known.last = (TERM, 1)
+    assert not known.take_first(notice(1, "running", grant=FIRST, remaining=5.0), NOW)
+    assert (known.state, known.open) == ("expected", False)
+    assert known.take_first(RUNS, NOW)
+    assert (known.state, known.grant, known.rcs) == ("running", FIRST, ["robot/x"])
+    queued = OpenArc.expected(EXPECTED, NOW)
+    assert queued.take_first(WAITS, NOW)
+    assert (queued.state, queued.open_request(NOW + SECOND).waited) == ("queued", 3.0)
+
+
+@pytest.mark.parametrize("bad", [{"id": "a/b"}, {"arc": ""}, {"needs": {"robot": {}}}])
+def test_nobody_is_handed_what_has_no_name(bad: dict[str, Any]) -> None:
+    with pytest.raises(BadName):
+        OpenArc.expected(msgspec.structs.replace(EXPECTED, **bad), NOW)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_what_moved_and_is_taken_back_keeps_its_place_and_its_wait(held: bool) -> None:
+    known = arc()
+    for word in (WAITS, RUNS, AGAIN) if held else (RUNS, TAKEN):
+        known.take(word, NOW)
+    known.place = Place(TERM, 1)
+    known.move(NOW + SECOND)
+    assert (known.state, known.open, known.grant) == ("moved", False, None)
+    assert not known.take(notice(99), NOW + SECOND)
+    known.take_back("new", "the new client is gone", NOW + 2 * SECOND)
+    asked = known.ask(NOW + 3 * SECOND)
+    assert (known.state, known.open) == ("asking", True)
+    assert (asked.id, asked.place, asked.waited) == ("new", Place(TERM, 1), 2.0 if held else 3.0)
+    revoked = Revoked(known)
+    # A hold that moved is a hold that was lost; how an earlier one ended stays as it was.
+    assert revoked.outcome == ("lost" if held else "preempted")
+    assert known.take(notice(1, "running", grant=FIRST, remaining=5.0, term=OLD), NOW + 3 * SECOND)
+
+
+def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
+    async def story() -> None:
+        store = RequestStore(lambda: NOW)
+        known = arc()
+        store.add(known)
+        store.take(known, RUNS)
+        store.resumed.clear()
+        gone = notice(9, "ended", outcome="handed_over", grant=FIRST)
+        store.take(known, gone)
+        assert (known.state, store.standing) == ("running", [known])
+        store.move(known, notice(10, "running", client="h/new", grant=SECOND_GRANT))
+        assert (store.open, store.moved, known.last) == ([], {"id": known}, (TERM, 10))
+        # What is expected is told of without a place: the RCs decide whose it is.
+        store.expected["other"] = OpenArc.expected(msgspec.structs.replace(EXPECTED, id="other"), NOW)
+        assert [(told.id, told.place, told.grant) for told in store.open_requests()] == [
+            ("other", None, None)
+        ]
+        store.resumed.set()
+        store.reclaim(known)
+        assert (list(store.arcs), store.moved, known.state) == ([known.id], {}, "asking")
+        assert known.id != "id"
+        # Of what may have been handed over it is told so afterwards: once more it is its own, elsewhere over.
+        store.reclaimed = {second := known.id}
+        store.take(known, notice(1, "ended", id=second, outcome="handed_over"))
+        assert (list(store.arcs), known.state) == ([known.id], "asking")
+        assert known.id != second
+        # A second answer about the old id says nothing of the new one.
+        store.take(known, notice(2, "ended", id=second, outcome="handed_over"))
+        assert known.state == "asking"
+        store.take(known, notice(2, "ended", id=known.id, outcome="handed_over"))
+        assert (store.arcs, known.state) == ({}, "ended")
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize(
+    ("answers", "result"),
+    [
+        (["not_yet", "stale", "not_yet", None], FIRST),
+        (["not_yet", "ended"], "ended"),
+        (["not_holder"], "not_holder"),
+    ],
+)
+def test_a_grant_is_confirmed_again_where_its_rc_has_not_heard_of_it_yet(
+    answers: list[str | None], result: Grant | str
+) -> None:
+    async def story() -> None:
+        client = Client(
+            cast("Mesh", SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)),
+            default_fleet(),
+        )
+        known = arc()
+        known.take(runs({}), NOW)
+        ended: list[OpenArc] = []
+
+        async def command(rc: str, *_: Any, **__: Any) -> None:
+            if (code := answers.pop(0)) is not None:
+                raise CommandRefused(rc, Problem(code, code))
+
+        async def end(given_up: OpenArc) -> None:
+            ended.append(given_up)
+
+        client.command, client.end = command, end  # type: ignore[assignment,method-assign]
+        if isinstance(result, Grant):
+            assert await client.granted(known) == result
+            assert (answers, ended) == ([], [])
+        else:
+            with pytest.raises(CommandRefused, match=result):
+                await client.granted(known)
+            assert (answers, ended) == ([], [known])
+
+    asyncio.run(story())

@@ -1,0 +1,115 @@
+"""Frames between a node and a component's process, good and hostile."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from decimal import Decimal
+
+import msgspec
+import pytest
+
+from zscout.behaviors.components import channel
+from zscout.behaviors.components.channel import (
+    BadFrame,
+    ComponentJob,
+    ComponentReport,
+    EndReport,
+    Order,
+    PhaseReport,
+    RestoreOrder,
+    StopOrder,
+)
+from zscout.config.fleet import default_fleet
+from zscout.messages import MAX_CHECKPOINT, OpenRequest
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        yield ours, theirs
+
+
+def test_messages_arrive_in_order_and_the_end_is_seen(pair: tuple[socket.socket, socket.socket]) -> None:
+    ours, theirs = pair
+    request = OpenRequest("1", "survey", {"robot/a": {"rate": Decimal("0.1")}}, 3, Decimal("2.5"))
+    job = ComponentJob("c", 7, "counter", "m:C", {"a": [1, None]}, "h", default_fleet(), "tag", memory=5)
+    orders = [StopOrder(), RestoreOrder(1, b"\x00\xff", [request])]
+    ours.sendall(b"".join(map(channel.pack, [job, *orders])))
+    ours.close()
+    assert channel.receive(theirs, ComponentJob) == job
+    assert [channel.receive(theirs, Order) for _ in orders] == orders
+    assert channel.receive(theirs, Order) is None
+
+
+def test_the_largest_checkpoint_goes_through(pair: tuple[socket.socket, socket.socket]) -> None:
+    ours, theirs = pair
+    state = bytes(range(256)) * (MAX_CHECKPOINT // 256)
+    sender = threading.Thread(target=ours.sendall, args=(channel.pack(RestoreOrder(1, state, [])),))
+    sender.start()
+    order = channel.receive(theirs, Order)
+    sender.join()
+    assert isinstance(order, RestoreOrder)
+    assert order.state == state
+
+
+HOSTILE = {
+    "garbage": b"GET / HTTP/1.1\r\n\r\n",
+    "too long": struct.pack(">I", channel.MAX_FRAME + 1),
+    "no JSON": struct.pack(">I", 3) + b"\xff{]",
+    "no message": struct.pack(">I", 2) + b"{}",
+    "of another sort": channel.pack(PhaseReport("running", movable=True)),
+    "deep": struct.pack(">I", 200_000) + b"[" * 200_000,
+    "wrong type": struct.pack(">I", 31) + b'{"type":"restore","number":"x"}',
+}
+
+
+@pytest.mark.parametrize("raw", HOSTILE.values(), ids=HOSTILE)
+def test_what_is_no_frame_is_refused(pair: tuple[socket.socket, socket.socket], raw: bytes) -> None:
+    ours, theirs = pair
+    sender = threading.Thread(target=ours.sendall, args=(raw,))
+    sender.start()
+    with pytest.raises(BadFrame):
+        channel.receive(theirs, Order)
+    sender.join()
+
+
+HALVES = {"header": b"\x00\x00", "body": channel.pack(StopOrder())[:-1], "nothing": b""}
+
+
+@pytest.mark.parametrize("raw", HALVES.values(), ids=HALVES)
+def test_half_a_frame_is_an_end(pair: tuple[socket.socket, socket.socket], raw: bytes) -> None:
+    ours, theirs = pair
+    ours.sendall(raw)
+    ours.close()
+    assert channel.receive(theirs, Order) is None
+
+
+def test_a_stream_is_read_alike() -> None:
+    async def read(raw: bytes) -> ComponentReport | None:
+        stream = asyncio.StreamReader()
+        stream.feed_data(raw)
+        stream.feed_eof()
+        told: ComponentReport | None = await channel.read(stream, ComponentReport)
+        return told
+
+    ends = EndReport("failed", "why")
+    assert asyncio.run(read(channel.pack(ends))) == ends
+    assert asyncio.run(read(channel.pack(ends)[:-1])) is None
+    for raw in (HOSTILE["garbage"], HOSTILE["too long"], HOSTILE["no JSON"], channel.pack(StopOrder())):
+        with pytest.raises(BadFrame):
+            asyncio.run(read(raw))
+
+
+def test_nothing_too_long_is_sent() -> None:
+    with pytest.raises(BadFrame, match="too many"):
+        channel.pack(channel.CheckpointTaken(1, b"x" * channel.MAX_FRAME))
+
+
+def test_a_move_as_large_as_the_mesh_takes_fits() -> None:
+    order = RestoreOrder(1, b"x" * MAX_CHECKPOINT, [])
+    assert len(msgspec.json.encode(order)) < channel.MAX_FRAME

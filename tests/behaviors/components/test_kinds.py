@@ -1,0 +1,69 @@
+"""Kinds of components: which are there, and what is said of those that are none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.behaviors.components.kit import ODD, register_odd_kinds
+from zscout.behaviors.components import kinds
+from zscout.behaviors.components.component import Component, is_movable
+from zscout.behaviors.components.kinds import BadKind
+from zscout.behaviors.components.shipped import Counter, Spin
+
+
+def test_what_comes_with_zscout_is_installed_and_can_be_loaded() -> None:
+    there = kinds.installed()
+    assert [kinds.load(kind, there[kind]) for kind in ("counter", "spin")] == [Counter, Spin]
+    assert is_movable(Counter({}))
+    assert not is_movable(Component({}))
+
+
+def test_kinds_of_other_packages_are_seen_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "still" not in kinds.installed()
+    register_odd_kinds(tmp_path / "site")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    assert set(ODD) < set(kinds.installed())
+
+
+def test_a_name_that_means_two_things_or_none_is_no_kind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "other-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[zscout.components]\nspin = a:B\nbad/name = a:B\nfine = a:B\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    there = kinds.installed()
+    assert there["fine"] == "a:B"
+    assert "spin" not in there
+    assert "bad/name" not in there
+
+
+@pytest.mark.parametrize(
+    "where",
+    ["zscout.behaviors.components.shipped:PAGE", "zscout.behaviors.components.shipped:No.such", "json"],
+)
+def test_what_is_no_component_is_refused_in_one_line(where: str) -> None:
+    with pytest.raises(BadKind, match=r"kind x: .* no subclass of .*; mend the entry point") as caught:
+        kinds.load("x", where)
+    assert "\n" not in str(caught.value)
+
+
+BAD = [
+    (Spin, {"cpu": 2}, "cpu is 2; write a number from 0 to 1"),
+    (Spin, {"cpu": True}, "cpu is True"),
+    (Spin, {"cpu": float("nan")}, "cpu is nan"),
+    (Spin, {"cores": 2}, "no parameter 'cores'; there are cpu, memory"),
+    (Counter, {"rc": 5}, "kind/name"),
+    (Counter, {"rc": "robot"}, "kind/name"),
+    (Counter, {"period": 0}, "period is 0"),
+]
+
+
+@pytest.mark.parametrize(("kind", "params", "words"), BAD)
+def test_bad_parameters_are_told(kind: type[Component], params: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=words) as caught:
+        kind(params)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,40 @@
+"""The source's side of a move, on a mesh in memory."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from tests.mesh.kit import run
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.components.component import SafePointGate
+from zscout.behaviors.components.migration import RESTORE_TIMEOUT, NotMoved, OutgoingMove
+from zscout.behaviors.components.shipped import Counter
+from zscout.config.fleet import default_fleet
+from zscout.keyexpr import Sender
+from zscout.mesh.memory import MemoryNetwork
+from zscout.messages import ComponentOperation, ComponentSpec, ComponentView
+from zscout.types import SECOND
+
+STANDS_BY = ComponentView("c", 2, "b", ComponentSpec("counter"), "standby")
+
+
+def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
+    async def test() -> None:
+        network = MemoryNetwork()
+        client = Client(network.open("f", Sender("a", "c.1")), default_fleet())
+        node = network.open("f", Sender("b", "node"))
+        move = OutgoingMove(client, Counter({}), SafePointGate(), "c", "b", 2)
+        began = client.mesh.now()
+        with pytest.raises(NotMoved, match="b did not answer"):
+            await move._give(b"", [])
+        assert (client.mesh.now() - began) / SECOND == pytest.approx(RESTORE_TIMEOUT, abs=1.1)
+
+        def serve() -> None:
+            node.serve(node.keys.component("b"), ComponentOperation, lambda query: query.answer(STANDS_BY))
+
+        asyncio.get_running_loop().call_later(1, serve)
+        await move._give(b"", [])
+
+    run(test())

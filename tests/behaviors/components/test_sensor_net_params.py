@@ -1,0 +1,165 @@
+"""Parameters of `place_robot` and `place_sensor_net`: what is wrong is told in one line that names it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from zscout.behaviors.components import kinds
+from zscout.behaviors.components.component import is_movable
+from zscout.behaviors.components.sensor_net import PlaceRobotComponent, PlaceSensorNetComponent, StatusPrinter
+from zscout.behaviors.sensor_net.place_robot import PlaceRobot
+from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
+from zscout.behaviors.tree import BehaviorStatus
+
+ONE: dict[str, Any] = {"robot": "robot/scout33"}
+TWO: dict[str, Any] = {"robots": ["robot/scout33", "robot/scout35"]}
+ROBOT_LIST = 'write a list of 1 to 64, as in ["robot/scout33"]'
+A_ROBOT = "write a robot, as in robot/scout33"
+
+SHARED: list[tuple[dict[str, Any], str]] = [
+    ({"radio": "robot/scout33"}, "radio is 'robot/scout33'; write radio/NAME or a pattern, as in radio/*"),
+    ({"radio": "rf0"}, "radio is 'rf0'; write radio/NAME or a pattern, as in radio/*"),
+    ({"video": None}, "video is None; write video/NAME or a pattern, as in video/*"),
+    ({"video": "video/**"}, "video: need 'video/**' is not valid: "),
+    ({"framegrabber": ["framegrabber/fgrab1"]}, "framegrabber is ['framegrabber/fgrab1']; write "),
+    ({"framegrabber": "framegrabber/a/b"}, "framegrabber: RC name 'a/b' is not valid: "),
+    ({"framegrabber": "framegrabber/"}, "framegrabber: RC name '' is not valid: "),
+    ({"command_rate": 0}, "command_rate is 0; write a number from 0.5 to 50"),
+    ({"command_rate": 50.1}, "command_rate is 50.1; write a number from 0.5 to 50"),
+    ({"command_rate": "5"}, "command_rate is '5'; write a number from 0.5 to 50"),
+    ({"speed": 0}, "speed is 0; write a number from 0.01 to 100"),
+    ({"speed": float("nan")}, "speed is nan; write a number from 0.01 to 100"),
+    ({"speed": True}, "speed is True; write a number from 0.01 to 100"),
+    ({"hide_slot": -1}, "hide_slot is -1; write a number from 1 to 3600"),
+    ({"watch_slot": float("inf")}, "watch_slot is inf; write a number from 1 to 3600"),
+    ({"hide_priority": 1.5}, "hide_priority is 1.5; write a whole number from -1000 to 1000"),
+    ({"watch_priority": 1001}, "watch_priority is 1001; write a whole number from -1000 to 1000"),
+    ({"watch_priority": False}, "watch_priority is False; write a whole number from -1000 to 1000"),
+    ({"watch_priorty": 1}, "there is no parameter 'watch_priorty'; there are robot"),
+]
+"""Wrong for both, with how the words begin."""
+
+OF_ONE: list[tuple[dict[str, Any], str]] = [
+    ({}, "robot is missing; write one, as in robot/scout33"),
+    ({"robot": None}, f"robot is None; {A_ROBOT}"),
+    ({"robot": "scout33"}, f"robot is 'scout33'; {A_ROBOT}"),
+    ({"robot": "radio/rf0"}, f"robot is 'radio/rf0'; {A_ROBOT}"),
+    ({"robot": "robot/*"}, "robot: RC name '*' is not valid: "),
+    ({"robot": ["robot/scout33"]}, f"robot is ['robot/scout33']; {A_ROBOT}"),
+    (ONE | {"above": 3}, "above is 3; write the path of a behavior, 100 letters at most"),
+    (ONE | {"above": "x" * 101}, "above is 'xxx"),
+    (TWO, "there is no parameter 'robots'; there are robot, above, "),
+]
+
+OF_NET: list[tuple[dict[str, Any], str]] = [
+    ({}, f"robots is missing; {ROBOT_LIST}"),
+    ({"robots": None}, f"robots is None; {ROBOT_LIST}"),
+    ({"robots": []}, f"robots is []; {ROBOT_LIST}"),
+    ({"robots": "robot/scout33"}, f"robots is 'robot/scout33'; {ROBOT_LIST}"),
+    ({"robots": {"robot/scout33": 1}}, f"robots is {{'robot/scout33': 1}}; {ROBOT_LIST}"),
+    ({"robots": [f"robot/scout{number}" for number in range(65)]}, "robots is ['robot/scout0', "),
+    ({"robots": ["robot/scout33", 35]}, f"robots[1] is 35; {A_ROBOT}"),
+    ({"robots": ["framegrabber/fgrab1"]}, f"robots[0] is 'framegrabber/fgrab1'; {A_ROBOT}"),
+    ({"robots": ["robot/*"]}, "robots[0]: RC name '*' is not valid: "),
+    (
+        {"robots": ["robot/scout33", "robot/scout35", "robot/scout33"]},
+        "robots: robot/scout33 is named twice; name each robot once",
+    ),
+    (TWO | {"wanted": 0}, "wanted is 0; write a whole number from 1 to 2"),
+    (TWO | {"wanted": 3}, "wanted is 3; write a whole number from 1 to 2"),
+    (TWO | {"wanted": 1.0}, "wanted is 1.0; write a whole number from 1 to 2"),
+    (TWO | {"wanted": True}, "wanted is True; write a whole number from 1 to 2"),
+    (TWO | {"name": "../net"}, "name '../net' is not valid: "),
+    (TWO | {"name": ""}, "name '' is not valid: "),
+    (TWO | {"name": ["net"]}, "name \"['net']\" is not valid: "),
+    (TWO | {"above": "net"}, "there is no parameter 'above'; there are robots, wanted, name, "),
+]
+
+WRONG = [
+    *((PlaceRobotComponent, ONE | wrong, words) for wrong, words in SHARED),
+    *((PlaceSensorNetComponent, TWO | wrong, words) for wrong, words in SHARED),
+    *((PlaceRobotComponent, wrong, words) for wrong, words in OF_ONE),
+    *((PlaceSensorNetComponent, wrong, words) for wrong, words in OF_NET),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "params", "words"), WRONG, ids=[f"{kind.__name__}: {words:.40}" for kind, _, words in WRONG]
+)
+def test_what_is_wrong_is_told_in_one_line(
+    kind: type[PlaceRobotComponent] | type[PlaceSensorNetComponent], params: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ValueError) as told:  # noqa: PT011 - the words are what is tested
+        kind(params)
+    line = str(told.value)
+    assert line.startswith(words)
+    assert "\n" not in line
+    assert len(line) < 300
+
+
+def test_what_is_asked_for_reaches_the_behaviors() -> None:
+    asked = {"radio": "radio/rf0", "video": "video/$*1", "command_rate": 8, "speed": 2, "watch_priority": -3}
+    one = PlaceRobotComponent(ONE | asked | {"above": "net", "hide_slot": 5, "watch_slot": 2.5})
+    assert isinstance(one.root, PlaceRobot)
+    assert (one.speed, one.root.path) == (2.0, "net/scout33")
+    assert one.root.needs.needs() == {
+        "robot/scout33": {},
+        "radio/rf0": {"command_rate": 8.0, "packet_size": 10},
+        "video/$*1": {"transmitters": 1},
+        "framegrabber/*": {},
+    }
+    assert (one.root.slots.of("hide"), one.root.slots.of("watch")) == ((2, 5.0), (-3, 2.5))
+
+
+def test_each_robot_of_a_net_is_placed_with_what_the_net_was_told() -> None:
+    net = PlaceSensorNetComponent(TWO | {"wanted": 1, "name": "night", "speed": 2, "hide_slot": 9})
+    assert isinstance(net.root, PlaceSensorNet)
+    assert (net.root.net.wanted, list(net.root.net.members)) == (1, TWO["robots"])
+    spec = net._spec_for("robot/scout35", "night")
+    assert spec.kind == "place_robot"
+    assert spec.params == {"robot": "robot/scout35", "above": "night", "speed": 2, "hide_slot": 9}
+    # What the net passes on is good for who gets it.
+    placed = PlaceRobotComponent(spec.params)
+    assert placed.root.path == "night/scout35"
+
+
+def test_both_are_installed_and_can_be_moved() -> None:
+    there = kinds.installed()
+    assert kinds.load("place_robot", there["place_robot"]) is PlaceRobotComponent
+    assert kinds.load("place_sensor_net", there["place_sensor_net"]) is PlaceSensorNetComponent
+    for made, same in (
+        (PlaceRobotComponent(ONE), PlaceRobotComponent(ONE)),
+        (PlaceSensorNetComponent(TWO), PlaceSensorNetComponent(TWO)),
+    ):
+        assert is_movable(made)
+        same.restore(made.checkpoint())
+        assert same.checkpoint() == made.checkpoint()
+
+
+def test_the_output_tells_each_word_once_and_every_alert(capsys: pytest.CaptureFixture[str]) -> None:
+    printer, robot = StatusPrinter(), "robot/scout33"
+    said = [
+        ("approach", "dark place 1.4 m ahead", False),
+        ("approach", "dark place 1.3 m ahead", False),
+        ("enter", "", False),
+        ("alert", "motion 1", True),
+        ("alert", "motion 2", True),
+        ("", "", False),
+        ("enter", "", False),
+    ]
+    for doing, detail, alert in said:
+        printer(BehaviorStatus("net/scout33/hide", doing, detail, robot=robot, alert=alert))
+    printer(BehaviorStatus("net", "place", "0 of 2 hidden"))
+    printer(BehaviorStatus("net", "place", "1 of 2 hidden"))
+    printer(BehaviorStatus("net", "place", "1 of 2 hidden"))
+    assert capsys.readouterr().out.splitlines() == [
+        "net/scout33/hide approach: dark place 1.4 m ahead",
+        "net/scout33/hide enter",
+        "net/scout33/hide ALERT: motion 1",
+        "net/scout33/hide ALERT: motion 2",
+        "net/scout33/hide enter",
+        "net place: 0 of 2 hidden",
+        "net place: 1 of 2 hidden",
+    ]

@@ -1,0 +1,83 @@
+"""Dark places: gaps are found where they are, dark faces are not, whatever the exposure."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.behaviors.perception.rooms import (
+    carton,
+    room,
+    seen_from,
+    sofa,
+)
+from zscout.behaviors.perception.darkness import analyse
+from zscout.behaviors.perception.lens import (
+    FIELD,
+    GAMMA,
+    bearing,
+    column,
+    floor_distance,
+    floor_row,
+    linear,
+)
+from zscout.lab.building.plan import Rug
+
+
+@pytest.mark.parametrize("distance", [0.5, 0.8, 1.2, 1.8])
+def test_the_gap_beneath_a_sofa_is_found_where_it_is(distance: float) -> None:
+    picture = seen_from(room(sofa(4.0)), 4.0 - distance, 2.0, 0.0)
+    widest = max(analyse(picture).places, key=lambda place: place.width)
+    assert widest.distance == pytest.approx(distance, rel=0.25, abs=0.05)
+    assert widest.height == pytest.approx(0.12, abs=0.05)
+    seen = min(2.0, 2 * distance * math.tan(FIELD / 2))
+    assert widest.width == pytest.approx(seen, rel=0.35)
+    assert widest.darkness < 0.1
+    assert abs(widest.bearing) < 0.15
+
+
+@pytest.mark.parametrize("distance", [0.4, 0.8, 1.3])
+def test_a_black_carton_is_no_place_to_hide(distance: float) -> None:
+    assert analyse(seen_from(room(carton(4.0)), 4.0 - distance, 2.0, 0.0)).places == ()
+
+
+def test_an_empty_room_has_no_dark_place() -> None:
+    for turn in range(8):
+        assert analyse(seen_from(room(), 2.5, 2.0, turn * math.pi / 4)).places == ()
+
+
+def test_exposure_changes_nothing() -> None:
+    picture = seen_from(room(sofa(4.0)), 3.0, 2.0, 0.0)
+    darker = np.round(255 * (linear(picture) * 0.5) ** (1 / GAMMA)).astype(np.uint8)
+    (one,), (other,) = analyse(picture).places, analyse(darker).places
+    assert other.distance == pytest.approx(one.distance, rel=0.1)
+    assert other.width == pytest.approx(one.width, rel=0.15)
+    assert analyse(darker).lit == pytest.approx(analyse(picture).lit / 2, rel=0.1)
+
+
+def test_out_of_the_dark_the_light_stands_out() -> None:
+    plan = room(sofa(4.0))
+    inside = analyse(seen_from(plan, 4.3, 2.0, math.pi))
+    assert inside.near < 0.1 * inside.outside
+    assert float(np.mean(inside.contrast >= 4)) > 0.9
+    assert inside.above < 0.2 * inside.outside
+    away = analyse(seen_from(plan, 4.3, 2.0, 0.0))
+    assert float(away.contrast.mean()) < 0.3 * float(inside.contrast.mean())
+
+
+def test_a_dark_rug_has_no_roof() -> None:
+    plan = room(rugs=(Rug(x=2.5, y=2.0, width=0.8, depth=0.8, shade=0.04),))
+    view = analyse(seen_from(plan, 2.5, 2.0, 0.0))
+    assert view.near < 0.3 * view.outside
+    assert view.above > 0.4 * view.outside
+
+
+def test_the_lens_goes_both_ways() -> None:
+    for row in (61.0, 75.5, 119.0):
+        assert floor_row(floor_distance(row)) == pytest.approx(row)
+    assert floor_distance(59.0) == math.inf
+    for at in (0.0, 79.5, 150.0):
+        assert column(bearing(at)) == pytest.approx(at)
+    assert bearing(0) > 0 > bearing(159)

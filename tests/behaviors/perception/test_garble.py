@@ -1,0 +1,76 @@
+"""Spoiled pictures are told from good ones, the darkest included."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from tests.behaviors.perception.rooms import room, sofa
+from zscout.behaviors.perception.garble import garbled
+from zscout.behaviors.perception.lens import Picture
+from zscout.lab.building.air import Air
+from zscout.lab.building.bodies import Pose
+from zscout.lab.building.plan import Robot
+from zscout.lab.building.world import World
+
+CHANNEL = 1
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    plan = room(sofa(4.0))
+    both = (*plan.robots, Robot(name="other", id=2, x=1.0, y=1.0))
+    world = World(msgspec.structs.replace(plan, robots=both), seed=3)
+    world.bodies["scout"].transmit(CHANNEL, 0.0)
+    while world.time < 2.5:
+        world.step(0.1)
+    return world
+
+
+@pytest.fixture(scope="module")
+def good(world: World) -> list[Picture]:
+    """Through the air, from the open and from beneath the sofa, all ways around."""
+    air, pictures = Air(seed=1), []
+    for turn in range(24):
+        for x in (1.5, 3.2, 4.4):
+            world.bodies["scout"].place(*Pose(x, 2.0, turn * math.pi / 12))
+            world.step(0.1)
+            pictures.append(air.receive(world, CHANNEL))
+    return pictures
+
+
+def test_good_pictures_are_believed(good: list[Picture]) -> None:
+    assert [garbled(picture) for picture in good].count(None) == len(good)
+
+
+def test_snow(world: World) -> None:
+    air = Air(seed=2)
+    assert {garbled(air.receive(world, 7)) for _ in range(20)} == {"snow"}
+
+
+def test_two_transmitters_on_one_channel(world: World) -> None:
+    air = Air(seed=4)
+    world.bodies["other"].transmit(CHANNEL, 0.0)
+    try:
+        found = []
+        for turn in range(30):
+            world.bodies["scout"].place(*Pose(1.5 + turn / 10, 2.0, turn / 4))
+            found.append(garbled(air.receive(world, CHANNEL)))
+    finally:
+        world.bodies["other"].transmit(None, world.time)
+    assert found.count(None) <= 1
+
+
+@pytest.mark.parametrize("grey", [0, 16, 128, 255])
+def test_blank(grey: int) -> None:
+    assert garbled(np.full((120, 160), grey, np.uint8)) == "blank"
+
+
+def test_half_a_picture(good: list[Picture]) -> None:
+    for picture in good:
+        half = picture.copy()
+        half[70:] = 128
+        assert garbled(half) is not None

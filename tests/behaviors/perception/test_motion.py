@@ -1,0 +1,233 @@
+"""The motion detector on made-up scenes, on real recordings, and hidden in a simulated building."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.behaviors.perception.recordings import (
+    EMPTY_LAWN,
+    GARDEN,
+    HAND,
+    PASSERS_BY,
+    PEOPLE,
+    covered,
+    pictures,
+)
+from tests.behaviors.perception.scenes import Scene, box_of, overlap
+from zscout.behaviors.perception.motion import MAX_SIDE, MotionDetector
+from zscout.lab.building.plan_file import load_plan, shipped_plans
+from zscout.lab.trials.watch import (
+    Case,
+    Watched,
+    cases,
+    plan_of,
+    watch,
+)
+
+MISSING = "needs Debian's package opencv-doc (apt-get install opencv-doc)"
+
+
+def times(rate: float, seconds: float, start: float = 0.0) -> Iterator[float]:
+    for number in range(round(rate * seconds)):
+        yield start + number / rate
+
+
+def settled(scene: Scene, rate: float = 10.0, seconds: float = 4.0) -> MotionDetector:
+    """A detector that has looked at the empty scene until `seconds`."""
+    detector = MotionDetector()
+    for time in times(rate, seconds):
+        detector.see(time, scene.picture())
+    return detector
+
+
+@pytest.mark.parametrize(
+    ("noise", "rate", "seconds"),
+    [(1.0, 5.0, 16.0), (1.0, 30.0, 3.0), (5.0, 2.0, 30.0), (12.0, 5.0, 16.0), (12.0, 2.0, 30.0)],
+)
+def test_nobody_is_no_alarm_and_a_walker_is_one_within_a_second(
+    noise: float, rate: float, seconds: float
+) -> None:
+    scene, detector = Scene(1, noise=noise), MotionDetector()
+    assert not any(detector.see(time, scene.picture()).moving for time in times(rate, seconds))
+    first, best = None, 0.0
+    for time in times(rate, 3.0, seconds):
+        walker = 20 + 40 * (time - seconds)
+        seen = detector.see(time, scene.picture(walker))
+        if seen.moving:
+            first = time if first is None else first
+            best = max(best, overlap(seen.boxes[0], box_of(walker)))
+    assert first is not None
+    assert first - seconds <= 1.0
+    assert best > 0.5
+
+
+def test_pictures_at_uneven_times_with_gaps() -> None:
+    scene, detector = Scene(2), MotionDetector()
+    moments = np.cumsum(np.random.default_rng(2).exponential(0.3, 100))
+    moments[50:] += 40
+    assert not any(detector.see(float(time), scene.picture()).moving for time in moments)
+    end = float(moments[-1])
+    assert any(detector.see(end + 0.3 * n, scene.picture(30 + 12 * n)).moving for n in range(1, 4))
+
+
+def test_light_that_flickers_drifts_and_is_switched_moves_nothing() -> None:
+    scene, detector = Scene(3), settled(Scene(3))
+    rng, told = np.random.default_rng(3), []
+    for time in times(5, 24, 4):
+        drift = 1 - 0.4 * (time - 4) / 24
+        switched = 0.6 if time > 20 else 1.0
+        gain = drift * switched * (1 + 0.08 * np.sin(2 * np.pi * 3.7 * time) + rng.normal(0, 0.02))
+        told.append(detector.see(time, scene.picture(gain=gain)).moving)
+    assert not any(told)
+
+
+def test_a_walker_is_seen_while_the_exposure_follows_him() -> None:
+    scene = Scene(4)
+    detector = settled(scene)
+    told = [
+        detector.see(4 + n / 10, scene.picture(30 + 4 * n, gain=1 + 0.03 * n, shade=20)).moving
+        for n in range(10)
+    ]
+    assert sum(told) >= 8
+
+
+def test_torn_lines_are_no_motion() -> None:
+    scene = Scene(5)
+    detector = settled(scene)
+    for number, time in enumerate(times(10, 10, 4)):
+        picture = scene.picture()
+        if number % 7 < 2:
+            row = 40 + 2 * (number % 7)
+            picture[row : row + 4] = np.roll(picture[row : row + 4], 17, axis=1)
+        assert not detector.see(time, picture).moving, time
+
+
+def test_a_moved_camera_is_learned_anew() -> None:
+    scene, elsewhere = Scene(6), Scene(66)
+    detector = settled(scene)
+    first = detector.see(4.0, elsewhere.picture())
+    assert not first.moving
+    assert first.learning
+    later = [detector.see(time, elsewhere.picture()).moving for time in times(10, 8, 4.1)]
+    assert not any(later)
+
+
+def test_who_stops_is_motion_no_longer_and_leaves_no_ghost() -> None:
+    scene = Scene(7)
+    detector = settled(scene, rate=5)
+    came = [
+        detector.see(time, scene.picture(min(80, 30 + 50 * (time - 4)))).moving for time in times(5, 2, 4)
+    ]
+    assert sum(came) >= 6
+    stands = [detector.see(time, scene.picture(80)).moving for time in times(5, 20, 6)]
+    assert not any(stands[50:])
+    left = [detector.see(time, scene.picture()).moving for time in times(5, 20, 26)]
+    assert not any(left[25:])
+
+
+def test_two_walkers_are_two_boxes_largest_first() -> None:
+    scene = Scene(8)
+    detector = settled(scene)
+    for number in range(4):
+        picture = scene.picture(40 + 2 * number)
+        picture[60:90, 120 - number : 128 - number] = 240
+        seen = detector.see(4 + number / 10, picture)
+    assert len(seen.boxes) == 2
+    assert seen.boxes[0].height > seen.boxes[1].height
+    assert overlap(seen.boxes[1], (117, 60, 8, 30)) > 0.3
+
+
+def test_large_colour_pictures_have_boxes_in_their_own_pixels() -> None:
+    scene, detector = Scene(9), MotionDetector()
+    for time in times(10, 5):
+        walker = 80 + 20 * (time - 4) if time >= 4 else None
+        large = cv2.resize(scene.picture(walker), (640, 480), interpolation=cv2.INTER_NEAREST)
+        seen = detector.see(time, np.asarray(cv2.merge([large, large, large]), np.uint8))
+    left, top, width, height = box_of(80 + 20 * 0.9)
+    assert seen.moving
+    assert overlap(seen.boxes[0], (4 * left, 4 * top, 4 * width, 4 * height)) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((120, 160), np.float32),
+        ((120, 160), np.uint16),
+        ((120, 160, 4), np.uint8),
+        ((0, 160), np.uint8),
+        ((7, 160), np.uint8),
+        ((8, MAX_SIDE + 1), np.uint8),
+        ((160,), np.uint8),
+    ],
+)
+def test_what_is_no_picture_is_refused(shape: tuple[int, ...], kind: type) -> None:
+    with pytest.raises(ValueError, match="no picture"):
+        MotionDetector().see(0.0, np.zeros(shape, kind))
+
+
+def test_plain_pictures_and_times_that_go_back_do_no_harm() -> None:
+    detector = MotionDetector()
+    for number, level in enumerate((0, 0, 0, 0, 255, 255, 7, 7, 0)):
+        seen = detector.see(10.0 - number, np.full((120, 160), level, np.uint8))
+        assert not seen.moving
+
+
+@pytest.mark.skipif(not PASSERS_BY.exists(), reason=MISSING)
+def test_passers_by_of_a_real_recording_are_found_and_nobody_else() -> None:
+    whole, lawn = MotionDetector(), MotionDetector()
+    rows, columns, empty_until = EMPTY_LAWN
+    found = people = 0
+    for number, (time, picture) in enumerate(pictures(PASSERS_BY)):
+        seen = whole.see(time, picture)
+        if time < empty_until:
+            part = np.ascontiguousarray(picture[rows, columns])
+            assert not lawn.see(time, part).moving, f"the empty lawn moves at {time} s"
+        if number >= 10:
+            assert seen.moving or number < 12
+        for one in PEOPLE.get(number, ()):
+            people += 1
+            found += max((covered(one, box) for box in seen.boxes), default=0.0) >= 0.5
+        if number in PEOPLE:
+            for box in seen.boxes:
+                assert any(covered(one, box) >= 0.25 for one in PEOPLE[number]), (number, box)
+        if number == 160:
+            break
+    assert people == 13
+    assert found >= 8
+
+
+@pytest.mark.skipif(not GARDEN.exists(), reason=MISSING)
+def test_leaves_in_the_wind_hardly_count_and_a_hand_does() -> None:
+    detector = MotionDetector()
+    told = [(time, detector.see(time, picture).moving) for time, picture in pictures(GARDEN)]
+    assert sum(moving for time, moving in told if time < HAND) <= 3
+    hand = [moving for time, moving in told if time >= HAND]
+    assert any(hand[:2])
+    assert sum(hand) >= 11
+
+
+def test_hidden_in_a_building_it_alerts_to_who_walks_by() -> None:
+    """Far from the figures of docs/watching.md, which `python -m benchmarks.watching` measures."""
+    sight = Watched()
+    for seed in (3, 4):
+        case = Case("living_room", 1.0, seed)
+        sight.add(watch(plan_of(case), seed=seed, noise=case.noise, seconds=16))
+    assert sight.crossings >= 1
+    assert sight.alerted == sight.crossings
+    assert sight.false_alarms == 0
+    assert sight.empty > 5
+
+
+def test_a_batch_is_even_however_soon_it_is_cut() -> None:
+    names = sorted(shipped_plans())
+    some = cases(names, seeds=3, noises=(0.5, 2.0))
+    assert len(some) == len(set(some)) == 6 * len(names)
+    assert {(case.building, case.noise) for case in some[: 2 * len(names)]} == {
+        (name, noise) for name in names for noise in (0.5, 2.0)
+    }
+    assert {case.seed for case in some[: 2 * len(names)]} == {0}
+    assert plan_of(some[0]).people[0].first < load_plan(shipped_plans()[names[0]]).people[0].first

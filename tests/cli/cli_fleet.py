@@ -1,0 +1,86 @@
+"""A real fleet for tests of the `zscout` command, driven from plain functions."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.cli import tools
+from tests.live.lab import Lab
+from zscout.behaviors.client.blocking import connect
+from zscout.messages import RcmState
+
+
+class CliFleet:
+    """One node with RCs, and `zscout` processes that use it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.lab = Lab(folder)
+        self.folder = folder
+        self._started: list[subprocess.Popen[str]] = []
+        self._eye = connect("eye", fleet=self.lab.fleet, host="test")
+
+    def zscout(self, *args: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
+        """Runs a command to its end, away from any terminal."""
+        return tools.zscout(*args, env=self.lab.env, stdin=stdin)
+
+    def start(self, *args: str) -> subprocess.Popen[str]:
+        """Starts a command; stdout and stderr come out of `.stdout`."""
+        process = subprocess.Popen(
+            [*tools.COMMAND, *args],
+            env=self.lab.env,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            bufsize=1,
+        )
+        self._started.append(process)
+        return process
+
+    def holder(self, name: str, *args: str) -> subprocess.Popen[str]:
+        """A request that holds already when this returns."""
+        process = self.start("request", "--name", name, *args)
+        tools.read_until(process, f"{name} holds")
+        return process
+
+    def state(self, until: Callable[[RcmState], bool]) -> RcmState:
+        """The RCM's state as soon as `until` holds of it."""
+        return self._eye.run(self.lab.state(self._eye.client, until))
+
+    def idle(self, *rcs: str) -> bool:
+        """Returns when nobody holds or waits for these RCs."""
+
+        def nobody(state: RcmState) -> bool:
+            needed = [view.needs for view in state.holds] + [view.needs for view in state.queue]
+            return not any(rc in needs for rc in rcs for needs in needed)
+
+        self.state(nobody)
+        return True
+
+    def terminal(self, *args: str) -> tools.Terminal:
+        """A command at a terminal of its own. Use as a context manager."""
+        return tools.Terminal(*args, env=self.lab.env)
+
+    def close(self) -> None:
+        for process in self._started:
+            tools.end(process)
+        self._eye.close()
+        asyncio.run(self.lab.__aexit__(None, None, None))
+
+
+@contextmanager
+def fleet_of(folder: Path, *rcs: str, env: Mapping[str, str] | None = None) -> Iterator[CliFleet]:
+    """A fleet of one node with these RCs, ready; `env` beside the environment of this process."""
+    fleet = CliFleet(folder)
+    fleet.lab.env |= env or {}
+    try:
+        fleet.lab.node("anvil", *rcs)
+        wanted = {rc.partition(":")[0] for rc in rcs}
+        fleet.state(lambda state: wanted <= {view.rc for view in state.rcs if view.present})
+        yield fleet
+    finally:
+        fleet.close()

@@ -1,0 +1,137 @@
+"""What is written behind `zscout start` and its like: read strictly, before anybody is asked."""
+
+from __future__ import annotations
+
+import pytest
+from click.testing import CliRunner
+
+from zscout.cli.components.logs import last
+from zscout.cli.components.placing import standing, tail_of, unknown
+from zscout.cli.components.start import gather_params, parse_size
+from zscout.cli.main import main
+from zscout.config.strict import BadInput
+from zscout.messages import ComponentSpec, Placement
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1", 1), ("500M", 500 << 20), ("1.5G", 3 << 29), ("2k", 2048), ("1GiB", 1 << 30), ("1TB", 1 << 40)],
+)
+def test_sizes(text: str, size: int) -> None:
+    assert parse_size(text, "--memory") == size
+
+
+@pytest.mark.parametrize(
+    "text", ["", "0", "M", "-1", "1e3", "5P", "1 M", "0.0001", "9" * 30, "2000000T", "٣"]
+)
+def test_what_is_no_size_is_refused(text: str) -> None:
+    with pytest.raises(BadInput, match=r"--memory: .* is no size; write bytes, or with a unit"):
+        parse_size(text, "--memory")
+
+
+def test_parameters_are_json_or_else_text() -> None:
+    settings = ["a=1", "b=0.5", "c=true", "d=robot/a", 'e="1"', "f=[1, 2]", "g=", "h=x=y", "i=NaN"]
+    assert gather_params('{"a": 7, "z": null}', settings) == {
+        "a": 1,
+        "b": 0.5,
+        "c": True,
+        "d": "robot/a",
+        "e": "1",
+        "f": [1, 2],
+        "g": "",
+        "h": "x=y",
+        "i": "NaN",
+        "z": None,
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "settings", "words"),
+    [
+        ("[1]", [], "is not a JSON object"),
+        ("{", [], "is not a JSON object"),
+        ('{"a": 1e999}', [], "is not a JSON object"),
+        ("{'a': 1}", [], "is not a JSON object"),
+        ("[" * 100_000, [], "is not a JSON object"),
+        (None, ["a"], '--set "a" sets nothing; write KEY=VALUE'),
+        (None, ["=1"], '--set "=1" sets nothing'),
+        (None, ["a=1", "a=2"], '"a" is given twice'),
+        (None, ["a=" + "x" * 17_000], "at most 16384 are taken"),
+    ],
+)
+def test_bad_parameters(given: str | None, settings: list[str], words: str) -> None:
+    with pytest.raises(BadInput) as error:
+        gather_params(given, settings)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["start"], "Missing argument 'KIND'"),
+        (["start", "a/b"], "kind 'a/b' is not valid"),
+        (["start", "counter", "--name", "a b"], "--name 'a b' is not valid"),
+        (["start", "counter", "--name", ""], "--name '' is not valid"),
+        (["start", "k" * 49], "has more than 48 characters; give a shorter --name"),
+        (["start", "counter", "--host", "a*"], "--host 'a*' is not valid"),
+        (["start", "counter", "--label", "a/b"], "--label 'a/b' is not valid"),
+        (["start", "counter", "--memory", "much"], '--memory: "much" is no size'),
+        (["start", "counter", "--memory-limit", "-5"], '--memory-limit: "-5" is no size'),
+        (["start", "counter", "--cpu-limit", "nan"], '--cpu-limit: "nan" is no number of cores'),
+        (["start", "counter", "--cpu-limit", "0"], '--cpu-limit: "0" is no number of cores'),
+        (["start", "counter", "--restart", "maybe"], "'maybe' is not one of"),
+        (["start", "counter", "--timeout", "soon"], '--timeout: "soon" is not a duration'),
+        (["start", "counter", *[f"--label=l{n}" for n in range(33)]], "33 labels; at most 32"),
+        (["start", "counter", *[f"--host=h{n}" for n in range(257)]], "257 hosts; name at most 256"),
+        (["stop"], "Missing argument 'NAME...'"),
+        (["stop", "a/b"], "component 'a/b' is not valid"),
+        (["logs", "*"], "zscout components lists them"),
+        (["logs", "counter", "--lines", "-1"], "-1 is not in the range"),
+        (["migrate", "counter", "--to", "a/b"], "--to 'a/b' is not valid"),
+        (["drain", "*"], "host '*' is not valid"),
+        (["uncordon", ""], "host '' is not valid"),
+        (["components", "--kinds", "--watch"], "leave NAME and --watch out"),
+        (["components", "a b"], "component 'a b' is not valid"),
+    ],
+)
+def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
+    done = CliRunner().invoke(main, args)
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert words in done.stderr
+
+
+def test_how_a_component_stands_in_words() -> None:
+    spec = ComponentSpec("counter")
+
+    def words(state: str, **more: object) -> str:
+        return standing(Placement("c", spec, state, **more))  # type: ignore[arg-type]
+
+    assert words("running", host="anvil", reason="best of 3") == "runs on anvil"
+    assert words("waiting", reason="no host has gpu") == "waits for a host: no host has gpu"
+    assert words("moving", host="anvil", to="bellows") == "is moving from anvil to bellows"
+    assert words("backing_off", reason="exit code 3") == "failed, and will be started again: exit code 3"
+    assert words("ended") == "has ended"
+    assert words("given_up", reason="exit code 3") == "is given up: exit code 3"
+
+
+def test_what_a_component_wrote_can_not_draw() -> None:
+    assert tail_of(Placement("c", ComponentSpec("k"), "given_up", tail="a\tb\n\x1b[31mred\n")) == [
+        "a       b",
+        " [31mred",
+    ]
+
+
+def test_the_last_lines() -> None:
+    assert last("a\nb\nc", None) == "a\nb\nc"
+    assert last("a\nb\nc\n", 2) == "b\nc\n"
+    assert last("a\nb", 1) == "b"
+    assert last("a\n", 0) == ""
+    assert last("", 5) == ""
+
+
+def test_an_unknown_name_is_told_what_there_is() -> None:
+    assert str(unknown("cuonter", ["spin", "counter"])).endswith("did you mean counter?")
+    assert str(unknown("x", [])).endswith("nor any other; start one: zscout start")
+    many = str(unknown("zzz", [f"a{number}" for number in range(10)]))
+    assert many.endswith("known: a0, a1, a2, a3, a4, a5, a6, a7 and 2 more")

@@ -1,0 +1,107 @@
+"""Health and figures of devices in `zscout status` and `zscout why`, in the RCs' own words."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.cli.fleet.test_status import section
+from tests.cli.tools import COMMAND, PATIENCE, zscout_soon
+from tests.live.bench import Bench, Stand, until
+from tests.live.lab import Lab
+from zscout.cli.fleet.devices import figures_text
+from zscout.cli.fleet.watching import _lasting
+from zscout.messages import Figures
+
+
+class Gauge(Bench):
+    """A device with figures."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: Figures = {"frames_per_second": 9.8, "dropped": 0, "opened": 3}
+
+    def figures(self) -> Figures:
+        return dict(self.told)
+
+
+@pytest.mark.live
+def test_health_and_figures_of_devices(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a")
+            async with Stand(lab) as stand:
+                well = Gauge()
+                ill = await stand.rc("framegrabber/ill", Gauge())
+                await stand.rc("framegrabber/well", well)
+                client = await lab.client("program")
+                await lab.ready(client, "robot/a", "framegrabber/ill", "framegrabber/well")
+                watcher = await asyncio.create_subprocess_exec(
+                    *COMMAND, "status", "--devices", "--watch", env=lab.env, stdout=subprocess.PIPE
+                )
+                stdout = watcher.stdout
+                assert stdout is not None
+
+                async def line_with(words: str) -> None:
+                    async with asyncio.timeout(PATIENCE):
+                        while True:
+                            line = (await stdout.readline()).decode()
+                            assert line
+                            if words in line:
+                                return
+
+                await line_with("framegrabber/well  ok      frames_per_second=9.8, opened=3")
+                well.told = {"frames_per_second": 4.5}
+                ill.fail("the lens is dirty")
+                waits = await client.request("look", {"framegrabber/ill": {}, "robot/a": {}}, min_runtime=60)
+                await until(lambda: waits.state == "queued" and waits.reason != "")
+                await line_with("framegrabber/ill   the lens is dirty  frames_per_second=9.8, opened=3")
+                watcher.terminate()
+                await watcher.wait()
+
+                plain, every, story, machine = await asyncio.gather(
+                    zscout_soon("status", env=lab.env),
+                    zscout_soon("status", "--devices", env=lab.env),
+                    zscout_soon("why", "look", env=lab.env),
+                    zscout_soon("status", "--json", env=lab.env),
+                )
+                rows = {row[0]: row[1:] for row in section(plain.stdout, "RCs")}
+                assert rows["framegrabber/ill"] == ["exclusive", "lost", "bench"]
+                assert rows["framegrabber/well"] == ["exclusive", "free", "bench"]
+                # Without being asked for, only what is wrong is shown.
+                assert section(plain.stdout, "Devices") == [
+                    ["framegrabber/ill", "the lens is dirty", "frames_per_second=9.8, opened=3"]
+                ]
+                assert section(every.stdout, "Devices") == [
+                    ["framegrabber/ill", "the lens is dirty", "frames_per_second=9.8, opened=3"],
+                    ["framegrabber/well", "ok", "frames_per_second=4.5"],
+                ]
+                assert "  framegrabber/ill: the lens is dirty" in story.stdout.splitlines()
+                assert "  robot/a: no other ARC holds it" in story.stdout.splitlines()
+                rcs = {rc["rc"]: rc for rc in json.loads(machine.stdout)["rcs"]}
+                assert rcs["framegrabber/ill"]["health"] == "the lens is dirty"
+                assert rcs["framegrabber/ill"]["figures"] == {
+                    "frames_per_second": 9.8,
+                    "dropped": 0,
+                    "opened": 3,
+                }
+                assert rcs["framegrabber/ill"]["present"] is False
+                assert (rcs["robot/a"]["health"], rcs["robot/a"]["figures"]) == ("ok", {})
+
+    asyncio.run(story())
+
+
+def test_figures_alone_make_no_new_block_of_watch() -> None:
+    told = {"rcs": [{"rc": "robot/a", "health": "ok", "figures": {"dropped": 3.0}}]}
+    assert _lasting(told) == {"rcs": [{"rc": "robot/a", "health": "ok"}]}
+
+
+def test_figures_in_words() -> None:
+    assert figures_text({}) == ""
+    assert figures_text({"a": 0.0, "b": 3.0, "c": 0.123456, "d": -2.5}) == "b=3, c=0.1235, d=-2.5"
+    assert figures_text({"a": 1e300, "b": 1e14}) == "a=1e+300, b=100000000000000"
+    assert figures_text({f"f{n}": 1.0 for n in range(15)}).endswith("f11=1, 3 more")

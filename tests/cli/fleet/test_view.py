@@ -1,0 +1,249 @@
+"""`zscout view`: the recording is really served, a live one is complete, and nothing is left behind."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import time
+import urllib.request
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import psutil
+import pytest
+
+from tests.cli.tools import COMMAND, PATIENCE, zscout_here
+from tests.live.lab import Lab
+from tests.services.recorder.paper_run import (
+    RCS,
+    RERUN,
+    TABLE2,
+    lanes,
+    play_table1,
+    second_by_second,
+)
+from zscout.services.recorder.timeline import Timeline
+
+OPEN = re.compile(rb"^Open (http://\S+)", re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("view") / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        play_table1(timeline)
+    return path
+
+
+@contextmanager
+def viewing(
+    folder: Path, *args: object, env: dict[str, str] | None = None
+) -> Iterator[subprocess.Popen[bytes]]:
+    """`zscout view` with its output in `view.log` of the folder."""
+    with (folder / "view.log").open("wb") as log:
+        command = [*COMMAND, "view", *map(str, args)]
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=env, cwd=folder)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            process.wait(PATIENCE)
+
+
+def until(true: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+
+
+def page(folder: Path, process: subprocess.Popen[bytes]) -> tuple[str, str]:
+    """The address that it said to open, and that of the stream in it."""
+    log = folder / "view.log"
+    until(
+        lambda: OPEN.search(log.read_bytes()) is not None or process.poll() is not None, "no address was said"
+    )
+    found = OPEN.search(log.read_bytes())
+    assert found is not None, log.read_text()
+    url = found[1].decode()
+    (stream,) = parse_qs(urlsplit(url).query)["url"]
+    return url, stream
+
+
+def listens(url: str) -> bool:
+    parts = urlsplit(url)
+    with suppress(OSError), socket.create_connection((parts.hostname or "", parts.port or 0), timeout=1):
+        return True
+    return False
+
+
+def descendants(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Path, tmp_path: Path) -> None:
+    with viewing(tmp_path, recording, "--web") as process:
+        url, stream = page(tmp_path, process)
+        assert urlsplit(url).hostname == "127.0.0.1"
+        with urllib.request.urlopen(url, timeout=PATIENCE) as answer:  # noqa: S310 - our own page
+            assert b"Rerun" in answer.read()
+        # Another viewer gets the whole recording from where the page would.
+        got = tmp_path / "got.rrd"
+        save: list[str | Path] = [RERUN, "--bind", "127.0.0.1", "--port", "auto", "--save", got, stream]
+        with subprocess.Popen(save, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as reader:
+            try:
+                until(lambda: shows_table_2(got), "the recording never came")
+            finally:
+                reader.kill()
+        children = descendants(process)
+        assert [child.name() for child in children] == ["rerun"]
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+        assert not any(child.is_running() for child in children)
+        assert not listens(url)
+        assert not listens(stream)
+
+
+def shows_table_2(path: Path) -> bool:
+    with (
+        suppress(ValueError, RuntimeError, OSError, KeyError, IndexError),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")  # the file is still being written
+        shown = lanes(path, "/rc/**")
+        return {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS} == TABLE2
+    return False
+
+
+def test_as_json_it_says_once_where_all_is(recording: Path, tmp_path: Path) -> None:
+    with viewing(tmp_path, recording, "--web", "--json") as process:
+        said = said_as_json(tmp_path, process)
+        assert (said["file"], said["live"]) == (str(recording), None)
+        with urllib.request.urlopen(said["url"], timeout=PATIENCE) as answer:  # noqa: S310 - our own page
+            assert b"Rerun" in answer.read()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+    assert (tmp_path / "view.log").read_text().count("\n") == 1
+
+
+def said_as_json(folder: Path, process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    log = folder / "view.log"
+    until(lambda: b"}" in log.read_bytes() or process.poll() is not None, "it said nothing")
+    said: dict[str, Any] = json.loads(log.read_text().splitlines()[0])
+    return said
+
+
+def test_the_viewer_does_not_outlive_a_command_that_is_killed(recording: Path, tmp_path: Path) -> None:
+    with viewing(tmp_path, recording, "--web") as process:
+        url, _ = page(tmp_path, process)
+        children = descendants(process)
+        assert len(children) == 1
+        process.kill()
+        until(lambda: not any(child.is_running() for child in children), "the viewer was left behind")
+        assert not listens(url)
+
+
+@pytest.mark.live
+def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a")
+            recorded = asyncio.Event()
+            client.mesh.watch(client.mesh.keys.alive_any("recorder"), lambda _token, _alive: recorded.set())
+            with viewing(tmp_path, "--web", "--out", tmp_path / "out", env=lab.env) as process:
+                url, stream = await asyncio.to_thread(page, tmp_path, process)
+                assert listens(stream)
+                async with asyncio.timeout(PATIENCE):
+                    await recorded.wait()
+                arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
+                await lab.state(client, lambda state: len(state.holds) == 1)
+                await client.end(arc)
+                children = descendants(process)
+                assert len(children) == 2
+                process.send_signal(signal.SIGINT)
+                assert await asyncio.to_thread(process.wait, PATIENCE) == 130
+                assert not any(child.is_running() for child in children)
+                assert not listens(url)
+            (file,) = (tmp_path / "out").glob("*.rrd")
+            assert f"Recording to {file}\n" in (tmp_path / "view.log").read_text()
+            (lane,) = lanes(file, "/rc/**").values()
+            assert [states for _, states in lane][-2:] == [["survey"], [""]]
+
+    asyncio.run(story())
+
+
+@pytest.mark.live
+def test_a_live_view_as_json(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    with viewing(tmp_path, "--web", "--json", "--out", tmp_path / "out", env=lab.env) as process:
+        said = said_as_json(tmp_path, process)
+        assert listens(said["url"])
+        assert listens(said["live"])
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+    assert [Path(said["file"])] == list((tmp_path / "out").glob("*.rrd"))
+
+
+def test_without_a_display_it_names_web(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    for args in ([recording], []):
+        assert zscout_here("view", *args) == 1
+        out, line = capsys.readouterr()
+        assert (out, len(line.splitlines())) == ("", 1)
+        assert "--web" in line
+
+
+def test_a_display_that_does_not_answer_is_one_line(recording: Path, tmp_path: Path) -> None:
+    env = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
+    with viewing(tmp_path, recording, env=env | {"DISPLAY": "127.0.0.1:4711"}) as process:
+        assert process.wait(PATIENCE) == 1
+    text = (tmp_path / "view.log").read_text()
+    assert text.startswith("zscout: the viewer ended (code 1): ")
+    assert len(text.splitlines()) == 1
+
+
+def test_what_can_t_be_opened_or_served_is_one_line_and_code_2(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = tmp_path / "notes.rrd"
+    text.write_text("no recording")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        for args, words in (
+            ([tmp_path / "none.rrd"], "there is no such file"),
+            ([tmp_path], "there is no such file"),
+            ([text], "is not a Rerun recording"),
+            ([recording, "--bind", "here"], "is not an IP address"),
+            ([recording, "--bind", "192.0.2.1"], "can't serve on 192.0.2.1"),
+            ([recording, "--port", port], f"port {port} (Address already in use); choose another"),
+        ):
+            assert zscout_here("view", "--web", *args) == 2
+            out, line = capsys.readouterr()
+            assert (out, len(line.splitlines())) == ("", 1)
+            assert words in line
+
+
+def test_a_live_stream_on_a_taken_port_is_one_line_and_code_2(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        env = os.environ | {"DISPLAY": ":0", "ZSCOUT_FLEET": ""}
+        with viewing(tmp_path, "--port", port, "--out", tmp_path / "out", env=env) as process:
+            assert process.wait(PATIENCE) == 2
+    text = (tmp_path / "view.log").read_text()
+    assert len(text.splitlines()) == 1
+    assert f"port {port}" in text

@@ -1,0 +1,258 @@
+"""`zscout replay`: the paper's Table 1 becomes its Table 2, and whatever else a workload may be."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.cli.tools import Terminal, zscout, zscout_here
+from tests.services.recorder.paper_run import (
+    RCS,
+    TABLE1,
+    TABLE2,
+    events,
+    lanes,
+    second_by_second,
+)
+
+JSON = (
+    '{"strategy": "priority", "holds": ['
+    '{"arc": "arc0", "start": 0.0, "end": 5.0, "outcome": "completed", '
+    '"rcs": ["framegrabber/fgrab1", "robot/scout33"]}, '
+    '{"arc": "arc1", "start": 5.0, "end": 10.0, "outcome": "completed", '
+    '"rcs": ["framegrabber/fgrab1", "robot/scout35"]}, '
+    '{"arc": "arc3", "start": 5.0, "end": 8.0, "outcome": "completed", '
+    '"rcs": ["framegrabber/fgrab2", "robot/scout33"]}, '
+    '{"arc": "arc2", "start": 8.0, "end": 11.0, "outcome": "preempted", '
+    '"rcs": ["framegrabber/fgrab2", "robot/scout33"]}, '
+    '{"arc": "arc4", "start": 11.0, "end": 14.0, "outcome": "completed", '
+    '"rcs": ["framegrabber/fgrab1", "robot/scout33", "robot/scout35"]}, '
+    '{"arc": "arc2", "start": 14.0, "end": 18.0, "outcome": "completed", '
+    '"rcs": ["framegrabber/fgrab2", "robot/scout33"]}], "unserved": []}\n'
+)
+
+SHARED = """
+[[rc]]
+name = "radio/rf0"
+sharable = true
+capacity = { rate = 0.3 }
+[[rc]]
+name = "robot/a"
+[[arc]]
+name = "survey"
+at = 0.5
+priority = 1
+min_runtime = 5.25
+[arc.needs]
+"radio/rf0" = { rate = 0.15 }
+"robot/a" = {}
+[[arc]]
+name = "mapping"
+at = 1
+priority = 2
+min_runtime = 3
+[arc.needs]
+"radio/rf0" = { rate = 0.1 }
+[[arc]]
+name = "operator"
+at = 2.75
+priority = 10
+min_runtime = 3
+[arc.needs]
+"radio/rf0" = { rate = 0.2 }
+[[arc]]
+name = "ghost"
+at = 3
+priority = 10
+min_runtime = 3
+[arc.needs]
+"radio/none" = {}
+"""
+
+
+@pytest.fixture
+def table1(tmp_path: Path) -> Path:
+    text = "".join(f'[[rc]]\nname = "{rc}"\n' for rc in RCS)
+    for name, at, priority, runtime, needs in TABLE1:
+        text += f'[[arc]]\nname = "{name}"\nat = {at}\npriority = {priority}\nmin_runtime = {runtime}\n'
+        text += "[arc.needs]\n" + "".join(f'"{rc}" = {{}}\n' for rc in needs)
+    file = tmp_path / "table1.toml"
+    file.write_text(text)
+    return file
+
+
+def cells(text: str) -> list[list[str]]:
+    """The table in an output: its rows, each with its label first."""
+    rows = [line.split() for line in text.splitlines()]
+    return [row for row in rows if row and ("/" in row[0] or row[0] == "seconds")]
+
+
+def test_table_1_gives_table_2_as_json_to_the_byte(table1: Path) -> None:
+    for seed in ("0", "1"):
+        shown = zscout("replay", table1, "--json", env=os.environ | {"PYTHONHASHSEED": seed})
+        assert (shown.returncode, shown.stderr) == (0, "")
+        assert shown.stdout == JSON
+
+
+def test_table_1_gives_table_2_as_a_table(table1: Path) -> None:
+    shown = zscout("replay", table1)
+    assert shown.returncode == 0
+    head, *rows = cells(shown.stdout)
+    assert head == ["seconds", *map(str, range(18))]
+    assert [(row[0], " ".join(row[1:])) for row in rows] == list(TABLE2.items())
+    assert "arc2 at 11 s by arc4, after 3 of 4 s; ran again from 14 s" in shown.stdout
+    assert "0 ARCs unserved" in shown.stdout
+    assert "\x1b" not in shown.stdout
+
+
+def test_at_a_narrow_terminal_the_table_is_wrapped_and_coloured(table1: Path) -> None:
+    with Terminal("replay", table1, columns=50) as terminal:
+        assert terminal.code() == 0
+    table = [line for line in terminal.text.splitlines() if line.startswith(("seconds", *RCS))]
+    assert max(map(len, table)) <= 50
+    shown = cells("\n".join(table))
+    assert len(shown) == 2 * (1 + len(RCS))
+    halves = dict[str, list[str]]()
+    for label, *row in shown:
+        halves.setdefault(label, []).extend(row)
+    assert halves.pop("seconds") == list(map(str, range(18)))
+    assert {rc: " ".join(row) for rc, row in halves.items()} == TABLE2
+    assert "\x1b[" in terminal.raw
+
+
+def test_sharable_rcs_have_a_row_for_each_holder_and_times_that_are_not_whole_a_column_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "shared.toml"
+    file.write_text(SHARED)
+    assert zscout_here("replay", file) == 0
+    shown = capsys.readouterr().out
+    assert cells(shown) == [
+        ["seconds", "0.5", "1", "2.75", "4", "5.75"],
+        ["radio/rf0", "survey", "survey", "operator", "operator", "survey"],
+        ["radio/rf0", "-", "mapping", "mapping", "-", "-"],
+        ["robot/a", "survey", "survey", "-", "-", "survey"],
+    ]
+    assert "the last to 11 s" in shown
+    assert "ghost: radio/none not on the mesh" in shown
+    assert zscout_here("replay", file, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["unserved"] == ["ghost"]
+    assert [(hold["arc"], hold["start"], hold["end"], hold["outcome"]) for hold in told["holds"]] == [
+        ("survey", 0.5, 2.75, "preempted"),
+        ("mapping", 1.0, 4.0, "completed"),
+        ("operator", 2.75, 5.75, "completed"),
+        ("survey", 5.75, 11.0, "completed"),
+    ]
+
+
+def test_a_long_schedule_has_a_column_for_each_interval(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arc = (
+        '[[arc]]\nname = "{name}"\nat = {at}\npriority = 1\nmin_runtime = 3600\n'
+        'needs = {{"robot/a" = {{}}}}\n'
+    )
+    file = tmp_path / "long.toml"
+    file.write_text(
+        '[[rc]]\nname = "robot/a"\n' + arc.format(name="x1", at=0) + arc.format(name="y2", at=7200)
+    )
+    assert zscout_here("replay", file) == 0
+    assert cells(capsys.readouterr().out) == [
+        ["seconds", "0", "3600", "7200"],
+        ["robot/a", "x1", "-", "y2"],
+    ]
+
+
+def test_a_schedule_without_end_is_cut_in_the_table_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arc = '[[arc]]\nname = "a{n}"\nat = {n}\npriority = 1\nmin_runtime = 0.5\n[arc.needs]\n"robot/a" = {{}}\n'
+    file = tmp_path / "many.toml"
+    file.write_text('[[rc]]\nname = "robot/a"\n' + "".join(arc.format(n=n) for n in range(600)))
+    assert zscout_here("replay", file) == 0
+    shown = capsys.readouterr().out
+    assert [len(row) for row in cells(shown)] == [501, 501]
+    assert "699 more columns are left out" in shown
+    assert zscout_here("replay", file, "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)["holds"]) == 600
+
+
+def test_nothing_at_all_is_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "empty.toml"
+    file.write_text("")
+    assert zscout_here("replay", file) == 0
+    summary = "Strategy priority: 0 ARCs on 0 RCs; 0 holds, 0 preempted, over 0 s; 0 ARCs unserved\n"
+    assert capsys.readouterr().out == summary
+    assert zscout_here("replay", file, "--json") == 0
+    assert capsys.readouterr().out == '{"strategy": "priority", "holds": [], "unserved": []}\n'
+
+
+@pytest.mark.parametrize("strategy", ["optimal", "adaptive"])
+def test_the_other_strategies_serve_table_1_as_the_paper_does(
+    table1: Path, strategy: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert zscout_here("replay", table1, "--strategy", strategy, "--json") == 0
+    assert capsys.readouterr().out == JSON.replace('"priority"', f'"{strategy}"', 1)
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--rrd", "picture.png"], "end it in .rrd"),
+        (["--rrd", "no/such/folder/x.rrd"], "can't write the recording"),
+    ],
+)
+def test_what_can_t_be_done_is_one_line_and_code_2(
+    table1: Path, args: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert zscout_here("replay", table1, *args) == 2
+    out, line = capsys.readouterr()
+    assert (out, len(line.splitlines())) == ("", 1)
+    assert words in line
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[[rc", "line 1"),
+        ('[[arc]]\nname = "a"\nat = -1\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}', "arc[0].at"),
+        (
+            '[[arc]]\nname = "a"\nat = nan\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}',
+            "arc[0].at",
+        ),
+        ('[[arc]]\nname = "a"\nat = 0\npriority = 1\nmin_runtime = 1\n[arc.needs]', "at least one RC"),
+    ],
+)
+def test_a_bad_workload_is_one_line_that_names_the_file_and_code_2(
+    tmp_path: Path, text: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bad.toml"
+    file.write_text(text)
+    assert zscout_here("replay", file, "--json") == 2
+    out, line = capsys.readouterr()
+    assert (out, len(line.splitlines())) == ("", 1)
+    assert "bad.toml" in line
+    assert words in line
+
+
+def test_a_file_that_is_not_there_is_one_line_and_code_2(tmp_path: Path) -> None:
+    shown = zscout("replay", tmp_path / "none.toml")
+    assert (shown.returncode, shown.stdout) == (2, "")
+    assert "there is no such file" in shown.stderr
+
+
+def test_a_recording_shows_table_2(table1: Path, tmp_path: Path) -> None:
+    recording = tmp_path / "run.rrd"
+    shown = zscout("replay", table1, "--rrd", recording)
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert f"zscout view {recording}" in shown.stdout
+    held = lanes(recording, "/rc/**")
+    assert {rc: second_by_second(held[f"/rc/{rc}"]) for rc in RCS} == TABLE2
+    story = [(at, states[0].split(" · ")[0]) for at, states in lanes(recording, "/arc/**")["/arc/arc2"]]
+    kept = [change for index, change in enumerate(story) if index == 0 or change[1] != story[index - 1][1]]
+    assert kept == [(1, "waiting"), (8, "running"), (11, "preempted"), (14, "running"), (18, "done")]
+    assert any(text.startswith("arc2: preempted by arc4") for text in events(recording))

@@ -1,0 +1,192 @@
+"""`zscout watch` as people and programs run it: on files, on a camera over HTTP, and at a terminal."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rerun.chunk import RrdReader
+
+from tests.behaviors.perception.scenes import Scene, box_of, overlap
+from tests.cli.tools import COMMAND, PATIENCE, Terminal, end, zscout_here
+from tests.drivers.mjpeg import MjpegServer, jpeg
+from zscout.cli.operator.watch import watch as command
+
+RATE = 10.0
+COMES, GOES = 5.0, 7.0
+"""Seconds between which somebody walks through."""
+
+
+def walker_at(time: float) -> float | None:
+    return 25 + 50 * (time - COMES) if COMES <= time < GOES else None
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten seconds, through which somebody walks once."""
+    path, scene = tmp_path_factory.mktemp("video") / "hall.avi", Scene(1, noise=3)
+    fourcc = cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, RATE, (320, 240))
+    assert writer.isOpened()
+    for number in range(round(10 * RATE)):
+        large = cv2.resize(scene.picture(walker_at(number / RATE)), (320, 240))
+        writer.write(np.asarray(cv2.merge([large, large, large]), np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_file_is_told_event_by_event(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert zscout_here("watch", "--source", video, "--json") == 0
+    told = capsys.readouterr()
+    events = [json.loads(line) for line in told.out.splitlines()]
+    assert len(events) == 1
+    event = events[0]
+    assert COMES <= event["start"] <= COMES + 0.3
+    assert GOES - 0.3 <= event["end"] <= GOES + 0.3
+    left, top, width, height = box_of(walker_at(event["peak"]) or 0)
+    box = event["boxes"][0]
+    assert overlap((box[0], box[1], box[2], box[3]), (2 * left, 2 * top, 2 * width, 2 * height)) > 0.4
+    assert event["area"][2] > 2 * event["boxes"][0][2]
+    assert 15 <= event["frames"] <= 24
+    assert event["going_on"] is False
+    assert told.err.startswith("9.9 s watched, 100 pictures; 1 event, motion for ")
+
+
+def test_in_a_pipe_it_is_plain_lines_and_the_limit_ends_it(
+    video: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert zscout_here("watch", "--source", video, "--limit", 6) == 0
+    event, summary = capsys.readouterr().out.splitlines()
+    assert "motion and goes on, one thing at the peak, the largest " in event
+    assert summary.startswith("6.0 s watched, 61 pictures; 1 event, motion for ")
+
+
+def test_a_recording_has_pictures_boxes_and_events(video: Path, tmp_path: Path) -> None:
+    file = tmp_path / "runs" / "hall.rrd"
+    assert zscout_here("watch", "--source", video, "--record", file) == 0
+    counts: dict[str, int] = {}
+    for chunk in RrdReader(file).stream():
+        counts[str(chunk.entity_path)] = counts.get(str(chunk.entity_path), 0) + chunk.num_rows
+    assert counts["/picture"] == counts["/picture/moving"] == counts["/moving"] == 100
+    assert counts["/events"] == 1
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("none.avi", "can't be read (No such file or directory); name a video file"),
+        (".", "is no file; name a video file"),
+        ("notes.txt", "there is no video in"),
+        ("empty.avi", "there is no video in"),
+        ("", "--source: it is empty"),
+        ("http://127.0.0.1:1/video", "can't be opened: does its server run, and is the address right?"),
+        ("/dev/video97", "can't be opened: No such file or directory"),
+        ("tiny.avi", "are 4 by 4 pixels; give it ones of 8 to"),
+    ],
+)
+def test_a_source_that_gives_nothing_is_one_line_and_exit_code_2(
+    source: str,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("notes.txt").write_text("no video\n" * 50)
+    Path("empty.avi").touch()
+    writer = cv2.VideoWriter("tiny.avi", cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"FFV1"), 10, (4, 4))
+    writer.write(np.zeros((4, 4, 3), np.uint8))
+    writer.release()
+    assert zscout_here("watch", "--source", source) == 2
+    told = capsys.readouterr()
+    assert words in told.err
+    assert told.err.count("\n") == 1
+    assert not told.out
+
+
+def test_a_recording_that_cannot_be_written_is_refused(
+    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert zscout_here("watch", "--source", video, "--record", tmp_path / "file" / "x.rrd") == 2
+    told = capsys.readouterr().err
+    assert "--record: can't record to" in told
+    assert "name a file that can be written" in told
+
+
+@pytest.fixture
+def camera() -> Iterator[MjpegServer]:
+    """Somebody walks by every two seconds; the connection breaks once."""
+    scene = Scene(2, noise=3)
+
+    def picture(number: int) -> bytes:
+        if number == 50:
+            server.cut()
+        at = number / 20 % 2
+        return jpeg(scene.picture(25 + 100 * (at - 1.3) if at >= 1.3 else None))
+
+    server = MjpegServer(rate=20, picture=picture)
+    with server:
+        yield server
+
+
+def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary(
+    camera: MjpegServer,
+) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "watch", "--source", camera.url, "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    try:
+        events = [json.loads(process.stdout.readline()) for _ in range(2)]
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 130
+    assert all(event["start"] <= event["end"] and event["boxes"] for event in events)
+    assert f"{camera.url} was cut off; opening it again" in told
+    assert f"{camera.url} gives pictures again" in told
+    assert " watched, " in told.splitlines()[-1]
+    assert camera.accepted >= 2
+
+
+def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -> None:
+    camera.mode = "stall"
+    process = subprocess.Popen([*COMMAND, "watch", "--source", camera.url], stdout=subprocess.PIPE, text=True)
+    try:
+        # It has asked for pictures, and there are none.
+        while not camera.connected:
+            assert process.poll() is None
+            threading.Event().wait(0.02)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+    finally:
+        end(process)
+
+
+def test_at_a_terminal_there_is_a_live_line(video: Path) -> None:
+    with Terminal("watch", "--source", video) as terminal:
+        terminal.until("motion for")
+        terminal.until("9.9 s watched, 100 pictures; 1 event")
+        assert terminal.code() == 0
+        assert "\x1b[" in terminal.raw
+
+
+def test_help_has_examples() -> None:
+    shown = CliRunner().invoke(command, ["--help"]).output
+    assert "zscout watch --source garden.avi" in shown
+    assert "--json" in shown

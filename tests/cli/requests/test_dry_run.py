@@ -1,0 +1,57 @@
+"""`zscout request --dry-run`, and the estimates of `status` and `why`: asked, told, and nothing changed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import pytest
+
+from tests.cli.cli_fleet import CliFleet, fleet_of
+from tests.cli.tools import end
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+    with fleet_of(tmp_path_factory.mktemp("dry"), "robot/a", "robot/b") as fleet:
+        yield fleet
+
+
+def test_it_says_when_it_would_start_and_whom_it_would_preempt(fleet: CliFleet) -> None:
+    mine = fleet.holder("mine", "robot/a")
+    try:
+        take = fleet.zscout("request", "robot/a", "--priority", "5", "--dry-run")
+        assert take.stdout == "request would start at once\nit would preempt mine\n"
+        wait = fleet.zscout("request", "robot/a", "robot/b", "--dry-run", "--json", "--name", "wide")
+        told = json.loads(wait.stdout)
+        assert (wait.returncode, told["arc"], told["preempts"]) == (0, "wide", [])
+        assert told["starts_in"] > 0
+        assert "robot/a (held by mine" in told["reason"]
+        state = fleet.state(lambda state: True)
+        assert [hold.arc for hold in state.holds] == ["mine"]
+        assert not state.queue
+    finally:
+        end(mine)
+
+
+def test_what_would_never_start_is_said_with_code_1(fleet: CliFleet) -> None:
+    done = fleet.zscout("request", "robot/zz", "--dry-run")
+    assert done.returncode == 1
+    assert done.stdout == ("request would wait, and no start can be foretold: robot/zz not on the mesh\n")
+
+
+def test_status_and_why_tell_when_a_waiting_one_may_start(fleet: CliFleet) -> None:
+    mine = fleet.holder("mine", "robot/a")
+    waiting = fleet.start("request", "robot/a", "--name", "next", "--min-runtime", "1")
+    try:
+        fleet.state(lambda state: [wait.arc for wait in state.queue] == ["next"])
+        status = json.loads(fleet.zscout("status", "--json").stdout)
+        [queued] = status["queue"]
+        assert queued["starts_in"] > 0
+        assert " in " in fleet.zscout("status").stdout
+        assert "it may start in" in fleet.zscout("why", "next").stdout
+    finally:
+        end(waiting)
+        end(mine)

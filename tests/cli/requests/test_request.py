@@ -1,0 +1,277 @@
+"""`zscout request` with real processes: what the command is given, when it is ended, what is left behind."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import re
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.cli.cli_fleet import CliFleet, fleet_of
+from tests.cli.tools import end, events, gone, out_of, read_until
+from tests.live.lab import START
+from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
+from zscout.cli.requests.waiting import REFRESH, Report
+from zscout.mesh import clock
+from zscout.messages import RcmState
+from zscout.types import SECOND
+
+pytestmark = pytest.mark.live
+
+STUBBORN = "trap '' TERM; sleep 1000 & echo pid $$ $!; wait; wait"
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+    with fleet_of(tmp_path_factory.mktemp("request"), "robot/a", "robot/b", "radio/rf0:rate=10") as fleet:
+        yield fleet
+
+
+def test_a_command_gets_its_grant_and_gives_its_exit_code(fleet: CliFleet) -> None:
+    script = (
+        'echo "$ZSCOUT_ARC|$ZSCOUT_RCS|$ZSCOUT_GRANT|$ZSCOUT_CLIENT|$ZSCOUT_REMAINING|$ZSCOUT_FLEET"; exit 7'
+    )
+    done = fleet.zscout(
+        "request", "robot/a", "radio/rf0:rate=2.5", "--name", "survey", "--", "sh", "-c", script
+    )
+    assert done.returncode == 7, done.stderr
+    arc, rcs, grant, client, remaining, file = done.stdout.strip().split("|")
+    assert (arc, rcs, file) == ("survey", "radio/rf0 robot/a", str(fleet.lab.fleet_file))
+    assert grant.startswith("[[")
+    assert "/request-" in client
+    assert 50 < float(remaining) <= 60
+    assert "survey holds radio/rf0, robot/a for 1 min" in done.stderr
+    assert fleet.idle("robot/a", "radio/rf0")
+
+
+def test_a_command_ended_by_a_signal_gives_128_and_its_number(fleet: CliFleet) -> None:
+    assert fleet.zscout("request", "robot/a", "--", "sh", "-c", "kill -KILL $$").returncode == 137
+
+
+def test_without_a_command_it_holds_for_its_time(fleet: CliFleet) -> None:
+    done = fleet.zscout("request", "robot/a", "--min-runtime", "300ms", "--json")
+    assert done.returncode == 0
+    granted, ended = events(done.stdout)
+    assert (granted["event"], granted["rcs"], granted["keep"]) == ("granted", ["robot/a"], False)
+    assert 0 < granted["remaining"] <= 0.3
+    assert (ended["event"], ended["outcome"]) == ("ended", "completed")
+
+
+def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> None:
+    blocker = fleet.holder("blocker", "robot/a")
+    waiting = fleet.start("request", "robot/a", "--name", "next", "--min-runtime", "0.1")
+    (line,) = read_until(waiting, "next waits")
+    assert re.search(
+        r"\(held by blocker, priority 0\); starts in (\d\d s|1 min); robot/a: blocker \(priority 0, ", line
+    )
+    assert line.endswith(" left")
+    end(blocker)
+    read_until(waiting, "next holds robot/a")
+    assert waiting.wait(START) == 0
+
+
+def test_a_start_that_nobody_can_foretell_is_said_to_be_so(fleet: CliFleet) -> None:
+    never = ("request", "robot/nowhere", "--name", "never", "--timeout", "1")
+    line, _ = out_of(fleet.start(*never)).read().splitlines()
+    assert line == "never waits: robot/nowhere not on the mesh; no start can be foretold"
+    waits, _ = events(fleet.zscout(*never, "--json").stdout)
+    assert (waits["event"], waits["starts_in"]) == ("waits", None)
+
+
+class Noting(Client):
+    """A client that notes each time that it asks for the state, and whether with a forecast."""
+
+    looks: list[bool]
+
+    async def state(
+        self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT
+    ) -> RcmState | None:
+        self.looks.append(forecast)
+        return await super().state(arc, forecast=forecast, timeout=timeout)
+
+
+def test_an_estimate_that_ticks_down_prints_nothing_and_asks_for_nothing(fleet: CliFleet) -> None:
+    blocker = fleet.holder("blocker", "robot/a")
+    out = io.StringIO()
+
+    async def wait_in_a_crowd_of_news() -> list[bool]:
+        async with await Noting.connect("noting", fleet=fleet.lab.fleet, host="test") as client:
+            client.looks = []
+            with Report("next", str(client.mesh.me), as_json=False, stream=out) as report:
+                client.watch(report.news)
+                arc = await client.request("next", {"robot/a": {}}, estimate=True)
+                telling = asyncio.ensure_future(report.follow_wait(client))
+                until = clock.now() + 2 * REFRESH * SECOND
+                while clock.now() < until:
+                    report.news(arc)
+                    await asyncio.sleep(0.01)
+                telling.cancel()
+            return client.looks
+
+    assert asyncio.run(wait_in_a_crowd_of_news()) == [False]
+    (line,) = out.getvalue().splitlines()
+    assert "; starts in " in line
+    end(blocker)
+
+
+def test_a_command_is_ended_when_its_grant_is_taken(fleet: CliFleet) -> None:
+    script = "trap 'echo told; exit 3' TERM; echo pid $$; while :; do sleep 0.05; done"
+    victim = fleet.start("request", "robot/a", "--name", "victim", "--", "sh", "-c", script)
+    read_until(victim, "pid")
+    taker = fleet.zscout("request", "robot/a", "--priority", "5", "--name", "boss", "--", "true")
+    assert taker.returncode == 0
+    lines = out_of(victim).read()
+    assert victim.wait(START) == 75
+    assert "told" in lines
+    assert "victim lost its grant: preempted by boss, priority 5" in lines
+    assert fleet.idle("robot/a")
+
+
+def test_a_command_whose_time_is_over_is_ended(fleet: CliFleet) -> None:
+    done = fleet.zscout("request", "robot/a", "--min-runtime", "300ms", "--json", "--", "sleep", "1000")
+    assert (done.returncode, done.stdout) == (124, "")
+    assert [event["event"] for event in events(done.stderr)] == ["granted", "stopping", "ended"]
+    assert fleet.idle("robot/a")
+
+
+def test_what_ignores_sigterm_is_killed_after_the_grace_with_its_children(fleet: CliFleet) -> None:
+    options = ["--name", "victim", "--grace", "300ms"]
+    victim = fleet.start("request", "robot/a", *options, "--", "sh", "-c", STUBBORN)
+    pids = [int(pid) for pid in read_until(victim, "pid")[-1].split()[1:]]
+    assert fleet.zscout("release", "victim").returncode == 0
+    assert victim.wait(START) == 75
+    assert len(pids) == 2
+    assert all(gone(pid) for pid in pids)
+
+
+def test_again_runs_the_command_again_after_a_preemption(fleet: CliFleet, tmp_path: Path) -> None:
+    script = f"echo run $$; if mkdir {tmp_path}/first; then sleep 1000; fi; exit 4"
+    victim = fleet.start("request", "robot/b", "--again", "--name", "victim", "--", "sh", "-c", script)
+    first = read_until(victim, "run")[-1]
+    assert fleet.zscout("request", "robot/b", "--priority", "5", "--", "true").returncode == 0
+    lines = read_until(victim, "run")
+    assert any("waiting again" in line for line in lines)
+    assert lines[-1] != first
+    assert victim.wait(START) == 4
+
+
+def test_what_a_command_leaves_running_is_ended(fleet: CliFleet) -> None:
+    left = fleet.start("request", "robot/a", "--", "sh", "-c", "sleep 1000 & echo pid $!")
+    pid = int(read_until(left, "pid")[-1].split()[1])
+    assert left.wait(START) == 0
+    assert gone(pid)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_it_waits_leaves_nothing(fleet: CliFleet, number: signal.Signals) -> None:
+    blocker = fleet.holder("blocker", "robot/a", "robot/b")
+    waiting = fleet.start("request", "robot/a", "--name", "waiting", "--", "true")
+    read_until(waiting, "waiting waits")
+    waiting.send_signal(number)
+    assert "Traceback" not in out_of(waiting).read()
+    assert waiting.wait(START) == 128 + number
+    fleet.state(lambda state: not state.queue)
+    end(blocker)
+
+
+def test_a_signal_ends_the_command_and_gives_back(fleet: CliFleet) -> None:
+    running = fleet.start("request", "robot/a", "--", "sh", "-c", "echo pid $$; sleep 1000")
+    pid = int(read_until(running, "pid")[-1].split()[1])
+    running.send_signal(signal.SIGTERM)
+    assert running.wait(START) == 143
+    assert gone(pid)
+    assert fleet.idle("robot/a")
+
+
+def test_a_second_signal_does_not_wait_for_a_stubborn_command(fleet: CliFleet) -> None:
+    running = fleet.start(
+        "request", "robot/a", "--grace", "10m", "--", "sh", "-c", f"trap 'echo no' TERM; {STUBBORN[13:]}"
+    )
+    pids = [int(pid) for pid in read_until(running, "pid")[-1].split()[1:]]
+    running.send_signal(signal.SIGINT)
+    read_until(running, "no")
+    running.send_signal(signal.SIGINT)
+    assert running.wait(START) == 130
+    assert all(gone(pid) for pid in pids)
+
+
+def test_a_command_does_not_outlive_zscout(fleet: CliFleet) -> None:
+    running = fleet.start("request", "robot/a", "--", "sh", "-c", "echo pid $$; exec sleep 1000")
+    pid = int(read_until(running, "pid")[-1].split()[1])
+    running.kill()
+    assert gone(pid)
+    assert fleet.idle("robot/a")
+
+
+def test_a_timeout_ends_the_wait(fleet: CliFleet) -> None:
+    blocker = fleet.holder("blocker", "robot/a")
+    done = fleet.zscout("request", "robot/a", "--name", "late", "--timeout", "400ms", "--json")
+    assert done.returncode == 1
+    waits, ended = events(done.stdout)
+    assert waits["needs"][0]["holders"][0]["arc"] == "blocker"
+    assert 50 < waits["starts_in"] < 60
+    assert waits["starts_in"] == pytest.approx(waits["needs"][0]["holders"][0]["remaining"], abs=0.5)
+    assert (ended["event"], ended["outcome"]) == ("ended", "timeout")
+    assert done.stderr.count("\n") == 1
+    assert "late was not granted within 0.4 s" in done.stderr
+    fleet.state(lambda state: not state.queue)
+    end(blocker)
+
+
+def test_what_can_not_run_is_said_before_anybody_waits(fleet: CliFleet, tmp_path: Path) -> None:
+    plain = tmp_path / "plain"
+    plain.write_text("no program")
+    missing = fleet.zscout("request", "robot/a", "--", "no-such-program")
+    assert (missing.returncode, missing.stdout) == (127, "")
+    assert missing.stderr == "zscout: no-such-program: there is no such command; check the name and $PATH\n"
+    assert fleet.zscout("request", "robot/a", "--", str(plain)).returncode == 126
+
+
+def test_refusals_by_the_rcm_are_one_line(fleet: CliFleet) -> None:
+    blank = fleet.zscout("request", "robot/a", "--name", "not valid")
+    assert blank.returncode == 2
+    assert blank.stderr == "zscout: --name 'not valid' is not valid: use 1 to 64 of A-Z a-z 0-9 _ . -\n"
+    needless = fleet.zscout("request", *(f"robot/{number}" for number in range(65)))
+    assert needless.returncode == 2
+    assert needless.stderr.startswith("zscout: 65 RCs; at most 64 are allowed")
+
+
+def test_the_live_line_shows_and_ctrl_c_ends_the_wait(fleet: CliFleet) -> None:
+    blocker = fleet.holder("blocker", "robot/a")
+    with fleet.terminal("request", "robot/a", "--name", "seen") as terminal:
+        assert re.search(r"seen waits \d\.\d s, starts in (\d\d s|1 min): needs ", terminal.until(": needs "))
+        terminal.until("robot/a: blocker (priority 0, ")
+        terminal.until("seen waits ")  # drawn anew
+        terminal.press("\x03")
+        terminal.until("seen is cancelled")
+        assert terminal.code() == 130
+    fleet.state(lambda state: not state.queue)
+    end(blocker)
+
+
+def test_a_command_has_the_terminal(fleet: CliFleet) -> None:
+    # Python forgets a signal that comes just before a blocking read: the script waits for the signal itself.
+    script = (
+        "import os, signal, sys\n"
+        "signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])\n"
+        "print('front', os.getpgrp() == os.tcgetpgrp(0), flush=True)\n"
+        "print('got', input(), flush=True)\n"
+        "print('interrupted', signal.sigwait([signal.SIGINT]) == signal.SIGINT, flush=True)\n"
+        "input(); sys.exit(9)\n"
+    )
+    with fleet.terminal("request", "robot/a", "--", sys.executable, "-c", script) as terminal:
+        terminal.until("front True")
+        terminal.press("hello\n")
+        terminal.until("got hello")
+        terminal.press("\x03")
+        terminal.until("interrupted True")
+        terminal.press("\x1a")
+        terminal.until("not suspended")
+        terminal.press("\n")
+        terminal.until("gave back")
+        assert terminal.code() == 9

@@ -1,0 +1,199 @@
+"""A resource controller on the mesh in memory: the order of its work, what it reads, how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
+from tests.mesh.kit import run, until
+from zscout.drivers.resource_controller import ResourceController
+from zscout.drivers.work_queue import EARLY_PER_HOST
+from zscout.keyexpr import Role, Sender
+from zscout.mesh import Mesh
+from zscout.mesh.memory import MemoryNetwork
+from zscout.messages import Grants, RcState
+from zscout.types import SECOND, Grant
+
+Story = Callable[[Rcm, ResourceController, Device, Mesh], Awaitable[None]]
+
+
+def play(story: Story) -> None:
+    """An RCM, an RC that `one` holds under grant 1, and its client `h/client`."""
+
+    async def all_of_it() -> None:
+        network = MemoryNetwork()
+        rcm, device = Rcm(network), Device()
+        client = network.open("f", Sender("h", "client"))
+        rc = await started(network, device)
+        rcm.publish(holder(1))
+        await until(lambda: device.calls == ["begin one"])
+        try:
+            await story(rcm, rc, device, client)
+        finally:
+            await close(rc, rcm.mesh, client)
+
+    run(all_of_it())
+
+
+def grant(number: int) -> Grant:
+    return Grant(TERM, number)
+
+
+def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> None:
+    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+        rcm.hangs = True
+        # Under a grant that nobody knows: each made the RC read `rcm/state` for half a second.
+        early = [asyncio.create_task(answer(client, grant(99), ttl=60)) for _ in range(20)]
+        await until(lambda: rc.queue.commands == EARLY_PER_HOST)
+        asked, ended = len(rcm.asked), rcm.mesh.now()
+        rcm.publish()
+        await until(lambda: device.calls == ["begin one", "end one", "safe"])
+        assert rcm.mesh.now() - ended < 0.01 * SECOND
+        assert await asyncio.gather(*early) == ["not_yet"] * EARLY_PER_HOST + ["busy"] * (20 - EARLY_PER_HOST)
+        assert len(rcm.asked) == asked == 2  # one when it started, and one for all of these
+
+    play(story)
+
+
+def test_the_safe_state_goes_before_commands_that_wait() -> None:
+    async def story(rcm: Rcm, _rc: ResourceController, device: Device, client: Mesh) -> None:
+        slow = asyncio.create_task(answer(client, grant(1), {"name": "slow", "seconds": 0.5}))
+        await asyncio.sleep(0.1)
+        waiting = [asyncio.create_task(answer(client, grant(1))) for _ in range(5)]
+        await asyncio.sleep(0.1)
+        rcm.publish(holder(2, "two"))
+        assert await slow == "done"
+        assert {await task for task in waiting} == {"ended"}
+        assert device.calls == ["begin one", "slow", "end one", "safe", "begin two"]
+
+    play(story)
+
+
+def test_early_commands_are_obeyed_in_their_order_once_the_grant_is_known() -> None:
+    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+        rcm.hangs = True
+        told = [
+            asyncio.create_task(answer(client, grant(2), {"name": "echo", "value": number}))
+            for number in range(3)
+        ]
+        await until(lambda: rc.queue.commands == 3)
+        assert await answer(client, grant(1)) == "done"  # nothing else waits for them
+        rcm.publish(holder(2))
+        told.append(asyncio.create_task(answer(client, grant(2), {"name": "echo", "value": 3})))
+        assert await asyncio.gather(*told) == ["done"] * 4
+        assert device.calls[-5:] == ["begin one", *(f"echo {number}" for number in range(4))]
+        assert "safe" not in device.calls[-5:]
+
+    play(story)
+
+
+def test_an_early_command_makes_the_rc_read_what_it_missed() -> None:
+    async def story(rcm: Rcm, _rc: ResourceController, device: Device, client: Mesh) -> None:
+        rcm.publish()
+        await until(lambda: device.calls[-1] == "safe")
+        rcm.seq = 5
+        rcm.holds = [rcm.view(5)]
+        assert await asyncio.gather(*(answer(client, grant(5)) for _ in range(2))) == ["done", "done"]
+        assert await answer(client, grant(6)) == "not_yet"
+        assert await answer(client, grant(5), ttl=0) == "bad_command"
+
+    play(story)
+
+
+def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:
+    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+        ended: list[str] = []
+        client.subscribe(
+            client.keys.rc_state_any,
+            RcState,
+            lambda _key, state: ended.extend(hold.why for hold in state.ended),
+        )
+        begun = rcm.mesh.now()
+        await until(lambda: device.calls[-1] == "safe")
+        assert abs(rcm.mesh.now() - begun - LEASE * SECOND) < 0.1 * SECOND
+        await until(lambda: ended == ["lease"])
+        assert await answer(client, grant(1)) == "ended"
+        assert rc.health == "ok"
+
+    play(story)
+
+
+@pytest.mark.parametrize("where", ["begin two", "safe"])
+def test_a_driver_that_raises_fails_its_rc_which_recovers(where: str) -> None:
+    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+        device.broken = {where}
+        rcm.publish(holder(2, "two"))
+        await until(lambda: rc.health == f"its driver failed: {where} failed")
+        assert await answer(client, grant(2)) == "ended"
+        device.broken = set()
+        rc.recover()
+        rcm.publish(holder(3, "three"))
+        await until(lambda: device.calls[-1] == "begin three")
+
+    play(story)
+
+
+def test_an_rc_that_fails_leaves_the_mesh_with_its_device_safe_and_tells_its_owner(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def story() -> None:
+        network = MemoryNetwork()
+        rcm, device, failures = Rcm(network), Device(), list[Exception]()
+        tokens: dict[str, bool] = {}
+        key = rcm.mesh.keys.alive_any(Role.RC)
+        watch = rcm.mesh.watch(key, lambda token, alive: tokens.update({token.name: alive}))
+        rc = await started(network, device, on_failure=failures.append)
+        rcm.publish(holder(1))
+        await until(lambda: device.calls == ["begin one"] and tokens == {"robot/x": True})
+
+        def fault(*_args: object, **_how: object) -> None:
+            raise KeyError("a fault of ours")
+
+        monkeypatch.setattr(rc.holds, "apply_grants", fault)
+        rcm.publish()
+        await until(lambda: device.calls[-1] == "safe")
+        assert [type(error) for error in failures] == [KeyError]
+        assert "its resource controller failed" in rc.health
+        await until(lambda: tokens == {"robot/x": False})
+        watch.close()
+        await close(rc, rcm.mesh)
+        assert device.calls.count("safe") == 1
+
+    run(story())
+
+
+def test_figures_are_published_when_they_change() -> None:
+    async def story() -> None:
+        network, device = MemoryNetwork(), Device()
+        watcher = network.open("f", Sender("w", "watcher"))
+        seen: list[float] = []
+        figures = {"packets": 1.0}
+        device.figures = figures.copy  # type: ignore[method-assign]
+        rc = await started(network, device)
+        watcher.subscribe(
+            watcher.keys.rc_state_any, RcState, lambda _key, state: seen.append(state.figures["packets"])
+        )
+        await asyncio.sleep(5)
+        assert seen == []
+        figures["packets"] = 2.0
+        await asyncio.sleep(5)
+        assert seen == [2.0]
+        await close(rc, watcher)
+
+    run(story())
+
+
+def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
+    async def story(rcm: Rcm, _rc: ResourceController, _device: Device, client: Mesh) -> None:
+        states: list[RcState] = []
+        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+        old = type(TERM)(1, "old")
+        client.publisher(client.keys.grants, Grants).put(Grants(term=old, seq=9, prev=8, every=0.5))
+        await until(lambda: bool(states))
+        assert states[0].term == TERM
+        assert await answer(client, grant(1), dict(ECHO)) == "done"
+
+    play(story)

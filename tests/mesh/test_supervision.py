@@ -1,0 +1,315 @@
+"""What fails in a service is logged once, fails its owner once, and ends what else the service runs."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+import uvloop
+
+from zscout.keyexpr import BadName
+from zscout.mesh import supervision
+from zscout.mesh.exchange import Refused
+from zscout.mesh.supervision import Supervisor
+
+
+class Owner:
+    def __init__(self) -> None:
+        self.failures: list[Exception] = []
+        self.failed = asyncio.Event()
+        self.supervisor = Supervisor("owner", self.on_failure)
+
+    def on_failure(self, error: Exception) -> None:
+        self.failures.append(error)
+        self.failed.set()
+
+
+@asynccontextmanager
+async def owned() -> AsyncIterator[Owner]:
+    owner = Owner()
+    try:
+        async with asyncio.timeout(5):
+            yield owner
+    finally:
+        await owner.supervisor.close()
+
+
+async def forever() -> None:
+    await asyncio.Event().wait()
+
+
+async def explode(message: str = "boom") -> None:
+    raise ValueError(message)
+
+
+def fail() -> None:
+    raise ValueError("boom")
+
+
+def errors(caplog: pytest.LogCaptureFixture) -> list[logging.LogRecord]:
+    return [record for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+def has_traceback(record: logging.LogRecord, of: str) -> bool:
+    return record.exc_info is not None and of in logging.Formatter().formatException(record.exc_info)
+
+
+@pytest.fixture(params=[asyncio.new_event_loop, uvloop.new_event_loop], ids=["asyncio", "uvloop"])
+def runner(request: pytest.FixtureRequest) -> asyncio.Runner:
+    return asyncio.Runner(loop_factory=request.param)
+
+
+def test_a_task_that_raises_is_logged_once_fails_its_owner_once_and_ends_its_siblings(
+    runner: asyncio.Runner, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            sibling = owner.supervisor.spawn(forever())
+            timer = owner.supervisor.call_later(60, fail)
+            owner.supervisor.spawn(explode(), "exploder")
+            await owner.failed.wait()
+            with pytest.raises(asyncio.CancelledError):
+                await sibling
+            assert timer.cancelled()
+            assert [str(error) for error in owner.failures] == ["boom"]
+            assert owner.supervisor.error is owner.failures[0]
+            assert not owner.supervisor.active
+
+    with runner:
+        runner.run(story())
+    gc.collect()
+    (record,) = errors(caplog)
+    assert record.getMessage() == "owner failed"
+    assert has_traceback(record, "in explode")
+
+
+def test_two_that_fail_together_fail_the_owner_once_and_are_both_logged(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            owner.supervisor.spawn(explode("first"))
+            owner.supervisor.spawn(explode("second"))
+            await owner.failed.wait()
+            await owner.supervisor.close()
+            assert [str(error) for error in owner.failures] == ["first"]
+
+    asyncio.run(story())
+    assert [str(record.exc_info[1]) for record in errors(caplog) if record.exc_info] == ["first", "second"]
+
+
+def test_an_error_that_is_awaited_in_a_sibling_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            task = owner.supervisor.spawn(explode())
+
+            async def wait() -> None:
+                await asyncio.wait([task])
+                task.result()
+
+            waiter = owner.supervisor.spawn(wait())
+            with pytest.raises((ValueError, asyncio.CancelledError)):
+                await waiter
+            assert len(owner.failures) == 1
+
+    asyncio.run(story())
+    assert len(errors(caplog)) == 1
+
+
+def test_a_timer_that_raises_fails_the_owner(
+    runner: asyncio.Runner, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            sibling = owner.supervisor.spawn(forever())
+            owner.supervisor.call_later(0.001, fail)
+            await owner.failed.wait()
+            with pytest.raises(asyncio.CancelledError):
+                await sibling
+
+    with runner:
+        runner.run(story())
+    (record,) = errors(caplog)
+    assert has_traceback(record, "in fail")
+
+
+def test_a_handler_that_raises_fails_the_owner_and_is_not_called_again() -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            calls: list[int] = []
+
+            def handle(value: int) -> None:
+                calls.append(value)
+                fail()
+
+            guarded = owner.supervisor.guard(handle)
+            with pytest.raises(Refused) as refused:
+                guarded(1)
+            assert refused.value.problem.code == "internal"
+            guarded(2)
+            assert calls == [1]
+            assert [str(error) for error in owner.failures] == ["boom"]
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("answer", [Refused("busy", "ask again"), BadName("no name")])
+def test_a_handler_that_refuses_has_not_failed(answer: Exception) -> None:
+    async def story() -> None:
+        async with owned() as owner:
+
+            def refuse() -> None:
+                raise answer
+
+            with pytest.raises(type(answer)) as raised:
+                owner.supervisor.guard(refuse)()
+            assert raised.value is answer
+            assert owner.failures == []
+            assert owner.supervisor.active
+
+    asyncio.run(story())
+
+
+def test_an_owner_that_fails_to_handle_a_failure_is_logged_and_its_tasks_end(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def story() -> None:
+        def on_failure(error: Exception) -> None:
+            raise KeyError("twice")
+
+        supervisor = Supervisor("owner", on_failure)
+        sibling = supervisor.spawn(forever())
+        supervisor.spawn(explode())
+        async with asyncio.timeout(5):
+            with pytest.raises(asyncio.CancelledError):
+                await sibling
+
+    asyncio.run(story())
+    assert [record.getMessage() for record in errors(caplog)] == [
+        "owner failed",
+        "owner could not handle its failure",
+    ]
+    assert has_traceback(errors(caplog)[1], "in on_failure")
+
+
+def test_a_task_that_ends_or_is_cancelled_by_itself_has_not_failed(caplog: pytest.LogCaptureFixture) -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            other = owner.supervisor.spawn(forever())
+            one = owner.supervisor.spawn(forever())
+            await owner.supervisor.spawn(asyncio.sleep(0, result=None))
+            one.cancel()
+            await asyncio.wait([one])
+            assert owner.failures == []
+            assert not other.done()
+
+    asyncio.run(story())
+    assert not errors(caplog)
+
+
+def test_close_awaits_all_and_nothing_starts_afterwards() -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            ended: list[str] = []
+
+            async def work() -> None:
+                try:
+                    await forever()
+                finally:
+                    await asyncio.sleep(0.01)
+                    ended.append("work")
+
+            owner.supervisor.spawn(work())
+            await asyncio.sleep(0)
+            await owner.supervisor.close()
+            assert ended == ["work"]
+            late = owner.supervisor.spawn(work())
+            with pytest.raises(asyncio.CancelledError):
+                await late
+            assert owner.supervisor.call_later(0, fail).cancelled()
+            owner.supervisor.guard(fail)()
+            assert ended == ["work"]
+            assert owner.failures == []
+
+    asyncio.run(story())
+
+
+def test_close_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(supervision, "CLOSE_TIMEOUT", 0.05)
+
+    async def story() -> None:
+        async with owned() as owner:
+            release = asyncio.Event()
+
+            async def stubborn() -> None:
+                while not release.is_set():
+                    try:
+                        await release.wait()
+                    except asyncio.CancelledError:
+                        continue
+
+            task = owner.supervisor.spawn(stubborn(), "stubborn")
+            await asyncio.sleep(0)
+            await owner.supervisor.close()
+            assert not task.done()
+            release.set()
+            await task
+
+    asyncio.run(story())
+    (record,) = errors(caplog)
+    assert record.getMessage() == "owner: stubborn did not end within 0.05 s of its cancellation"
+
+
+def test_a_task_may_close_its_own_supervisor() -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            sibling = owner.supervisor.spawn(forever())
+
+            async def end() -> str:
+                await owner.supervisor.close()
+                return "closed"
+
+            assert await owner.supervisor.spawn(end()) == "closed"
+            assert sibling.cancelled()
+
+    asyncio.run(story())
+
+
+def test_an_owner_that_is_cancelled_while_it_closes_has_cancelled_its_tasks() -> None:
+    async def story() -> None:
+        async with owned() as owner:
+            cancelled = asyncio.Event()
+            release = asyncio.Event()
+
+            async def slow() -> None:
+                try:
+                    await forever()
+                finally:
+                    cancelled.set()
+                    await release.wait()
+
+            task = owner.supervisor.spawn(slow())
+
+            async def own() -> None:
+                try:
+                    await forever()
+                finally:
+                    await owner.supervisor.close()
+
+            owning = asyncio.create_task(own())
+            await asyncio.sleep(0)
+            owning.cancel()
+            await cancelled.wait()
+            owning.cancel()
+            await asyncio.wait([owning])
+            assert owning.cancelled()
+            assert not task.done()
+            release.set()
+            await asyncio.wait([task])
+            assert task.cancelled()
+
+    asyncio.run(story())

@@ -1,0 +1,56 @@
+"""An ARC makes only the moves of the table; every reason has a text and stands in the protocol."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+
+import pytest
+
+from zscout.scheduling.model import TRANSITIONS, Arc, ArcRequest, ArcState
+from zscout.scheduling.reason import Party, Reason, ReasonCode
+from zscout.types import NO_TERM, SECOND, Place
+
+PROTOCOL = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+
+
+def arc_in(state: ArcState) -> Arc:
+    arc = Arc(ArcRequest("a", "h/c", {"robot/a": {}}, 1, SECOND), Place(NO_TERM, 1), 1)
+    arc.state = state
+    return arc
+
+
+@pytest.mark.parametrize(("before", "after"), list(itertools.product(ArcState, ArcState)))
+def test_a_move_that_is_not_in_the_table_raises(before: ArcState, after: ArcState) -> None:
+    arc = arc_in(before)
+    if after in TRANSITIONS[before]:
+        arc.move_to(after)
+        assert arc.state is after
+    else:
+        with pytest.raises(ValueError, match=f"ARC a is {before} and can't become {after}"):
+            arc.move_to(after)
+        assert arc.state is before
+
+
+def test_nothing_runs_before_it_was_queued_and_nothing_comes_back_from_its_end() -> None:
+    assert ArcState.RUNNING not in TRANSITIONS[ArcState.NEW]
+    assert not TRANSITIONS[ArcState.ENDED]
+    assert TRANSITIONS.keys() == set(ArcState)
+
+
+@pytest.mark.parametrize("code", ReasonCode)
+def test_every_reason_has_a_text_and_is_documented(code: ReasonCode) -> None:
+    reason = Reason(code, ("robot/a",), (Party("h/c/b", "b", 7),), detail="own words", number=1)
+    assert re.fullmatch(r"[a-z].+[^.]", str(reason).replace("own words", "its own words"))
+    assert str(reason._replace(pattern="robot/*")) == f"no robot/* is to be had: {reason}"
+    section = PROTOCOL[PROTOCOL.index("### ReasonInfo") : PROTOCOL.index("### ReasonParty")]
+    assert f"`{code}`" in section
+
+
+def test_a_reason_names_three_and_counts_the_rest() -> None:
+    parties = tuple(Party(f"h/c/{name}", name, 1) for name in "xyz")
+    held = Reason(ReasonCode.HELD, ("a", "b", "c"), parties, number=5)
+    assert str(held) == (
+        "needs a (held by x, priority 1), b (held by y, priority 1), c (held by z, priority 1) and 2 more"
+    )

@@ -1,0 +1,89 @@
+"""All invariants of a core's state, checked from its inside."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from zscout.config.scheduling_policy import owner_of
+from zscout.keyexpr import matcher
+from zscout.scheduling.core import Core
+from zscout.scheduling.model import ArcState
+from zscout.scheduling.queue_index import QueueIndex
+from zscout.scheduling.state import SchedulerState
+
+QUEUED = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.WATCHING, ArcState.PARKED)
+
+
+def validate(core: Core) -> None:
+    """Raises AssertionError that names the breach."""
+    state = core._state
+    _check_state(state)
+    _check_index(state, state.index)
+    for arc in state.running.values():
+        left = arc.hold is not None and arc.hold.end - state.now >= 0
+        assert left or arc.request.keep, f"{arc.id} overran"
+        assert arc.reason is None, f"{arc.id} runs and has a reason to wait"
+    for arc in state.queued.values():
+        assert arc.reason is not None, f"{arc.id} waits without a reason"
+    for _, rc, holders in state.votes.out():
+        assert state.rc(rc).present, f"a proposal is out at {rc}, which is absent"
+        assert all(state.arc(arc) for arc in holders), f"a proposal at {rc} names an ARC that ended"
+
+
+def _check_state(state: SchedulerState) -> None:
+    assert not state.queued.keys() & state.running.keys(), "an ARC both waits and runs"
+    for arc in state.queued.values():
+        assert arc.hold is None, f"{arc.id} waits and holds"
+        assert arc.state in QUEUED
+    for arc in state.running.values():
+        assert arc.hold is not None, f"{arc.id} runs without a hold"
+        assert arc.state is ArcState.RUNNING
+        assert arc.mask & ~state.present == 0, f"{arc.id} holds an absent RC"
+        assert arc.bound.keys() == set(arc.patterns), f"{arc.id} runs and is not bound"
+        for need, rc_name in arc.bound.items():
+            assert matcher(need)(rc_name), f"{arc.id} has {rc_name} for {need}"
+        assert len(arc.needs) == len(arc.request.needs), f"{arc.id} has one RC for two needs"
+        for rc in state.rcs_in(arc.mask):
+            assert rc.holders.get(arc.id) is arc, f"{arc.id} holds only a part: not {rc.name}"
+    busy = 0
+    for rc in state.rcs.values():
+        for holder in rc.holders:
+            assert holder in state.running, f"{rc.name} is held by {holder}, which does not run"
+            assert rc.name in state.running[holder].needs, f"{holder} did not ask for {rc.name}"
+        if not rc.sharable:
+            assert len(rc.holders) <= 1, f"{rc.name} has two holders: {sorted(rc.holders)}"
+            busy |= rc.bit if rc.holders else 0
+    assert busy == state.busy, "the mask of busy RCs is wrong"
+    counted = Counter(owner_of(arc.request.client) for arc in state.running.values())
+    assert counted == state.running_by_owner, "the owners' ARCs are miscounted"
+    demand = Counter(name for arc in state.queued.values() for name in arc.request.needs if name in state.rcs)
+    for rc in state.rcs.values():
+        assert rc.demand == demand[rc.name], f"{rc.name} is named by {demand[rc.name]}, not {rc.demand}"
+    by_pattern = {arc.id for arc in state.queued.values() if arc.patterns}
+    assert by_pattern == state.by_pattern.keys(), "those queued by pattern are not those known"
+    known = {arc.id for arcs in state._clients.values() for arc in arcs.values()}
+    assert known == state.queued.keys() | state.running.keys(), "the clients' ARCs are not those known"
+
+
+def _check_index(state: SchedulerState, index: QueueIndex) -> None:
+    queued = state.queued.values()
+    assert index.ranks == sorted(arc.rank for arc in queued), "the ranks are not those of the queue"
+    patient = sorted((arc.since, arc.id) for arc in queued if not index.is_starving(arc))
+    assert index._patient == patient, "the patient are not those of the queue"
+    band = state.policy.band
+    starving = sorted((-band(arc.priority), arc.since, arc.id) for arc in queued if index.is_starving(arc))
+    assert index.starving == starving, "the starving are not those of the queue"
+    for arc in queued:
+        places = {
+            ArcState.PARKED: arc.id in index.parked,
+            ArcState.WATCHING: arc.id in index.watching,
+        }
+        assert (arc.id in index.ready) == (not any(places.values())), f"{arc.id} is indexed twice, or nowhere"
+        for kind, there in places.items():
+            assert there == (arc.state is kind), f"{arc.id} is {arc.state} and not indexed so"
+        undecided = arc.state in {ArcState.VOTING, ArcState.DEFERRED, ArcState.PARKED}
+        assert (arc.id in index.footprints) == undecided, f"{arc.id} is {arc.state}"
+        rc = index.watching.get(arc.id)
+        assert rc is None or arc.rank in rc.watchers, f"{arc.id} is not among the watchers"
+    assert not (index.watching.keys() | index.footprints.keys()) - state.queued.keys()
+    assert index.hidden.keys() <= index.footprints.keys()

@@ -1,0 +1,118 @@
+"""One component's process, without a node: what the host can't do for it, and what it may not do."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from tests.behaviors.components.kit import ROOT, gone
+from zscout.config.fleet import default_fleet
+from zscout.keyexpr import new_instance
+from zscout.mesh import Refused, Supervisor
+from zscout.messages import ComponentSpec, StartComponent
+from zscout.services.node.component_process import ComponentProcess
+from zscout.services.node.limits import ControlGroups
+from zscout.types import SECOND
+
+START = 20.0
+
+
+def play(
+    folder: Path,
+    kind: str,
+    params: dict[str, Any],
+    story: Callable[[ComponentProcess], Awaitable[None]],
+    *,
+    memory_limit: int = 0,
+    cpu_limit: float = 0,
+) -> ComponentProcess:
+    """Runs a kind of `odd.py` as a process on a host without control groups; returns how it ended."""
+    fleet = default_fleet()
+    mesh = msgspec.structs.replace(fleet.mesh, multicast=False)
+    rules = msgspec.structs.replace(fleet, name=f"test-{new_instance()}", mesh=mesh)
+    spec = ComponentSpec(kind, params, memory_limit=memory_limit, cpu_limit=cpu_limit)
+    ends: list[ComponentProcess] = []
+    failures: list[Exception] = []
+
+    async def run() -> ComponentProcess:
+        start = StartComponent("c", 1, spec)
+        process = ComponentProcess(
+            "h", rules, ControlGroups(folder), start, f"tests.behaviors.components.odd:{kind}", ends.append
+        )
+        process.begin(Supervisor("test", failures.append))
+        async with asyncio.timeout(START):
+            await process.settled.wait()
+            pid = process.pid
+            await story(process)
+            await process.over.wait()
+        assert (ends, failures) == ([process], [])
+        if pid is not None:
+            await gone(pid)
+        return process
+
+    return asyncio.run(run())
+
+
+@pytest.fixture(autouse=True)
+def tests_importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
+def test_memory_is_limited_without_groups_too_and_it_is_said_what_is_not(tmp_path: Path) -> None:
+    seen = []
+
+    async def story(process: ComponentProcess) -> None:
+        seen.append(process.view().reason)
+
+    limits: dict[str, Any] = {"memory_limit": 200_000_000, "cpu_limit": 0.5}
+    process = play(tmp_path, "Eater", {"memory": 1000}, story, **limits)
+    assert (process.ended, process.reason) == ("failed", "MemoryError")
+    assert "memory_limit holds for each of its processes" in seen[0]
+    assert "cpu_limit can't be set" in seen[0]
+
+
+def test_who_says_what_is_no_message_is_killed(tmp_path: Path) -> None:
+    async def story(process: ComponentProcess) -> None:
+        await process.over.wait()
+
+    process = play(tmp_path, "Garbler", {}, story)
+    assert process.ended == "failed"
+    assert "what it said to its node is no message" in process.reason
+
+
+def test_who_ends_before_it_has_answered_is_not_waited_for(tmp_path: Path) -> None:
+    async def story(process: ComponentProcess) -> None:
+        asking = asyncio.create_task(process.checkpoint())
+        await asyncio.sleep(0)
+        await process.stop(5)
+        # Its process may still have said so itself, on its way out.
+        with pytest.raises(Refused, match=r"it has ended, stopped|it does not run"):
+            await asking
+        with pytest.raises(Refused, match="it must run for that"):
+            await process.checkpoint()
+
+    process = play(tmp_path, "Restless", {}, story)
+    assert (process.ended, process.reason) == ("stopped", "")
+
+
+def test_who_is_stopped_before_it_is_ready_ends(tmp_path: Path) -> None:
+    async def story() -> None:
+        fleet = default_fleet()
+        start = StartComponent("c", 1, ComponentSpec("Never"))
+        process = ComponentProcess(
+            "h", fleet, ControlGroups(tmp_path), start, "tests.behaviors.components.odd:Never", lambda _: None
+        )
+        failures: list[Exception] = []
+        process.begin(Supervisor("test", failures.append))
+        began = asyncio.get_running_loop().time()
+        await process.stop(0.5)
+        assert asyncio.get_running_loop().time() - began < fleet.placement.start_timeout / SECOND
+        assert (process.phase, process.ended) == ("ended", "stopped")
+        assert process.settled.is_set()
+
+    asyncio.run(story())

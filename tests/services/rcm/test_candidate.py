@@ -1,0 +1,202 @@
+"""Who leads: taking over, being deposed, and what becomes of a candidate in which something fails."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from decimal import Decimal
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from tests.mesh.kit import run, until
+from tests.services.rcm.kit import FakeFleet, Refusal
+from zscout.keyexpr import Role
+from zscout.messages import Notice, OpenRequest, Release
+from zscout.services.rcm.candidate import BACKOFF, MAX_BACKOFF, Candidate
+from zscout.types import Term
+
+
+def open_request(notice: Notice) -> OpenRequest:
+    needs: dict[str, dict[str, Decimal]] = {rc: {} for rc in notice.rcs}
+    return OpenRequest(notice.id, notice.arc, needs, 0, Decimal(60), place=notice.place, grant=notice.grant)
+
+
+async def living(fleet: FakeFleet, role: str) -> list[tuple[str, str]]:
+    """Host and instance of each token of a role."""
+    tokens = await fleet.watcher.living(fleet.watcher.keys.alive_any(role), timeout=1)
+    return [(token.host, token.instance) for token in tokens]
+
+
+def test_a_takeover_carries_on_what_stands_and_nobody_is_disturbed() -> None:
+    async def story() -> None:
+        fleet = FakeFleet("x", "y")
+        leader, heir = fleet.candidate("x"), fleet.candidate("y")
+        robots = [fleet.rc(f"robot/{name}") for name in "ab"]
+        await until(lambda: leader.rcm)
+        await fleet.joined(*robots)
+        client, late = fleet.client("one"), fleet.client("late")
+        held, waits = await client.ask("held", "robot/a"), await client.ask("waits", "robot/a")
+        half = await late.ask("half", "robot/b")
+        client.open = [open_request(held), open_request(waits)]
+        late.open = [open_request(half)]
+        fleet.network.kill(leader.mesh)
+        await until(lambda: heir.rcm)
+        assert heir.rcm is not None
+        assert heir.rcm.term.counter == 2
+        state = await fleet.state()
+        assert {view.arc: view.grant for view in state.holds} == {"held": held.grant, "half": half.grant}
+        assert [(view.arc, view.place) for view in state.queue] == [("waits", waits.place)]
+        # It carries the queue on.
+        await client.do(Release("held"))
+        await until(lambda: robots[0].arcs == ["waits"])
+        assert late.notices == []
+        await heir.stop()
+        await leader.stop()
+
+    run(story())
+
+
+def test_while_most_rcs_see_a_leader_nobody_takes_over() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        robots = [fleet.rc(f"robot/{name}", leader=True) for name in "abc"]
+        candidate = fleet.candidate("x")
+        await asyncio.sleep(5)
+        assert candidate.rcm is None
+        robots[0].leader = robots[1].leader = False
+        await until(lambda: candidate.rcm)
+        await candidate.stop()
+
+    run(story())
+
+
+def test_a_leader_steps_down_for_a_higher_term_and_asks_nothing_more() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        candidate = fleet.candidate("x")
+        await until(lambda: candidate.rcm)
+        (reign,) = await living(fleet, Role.RCM)
+        # An RC that comes has promised a higher term: it refuses this one, however often it is asked.
+        robot = fleet.rc("robot/a", term=Term(7, "other"), leader=True)
+        await until(lambda: candidate.rcm is None)
+        assert candidate.known == Term(7, "other")
+        await asyncio.sleep(5)
+        assert [asked.promise for asked in robot.asked if asked.promise] == [Term(1, reign[1])]
+        robot.leader = False
+        await until(lambda: candidate.rcm)
+        assert robot.term.counter == 8
+        await candidate.stop()
+
+    run(story())
+
+
+def broken_loop(candidate: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(candidate._changed, "clear", lambda: 1 / 0)
+    candidate._changed.set()
+
+
+def broken_core(candidate: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert candidate.rcm is not None
+    monkeypatch.setattr(candidate.rcm.core, "handle", lambda *_: 1 / 0)
+
+
+def broken_handler(candidate: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert candidate.rcm is not None
+    monkeypatch.setattr(candidate.rcm.registry, "enter", lambda *_: 1 / 0)
+
+
+def broken_heartbeat(candidate: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert candidate.rcm is not None
+    monkeypatch.setattr(candidate.rcm.publisher, "_put", lambda *_: 1 / 0)
+
+
+@pytest.mark.parametrize("broken", [broken_loop, broken_core, broken_handler, broken_heartbeat])
+def test_a_leader_in_which_something_fails_steps_down_and_stands_again(
+    broken: Callable[[Candidate, pytest.MonkeyPatch], None],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def story() -> None:
+        fleet = FakeFleet("x", "y")
+        first = fleet.candidate("x")
+        second = fleet.candidate("y")
+        await until(lambda: first.rcm)
+        robot, client = fleet.rc("robot/a"), fleet.client("one")
+        await fleet.joined(robot)
+        held = await client.ask("held", "robot/a")
+        client.open = [open_request(held)]
+        before = dict(await living(fleet, Role.CANDIDATE))["x"]
+        begin = asyncio.get_running_loop().time()
+        broken(first, monkeypatch)
+        refusal = await asyncio.gather(client.ask("next", "robot/a"), return_exceptions=True)
+        await until(lambda: first.rcm is None)
+        monkeypatch.undo()
+        if broken in (broken_core, broken_handler):
+            # Its operation is answered at once: another RCM has to be asked.
+            assert isinstance(refusal[0], Refusal)
+            assert refusal[0].code == ("not_leading" if broken is broken_core else "internal")
+        # Another takes over meanwhile, with all that stands.
+        await until(lambda: second.rcm)
+        assert [host for host, _ in await living(fleet, Role.CANDIDATE)] == ["y"]
+        assert {view.grant for view in (await fleet.state()).holds} == {held.grant}
+        # It stands again after a while, as a new candidate, and leads when it must.
+        while len(tokens := await living(fleet, Role.CANDIDATE)) < 2:  # noqa: ASYNC110
+            await asyncio.sleep(0.1)
+        assert asyncio.get_running_loop().time() - begin < 10
+        assert dict(tokens)["x"] != before
+        fleet.network.kill(second.mesh)
+        await until(lambda: first.rcm)
+        assert (await fleet.state()).holds[0].grant == held.grant
+        await first.stop()
+        await second.stop()
+
+    with caplog.at_level(logging.ERROR):
+        run(story())
+    failures = [record for record in caplog.records if record.exc_info and "failed" in record.message]
+    assert len(failures) == 1
+    assert "never retrieved" not in caplog.text
+
+
+def test_a_candidate_that_always_fails_tries_less_and_less(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    stood: list[float] = []
+
+    async def fails(_: Any) -> None:
+        stood.append(asyncio.get_running_loop().time())
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Candidate, "_run", fails)
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        candidate = fleet.candidate("x")
+        await asyncio.sleep(120)
+        await candidate.stop()
+        count = len(stood)
+        await asyncio.sleep(120)
+        assert len(stood) == count
+
+    run(story())
+    gaps = [round(later - earlier) for earlier, later in pairwise(stood)]
+    assert gaps[:6] == [BACKOFF, 2, 4, 8, 16, MAX_BACKOFF]
+    assert set(gaps[6:]) == {MAX_BACKOFF}
+
+
+def test_a_reign_that_is_over_asks_nothing_more() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm()
+        # A token that stands for nothing: its RC never answers, and is asked again and again.
+        robot = fleet.rc("robot/a", term=Term(9, "newer"))
+        await until(lambda: fleet.newer)
+        rcm.stop()
+        count = len(robot.asked)
+        await asyncio.sleep(5)
+        assert len(robot.asked) == count
+        assert fleet.failures == []
+
+    run(story())

@@ -1,0 +1,146 @@
+"""When a candidate may try to lead: tables of what it sees, and what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from zscout.services.rcm.election import (
+    RETRY,
+    SETTLE,
+    TURN,
+    Election,
+)
+from zscout.types import SECOND, Ns, Term
+
+SILENCE = 2 * SECOND
+START: Ns = 100 * SECOND
+LATER: Ns = START + 60 * SECOND
+
+Sight = Callable[[Election], None]
+
+
+def election(host: str = "b", ranking: tuple[str, ...] = ("a", "b", "c")) -> Election:
+    return Election(host, ranking, silence=SILENCE, now=START)
+
+
+def came(instance: str, now: Ns = LATER) -> Sight:
+    return lambda seen: seen.leader(instance, alive=True, now=now)
+
+
+def went(instance: str, now: Ns = LATER) -> Sight:
+    return lambda seen: seen.leader(instance, alive=False, now=now)
+
+
+def heard(instance: str, now: Ns) -> Sight:
+    return lambda seen: seen.published(Term(7, instance), now)
+
+
+def candidate(host: str, *, alive: bool = True) -> Sight:
+    return lambda seen: seen.candidate(host, alive=alive)
+
+
+def failed(now: Ns) -> Sight:
+    return lambda seen: seen.failed(now)
+
+
+@pytest.mark.parametrize(
+    ("sights", "now", "due"),
+    [
+        pytest.param([], START, START + SETTLE, id="nothing seen: after it has settled"),
+        pytest.param([candidate("b")], START, START + SETTLE, id="itself is no better candidate"),
+        pytest.param([candidate("a")], START, START + SETTLE + TURN, id="a better one goes first"),
+        pytest.param([candidate("c")], START, START + SETTLE, id="a worse one is not waited for"),
+        pytest.param(
+            [candidate("a"), candidate("a", alive=False)], START, START + SETTLE, id="a better one left"
+        ),
+        pytest.param(
+            [candidate("a"), candidate("a"), candidate("a", alive=False)],
+            START,
+            START + SETTLE + TURN,
+            id="one of two lives of a better one is left",
+        ),
+        pytest.param(
+            [candidate("z", alive=False)], START, START + SETTLE, id="somebody unknown left: no matter"
+        ),
+        pytest.param([came("x")], LATER, LATER + SILENCE, id="a leader: until it is silent for too long"),
+        pytest.param(
+            [came("x"), heard("x", LATER + SECOND)], LATER, LATER + SECOND + SILENCE, id="it goes on speaking"
+        ),
+        pytest.param([heard("x", LATER)], LATER, START + SETTLE, id="words of one without a token count not"),
+        pytest.param([came("x"), went("x", LATER + 5)], LATER + 5, LATER + 5, id="it died: at once"),
+        pytest.param(
+            [came("x", START + 2), went("x", START + 5)],
+            START + 5,
+            START + 5,
+            id="it died before this one had settled: who saw a leader is on the mesh",
+        ),
+        pytest.param(
+            [candidate("a"), came("x"), went("x", LATER)], LATER, LATER + TURN, id="it died: the better first"
+        ),
+        pytest.param([went("x", LATER)], LATER, START + SETTLE, id="a death of one never seen"),
+        pytest.param(
+            [came("x"), came("y", LATER + SECOND), went("x", LATER + 2 * SECOND)],
+            LATER + 2 * SECOND,
+            LATER + SECOND + SILENCE,
+            id="one of two died",
+        ),
+        pytest.param([failed(LATER)], LATER, LATER + RETRY, id="an attempt failed: not again at once"),
+        pytest.param(
+            [came("x"), heard("x", LATER)],
+            LATER + SILENCE,
+            START + SETTLE,
+            id="it keeps its token and says nothing: as if it were gone",
+        ),
+        pytest.param(
+            [came("hung"), came("x", LATER + 5 * SECOND), heard("x", LATER + 9 * SECOND)],
+            LATER + 9 * SECOND,
+            LATER + 9 * SECOND + SILENCE,
+            id="one of two hangs: no reason to try while the other speaks",
+        ),
+        pytest.param(
+            [came("x"), failed(LATER + SILENCE - 1)],
+            LATER + SILENCE - 1,
+            LATER + SILENCE - 1 + RETRY,
+            id="a leader about to fall silent, and an attempt that failed",
+        ),
+    ],
+)
+def test_when_to_try(sights: list[Sight], now: Ns, due: Ns) -> None:
+    seen = election()
+    for sight in sights:
+        sight(seen)
+    assert seen.next_try(now) == due
+
+
+@pytest.mark.parametrize("sights", [[], [came("x"), went("x")], [failed(START)]])
+def test_who_is_not_named_never_tries(sights: list[Sight]) -> None:
+    seen = election(host="d")
+    for sight in sights:
+        sight(seen)
+    assert not seen.eligible
+    assert seen.next_try(LATER) is None
+
+
+def test_without_a_ranking_hosts_take_turns_by_name() -> None:
+    turns = {}
+    for host in ("a", "b", "c"):
+        seen = election(host, ranking=())
+        for other in ("a", "b", "c"):
+            seen.candidate(other, alive=True)
+        turns[host] = seen.next_try(START)
+    settled = START + SETTLE
+    assert turns == {"a": settled, "b": settled + TURN, "c": settled + 2 * TURN}
+
+
+def test_a_leader_counts_while_it_has_a_token_and_speaks() -> None:
+    seen = election()
+    assert not seen.sees_leader(LATER)
+    seen.leader("x", alive=True, now=LATER)
+    assert seen.sees_leader(LATER + SILENCE - 1)
+    assert not seen.sees_leader(LATER + SILENCE)
+    seen.published(Term(7, "x"), LATER + SILENCE)
+    assert seen.sees_leader(LATER + SILENCE)
+    seen.leader("x", alive=False, now=LATER + SILENCE)
+    assert not seen.sees_leader(LATER + SILENCE)

@@ -1,0 +1,267 @@
+"""A reign from request to notice: the real RCM and core on a mesh in memory."""
+
+from __future__ import annotations
+
+import asyncio
+
+import msgspec
+import pytest
+
+from tests.mesh.kit import run, until
+from tests.services.rcm.kit import FakeFleet, Refusal, grant_of
+from zscout.messages import Cancel, EndedHold, HandOver, Release
+from zscout.types import Grant, Term
+
+
+def test_a_grant_is_published_then_the_loser_is_told_then_the_asker_is_answered() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        robot = fleet.rc("robot/a")
+        await fleet.joined(robot)
+        survey, operator = fleet.client("survey"), fleet.client("operator")
+        first = await survey.ask("survey", "robot/a")
+        fleet.log.clear()
+        await operator.ask("drive", "robot/a", priority=10)
+        assert fleet.log == [
+            ("all", "grants", "robot/a"),
+            ("survey", "notice", "survey queued"),
+            ("operator", "answer", "drive running"),
+        ]
+        (preempted,) = survey.notices
+        assert (preempted.outcome, preempted.by, preempted.grant) == (
+            "preempted",
+            "desk/operator/drive",
+            first.grant,
+        )
+        # Why it waits now is told a little later.
+        await until(lambda: len(survey.notices) == 2)
+        assert survey.notices[1].reason == "needs robot/a (held by drive, priority 10)"
+        # The end of a hold that its own client released is told by the answer alone.
+        await operator.do(Release("drive"))
+        await until(lambda: survey.notices[-1].state == "running")
+        assert operator.notices == []
+        assert robot.arcs == ["survey"]
+        story = [line.text for line in (await fleet.state(arc="survey")).story]
+        assert story == [
+            "asked for robot/a at priority 0",
+            "granted robot/a",
+            "preempted: preempted by drive, priority 10; queued again",
+            "waits: needs robot/a (held by drive, priority 10)",
+            "granted robot/a",
+        ]
+
+    run(story())
+
+
+def test_what_arrives_in_one_burst_is_one_instant_and_ends_come_first() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm()
+        robots = [fleet.rc(f"robot/{name}") for name in "ab"]
+        await fleet.joined(*robots)
+        client = fleet.client("one")
+        await client.ask("first", "robot/a")
+        before, seq = rcm.core.batches, fleet.published[-1].seq
+        answers = await asyncio.gather(
+            client.ask("second", "robot/a"), client.ask("third", "robot/b"), client.do(Release("first"))
+        )
+        assert [answer.state for answer in answers] == ["running", "running", "ended"]
+        assert rcm.core.batches == before + 1
+        assert [grants.prev for grants in fleet.published if grants.seq > seq] == [seq]
+        # Of one ARC the order counts: it is asked for and given up, in two instants.
+        asked, cancelled = await asyncio.gather(client.ask("fourth", "robot/a"), client.do(Cancel("fourth")))
+        assert (asked.state, cancelled.outcome) == ("queued", "cancelled")
+
+    run(story())
+
+
+def test_asking_again_tells_how_it_stands_and_what_ended_is_remembered() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        robot = fleet.rc("robot/a")
+        await fleet.joined(robot)
+        client = fleet.client("one")
+        first = await client.ask("first", "robot/a", seconds=2)
+        assert grant_of(await client.ask("first", "robot/a", seconds=2)) == first.grant
+        await until(lambda: client.notices)
+        assert (client.notices[0].state, client.notices[0].outcome) == ("ended", "completed")
+        assert (await client.ask("first", "robot/a", seconds=2)).outcome == "completed"
+        await asyncio.sleep(61)
+        assert (await client.ask("second", "robot/a")).state == "running"
+        await client.do(Release("second"))
+        assert (await client.ask("first", "robot/a")).state == "running"
+        with pytest.raises(Refusal, match="bad_request: needs is empty"):
+            await client.ask("third")
+
+    run(story())
+
+
+def test_a_vote_that_is_late_grants_later_and_a_veto_is_a_reason() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        radio = fleet.rc("radio/f", accept=None)
+        await fleet.joined(radio)
+        client = fleet.client("one")
+        begin = asyncio.get_running_loop().time()
+        answer = await client.ask("talk", "radio/f:5")
+        waited = asyncio.get_running_loop().time() - begin
+        assert (answer.state, answer.reason) == ("queued", "radio/f does not answer")
+        assert waited == pytest.approx(0.25, abs=0.01)  # the vote is overdue
+        await asyncio.sleep(0.5)
+        radio.vote(accept=True)
+        await until(lambda: client.notices and client.notices[-1].state == "running")
+        # A veto is a reason. It stands until the rules of the RC change.
+        radio.accept = False
+        assert (await client.ask("more", "radio/f:9")).reason == "radio/f refuses: too much"
+        await client.ask("more", "radio/f:9")
+        assert [len(proposal.holders) for proposal in radio.proposals] == [1, 2]
+        radio.accept, radio.rules = True, 1
+        radio.publish()
+        await until(lambda: radio.arcs == ["talk", "more"])
+
+    run(story())
+
+
+def test_an_rc_that_comes_is_granted_and_one_that_goes_ends_the_whole_gang() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        client = fleet.client("one")
+        answer = await client.ask("gang", "robot/a", "robot/b")
+        assert "not on the mesh" in answer.reason
+        robots = [fleet.rc(f"robot/{name}") for name in "ab"]
+        await until(lambda: client.notices and client.notices[-1].state == "running")
+        place = client.notices[-1].place
+        # It can't carry its holder any longer, and then it can.
+        robots[0].publish(health="no power")
+        await until(lambda: client.notices[-1].outcome == "lost")
+        assert client.notices[-1].reason == "robot/a was lost: no power"
+        assert fleet.published[-1].rcs == {"robot/a": [], "robot/b": []}
+        robots[0].publish()
+        await until(lambda: client.notices[-1].state == "running")
+        # Its token goes; another instance comes.
+        robots[1].token.close()
+        await until(lambda: client.notices[-1].reason == "robot/b was lost: it left the mesh")
+        fleet.rc("robot/b", instance="i2")
+        await until(lambda: client.notices[-1].state == "running")
+        assert client.notices[-1].place == place
+
+    run(story())
+
+
+def test_what_an_rc_reports_is_set_right() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        robot = fleet.rc("robot/a")
+        await fleet.joined(robot)
+        client = fleet.client("one")
+        grant = grant_of(await client.ask("first", "robot/a"))
+        (holder,) = robot.holders
+        # It has ended the hold of its own: the ARC is queued, and granted anew.
+        robot.holders = []
+        robot.publish(ended=[EndedHold("first", grant, "lease")])
+        await until(lambda: client.notices and client.notices[-1].state == "running")
+        assert client.notices[0].reason == "robot/a ended the hold"
+        # It has a holder too many: who holds it is published again.
+        count = len(fleet.published)
+        stranger = msgspec.structs.replace(holder, grant=Grant(Term(1, "other"), 3), arc="stranger")
+        robot.holders = [*robot.holders, stranger]
+        robot.publish()
+        await until(lambda: robot.arcs == ["first"])
+        assert len(fleet.published) == count + 1
+        # What it does not name and has not heard of yet is not lost.
+        robot.holders, robot.seq = [], robot.seq - 1
+        robot.publish()
+        await asyncio.sleep(1)
+        assert client.notices[-1].state == "running"
+        assert [view.arc for view in (await fleet.state()).holds] == ["first"]
+
+    run(story())
+
+
+def test_a_client_that_is_gone_leaves_nothing() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        robot = fleet.rc("robot/a")
+        await fleet.joined(robot)
+        gone, heir = fleet.client("gone"), fleet.client("heir")
+        await gone.ask("first", "robot/a")
+        await gone.ask("second", "robot/a")
+        await heir.ask("third", "robot/a")
+        begin = asyncio.get_running_loop().time()
+        fleet.network.kill(gone.mesh)
+        await until(lambda: robot.arcs == ["third"])
+        assert asyncio.get_running_loop().time() - begin < 0.01
+        assert (await fleet.state()).queue == []
+        # Who asks and shows no token is dropped after a lease.
+        ghost = fleet.client("ghost")
+        ghost.token.close()
+        await ghost.ask("fourth", "robot/a", priority=5)
+        await until(lambda: robot.arcs == ["fourth"])
+        await until(lambda: robot.arcs == ["third"], within=2 * fleet.fleet.mesh.lease)
+
+    run(story())
+
+
+def test_a_client_that_goes_in_the_burst_of_its_request_leaves_nothing() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        robot = fleet.rc("robot/a")
+        await fleet.joined(robot)
+        client = fleet.client("brief")
+        asking = asyncio.ensure_future(client.ask("brief", "robot/a"))
+        await asyncio.sleep(0)
+        client.token.close()
+        await asking
+        await until(lambda: robot.arcs == [], within=2 * fleet.fleet.mesh.lease)
+
+    run(story())
+
+
+def test_a_hand_over_is_one_publication_and_can_be_repeated() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        robots = [fleet.rc(f"robot/{name}") for name in "ab"]
+        await fleet.joined(*robots)
+        old, new, rival = fleet.client("old"), fleet.client("new"), fleet.client("rival")
+        first = await old.ask("first", "robot/a", seconds=600)
+        await rival.ask("rival", "robot/b")
+        place = (await old.ask("second", "robot/b", seconds=600)).place
+        await rival.ask("third", "robot/a")
+        count = len(fleet.published)
+        order = HandOver("first", new.name, ["second", "none"])
+        answer = await old.do(order)
+        assert (answer.client, answer.state, answer.place) == (new.name, "running", first.place)
+        assert grant_of(answer) > grant_of(first)
+        assert len(fleet.published) == count + 1
+        assert [holder.client for holder in robots[0].holders] == [new.name]
+        assert [(notice.arc, notice.state) for notice in new.notices] == [
+            ("first", "running"),
+            ("second", "queued"),
+        ]
+        assert new.notices[1].place == place
+        assert {notice.arc: notice.outcome for notice in old.notices} == dict.fromkeys(
+            ("first", "second"), "handed_over"
+        )
+        # Doing it twice is doing it once; the new client may have missed it.
+        new.notices.clear()
+        assert (await old.do(order)).grant == answer.grant
+        await until(lambda: {notice.arc for notice in new.notices} == {"first", "second"})
+        with pytest.raises(Refusal, match="not_running"):
+            await old.do(HandOver("other", new.name))
+        with pytest.raises(Refusal, match="unknown_client"):
+            await new.do(HandOver("first", "desk/nobody"))
+        # What went on elsewhere is not queued once more at its old place.
+        await asyncio.sleep(61)
+        await new.do(Cancel("second"))
+        again = await old.ask("first", "robot/a", place=first.place)
+        assert (again.outcome, again.reason) == ("handed_over", "handed over to another client")
+
+    run(story())

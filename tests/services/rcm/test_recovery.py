@@ -1,0 +1,309 @@
+"""What a new RCM finds: tables of what RCs and clients answer, and what stands after that."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from fractions import Fraction
+
+import pytest
+
+from zscout.drivers.holds import HoldTable
+from zscout.messages import ClientRequests, Holder, HoldView, OpenRequest, RcmState, RcState
+from zscout.scheduling.core import Core
+from zscout.scheduling.events import LeadTaken, RcJoined
+from zscout.scheduling.strategies import STRATEGIES
+from zscout.services.rcm.recovery import RecoveredState, recover
+from zscout.types import (
+    SECOND,
+    Grant,
+    Ns,
+    Place,
+    Term,
+)
+
+NOW: Ns = 1000 * SECOND
+OLD, TERM = Term(2, "aa"), Term(3, "bb")
+PLACE = Place(OLD, 7)
+GANG = ("robot/a", "radio/b")
+
+
+def hold(
+    rcs: tuple[str, ...] = GANG,
+    *,
+    seq: int = 5,
+    term: Term = TERM,
+    client: str = "h/one",
+    name: str = "gang",
+    remaining: float = 10,
+    params: dict[str, Decimal] | None = None,
+    runtime: str = "60",
+    bound: dict[str, str] | None = None,
+) -> Holder:
+    return Holder(
+        id=f"{name}-id",
+        arc=name,
+        client=client,
+        grant=Grant(term, seq),
+        place=PLACE,
+        rcs=list(rcs),
+        min_runtime=Decimal(runtime),
+        remaining=remaining,
+        priority=3,
+        keep=True,
+        params=params or {},
+        bound=bound or {},
+    )
+
+
+def rc(name: str, *holders: Holder, health: str = "ok") -> RcState:
+    sharable = name.startswith("radio")
+    return RcState(rc=name, host="c", instance="i", sharable=sharable, holders=list(holders), health=health)
+
+
+def asked(
+    name: str = "gang",
+    *,
+    place: Place | None = PLACE,
+    grant: Grant | None = None,
+    needs: tuple[str, ...] = GANG,
+    rate: str = "2.5",
+    runtime: str = "60",
+    waited: float = 0.0,
+) -> OpenRequest:
+    return OpenRequest(
+        id=f"{name}-id",
+        arc=name,
+        needs={rc: {"rate": Decimal(rate)} if rc.startswith("radio") else {} for rc in needs},
+        priority=3,
+        min_runtime=Decimal(runtime),
+        keep=True,
+        place=place,
+        waited=waited,
+        grant=grant,
+    )
+
+
+def client(*requests: OpenRequest, name: str = "h/one") -> ClientRequests:
+    return ClientRequests(client=name, requests=list(requests))
+
+
+BOTH = [rc("robot/a", hold()), rc("radio/b", hold(params={"rate": Decimal("2.5")}))]
+RUNS = client(asked(grant=Grant(TERM, 5)))
+
+
+def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
+    """The names of what stands and what waits."""
+    return [held.request.name for held in found.standing], [one.request.name for one in found.waiting]
+
+
+@pytest.mark.parametrize(
+    ("states", "clients", "standing", "waiting"),
+    [
+        pytest.param([], [], [], [], id="nothing"),
+        pytest.param(BOTH, [RUNS], ["gang"], [], id="a gang that is all there"),
+        pytest.param(BOTH, [], ["gang"], [], id="its client is late: the RCs' word is enough"),
+        pytest.param(BOTH[:1], [RUNS], ["gang"], [], id="an RC is absent: the core ends it by name"),
+        pytest.param(
+            [BOTH[0], rc("radio/b")], [RUNS], [], ["gang"], id="an RC is there and does not hold it"
+        ),
+        pytest.param([BOTH[0], rc("radio/b")], [], [], ["gang"], id="the same, and its client is late"),
+        pytest.param(
+            [BOTH[0], rc("radio/b", hold(seq=4))], [RUNS], [], ["gang"], id="half under an older grant"
+        ),
+        pytest.param(
+            [rc("robot/a", hold(seq=1)), rc("radio/b", hold(seq=1), hold(term=OLD, seq=9))],
+            [RUNS],
+            ["gang"],
+            [],
+            id="of two grants of one ARC the newer counts, if it is whole",
+        ),
+        pytest.param(
+            [rc("robot/a"), rc("radio/b")], [RUNS], [], ["gang"], id="no RC holds what its client believes in"
+        ),
+        pytest.param([], [RUNS], [], ["gang"], id="no RC answers at all"),
+        pytest.param(BOTH, [client()], [], [], id="its client has given it up: nobody wants it"),
+        pytest.param(
+            BOTH,
+            [client(asked("other", place=None), name="h/one")],
+            [],
+            [],
+            id="its client has given it up and wants something else, which it asks for",
+        ),
+        pytest.param(
+            BOTH, [client(name="h/two")], ["gang"], [], id="another client has nothing to say about it"
+        ),
+        pytest.param([], [client(asked(place=None))], [], [], id="never answered: it will be asked again"),
+        pytest.param(
+            BOTH,
+            [
+                RUNS,
+                client(
+                    asked("third", place=Place(TERM, 1)), asked("second", place=Place(OLD, 9)), name="h/z"
+                ),
+                client(asked("first", place=Place(OLD, 8)), name="h/y"),
+            ],
+            ["gang"],
+            ["first", "second", "third"],
+            id="those who wait, by place",
+        ),
+        pytest.param([], [client(asked(runtime="-1"))], [], [], id="nonsense from a client"),
+        pytest.param(
+            [],
+            [client(asked(runtime="0"), asked("good"), asked("bad name")), client(name="no client")],
+            [],
+            ["good"],
+            id="nonsense from a client spoils nothing else",
+        ),
+        pytest.param(
+            [rc("robot/a", hold(("robot/a",), runtime="NaN"))], [], [], [], id="nonsense from an RC"
+        ),
+        pytest.param(
+            [rc("robot/a", hold(("robot/a",), client="nobody"), hold(("robot/a",), name="good"))],
+            [],
+            ["good"],
+            [],
+            id="nonsense from an RC spoils nothing else",
+        ),
+    ],
+)
+def test_recover(
+    states: list[RcState], clients: list[ClientRequests], standing: list[str], waiting: list[str]
+) -> None:
+    found = recover(states, clients, NOW)
+    assert summary(found) == (standing, waiting)
+    assert found.rcs == {state.rc: state for state in states}
+
+
+def test_a_standing_hold_is_carried_on_as_it_is() -> None:
+    (held,) = recover(BOTH, [RUNS], NOW).standing
+    assert (held.grant, held.place) == (Grant(TERM, 5), PLACE)
+    assert (held.start, held.end) == (NOW - 50 * SECOND, NOW + 10 * SECOND)
+    request = held.request
+    assert (request.arc, request.client, request.name) == ("h/one/gang-id", "h/one", "gang")
+    assert (request.priority, request.keep, request.min_runtime) == (3, True, 60 * SECOND)
+    assert request.needs == {"robot/a": {}, "radio/b": {"rate": Fraction(5, 2)}}
+
+
+def test_clocks_differ_a_little_and_the_earliest_end_counts() -> None:
+    states = [rc("robot/a", hold(remaining=10)), rc("radio/b", hold(remaining=9.5))]
+    (held,) = recover(states, [], NOW).standing
+    assert held.end == NOW + 9_500_000_000
+
+
+def test_the_parameters_at_an_absent_rc_are_what_the_client_says() -> None:
+    (held,) = recover(BOTH[:1], [RUNS], NOW).standing
+    assert held.request.needs["radio/b"] == {"rate": Fraction(5, 2)}
+
+
+# Needs by pattern
+
+RATE = {"rate": Decimal("2.5")}
+THREE = ("robot/a", "radio/b", "radio/c")
+BOUND = {"robot/*": "robot/a", "radio/*": "radio/c", "radio/*#2": "radio/b"}
+
+
+def bound_hold(bound: dict[str, str] = BOUND, params: dict[str, Decimal] | None = None) -> Holder:
+    return hold(THREE, params=params, bound=bound)
+
+
+BY_PATTERN = [
+    rc("robot/a", bound_hold()),
+    rc("radio/b", bound_hold(params=RATE)),
+    rc("radio/c", bound_hold(params=RATE)),
+]
+ASKED = client(asked(grant=Grant(TERM, 5), needs=tuple(BOUND)))
+
+
+@pytest.mark.parametrize("clients", [[], [ASKED]], ids=["its client is late", "its client answers"])
+@pytest.mark.parametrize(
+    "states",
+    [
+        pytest.param(BY_PATTERN, id="all there"),
+        pytest.param(BY_PATTERN[1:], id="without the robot"),
+        pytest.param(BY_PATTERN[:2], id="without one radio: the other tells what is asked of it"),
+        pytest.param([rc("robot/a", hold(THREE)), *BY_PATTERN[1:]], id="one RC knows nothing of patterns"),
+    ],
+)
+def test_patterns_and_what_meets_them_are_restored(
+    states: list[RcState], clients: list[ClientRequests]
+) -> None:
+    found = recover(states, clients, NOW)
+    (held,) = found.standing
+    rate = {"rate": Fraction(5, 2)}
+    assert held.request.needs == {"robot/*": {}, "radio/*": rate, "radio/*#2": rate}
+    assert held.bound == BOUND
+    core = Core(STRATEGIES["priority"]())
+    joined = [RcJoined(state.rc, state.sharable) for state in states]
+    core.handle(NOW, *joined, LeadTaken(Term(4, "cc"), tuple(found.standing)))
+    arc = core.arc("h/one/gang-id")
+    assert arc is not None
+    if len(states) == len(THREE):
+        assert (arc.hold is not None, set(arc.needs), arc.bound) == (True, set(THREE), BOUND)
+    else:
+        assert (arc.hold, arc.place) == (None, PLACE)
+
+
+def test_an_rc_that_read_of_its_hold_in_a_snapshot_passes_on_its_binding() -> None:
+    view = HoldView(
+        id="gang-id", arc="gang", client="h/one", priority=3, grant=Grant(TERM, 5), place=PLACE,
+        needs={"robot/a": {}}, min_runtime=Decimal(60), held=50.0, remaining=10.0,
+        bound={"robot/*": "robot/a"},
+    )  # fmt: skip
+    holding = HoldTable("robot/a", hold_lease=3 * SECOND)
+    holding.apply_snapshot(RcmState(TERM, 5, "h", [view]), NOW, sharable=False)
+    (held,) = recover([rc("robot/a", *holding.holders(NOW))], [], NOW).standing
+    assert (held.request.needs, held.bound) == ({"robot/*": {}}, {"robot/*": "robot/a"})
+
+
+def test_half_a_gang_waits_for_its_patterns() -> None:
+    found = recover([*BY_PATTERN[:2], rc("radio/c")], [], NOW)
+    assert summary(found) == ([], ["gang"])
+    assert found.waiting[0].request.needs.keys() == BOUND.keys()
+
+
+def test_what_waits_by_pattern_waits_on_and_nonsense_does_not() -> None:
+    good = asked("good", needs=("radio/*", "radio/*#2"), place=Place(OLD, 8))
+    bad = [asked(f"bad-{at}", needs=(need,)) for at, need in enumerate(("radio/**", "radio/*#0", "*/*/*"))]
+    cross = asked("cross", needs=("radio/*", "*/rf0"))
+    found = recover([], [client(good, *bad, cross)], NOW)
+    assert summary(found) == ([], ["good"])
+    assert found.waiting[0].request.needs.keys() == {"radio/*", "radio/*#2"}
+
+
+@pytest.mark.parametrize("missing", [None, "radio/c"], ids=["all there", "half a gang"])
+@pytest.mark.parametrize(
+    "bound",
+    [
+        pytest.param({"robot/*": "robot/b"}, id="an RC that it does not hold"),
+        pytest.param({"robot/*": "radio/b"}, id="an RC that does not match"),
+        pytest.param({"radio/*": "radio/b", "radio/*#2": "radio/b"}, id="one RC for two patterns"),
+        pytest.param({"robot/b": "robot/a"}, id="a name for a pattern"),
+        pytest.param({"robot/a": "robot/a"}, id="an RC for itself"),
+        pytest.param({"robot/**": "robot/a"}, id="no pattern"),
+        pytest.param({"robot/* ": "robot/a"}, id="nearly a pattern"),
+        pytest.param({"*/a": "robot/a", "radio/*": "radio/b"}, id="patterns that may not stand together"),
+    ],
+)
+def test_a_hold_with_a_wrong_binding_is_left_out(
+    bound: dict[str, str], missing: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    wrong = [
+        rc(name, *([] if name == missing else [bound_hold(bound, RATE if name.startswith("radio") else {})]))
+        for name in THREE
+    ]
+    other = rc("robot/x", hold(("robot/x",), name="good"))
+    assert summary(recover([*wrong, other], [], NOW)) == (["good"], [])
+    assert "the hold of h/one/gang-id is not carried on: " in caplog.text
+
+
+def test_what_waits_keeps_place_and_parameters() -> None:
+    place = Place(OLD, 9)
+    ((request, at, since),) = recover([], [client(asked(place=place, rate="0.1", waited=2.5))], NOW).waiting
+    assert (at, since) == (place, NOW - 2_500_000_000)
+    assert request.needs == {"robot/a": {}, "radio/b": {"rate": Fraction(1, 10)}}
+
+
+def test_requests_of_two_clients_may_share_an_id() -> None:
+    clients = [client(asked(), name="h/one"), client(asked(), name="h/two")]
+    found = recover([], clients, NOW)
+    assert [one.request.arc for one in found.waiting] == ["h/one/gang-id", "h/two/gang-id"]

@@ -1,0 +1,139 @@
+"""Pictures, captions and boxes in real recordings, and what is no picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.services.recorder.paper_run import events, rows
+from tests.services.recorder.robot_run import (
+    CAMERA,
+    GRANT,
+    NET,
+    captions,
+    head,
+    jpeg,
+    png,
+    say,
+)
+from zscout.drivers.image_size import jpeg_size, png_size
+from zscout.services.recorder import pictures
+from zscout.services.recorder.colours import PALE
+from zscout.services.recorder.robot_tracker import RobotHold, RobotTracker
+from zscout.services.recorder.timeline import Timeline
+from zscout.types import Grant, Term
+
+
+@pytest.fixture(autouse=True)
+def _strict() -> Iterator[None]:
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def test_a_picture_that_is_old_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    picture = jpeg(0, "scout33", None)
+    with Timeline("lab", path=path) as timeline:
+        tracker = RobotTracker(timeline)
+        tracker.no_frame(0, CAMERA)
+        tracker.held(CAMERA, {GRANT: RobotHold(("robot/scout33",), operator=False)})
+        tracker.frame(1, CAMERA, head(1), picture)
+        say(
+            tracker, 1.5, "net/a/watch", "alert", camera=CAMERA, boxes=[[1, 2, 30, 40]], robot="robot/scout33"
+        )
+        for at in (4, 7):
+            tracker.no_frame(at, CAMERA)
+        tracker.frame(8, CAMERA, head(2), picture)
+        tracker.dropped(CAMERA, {GRANT})
+        tracker.no_frame(11, CAMERA)
+        tracker.frame(12, CAMERA, head(3, None), picture)
+    assert [(at, text) for at, text, _ in captions(path, "fgrab1")] == [
+        (1, "scout33"),
+        (4, "scout33 · no picture"),
+        (8, "scout33 · alert"),
+        (11, "not held"),
+        (12, ""),
+    ]
+    seen = {at: value for _, at, value in rows(path, "/camera/fgrab1", "EncodedImage:opacity")}
+    assert {at for at, (value,) in seen.items() if value < 1} == {4, 11}
+    # What was marked in an old picture is not marked in the next.
+    assert [at for _, at, _ in rows(path, "/camera/fgrab1/boxes", "Clear:is_recursive")] == [4]
+
+
+def test_boxes_end_with_what_they_mark(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    picture = jpeg(0, "scout33", None)
+    next_grant, box = Grant(Term(1, "rcm"), 8), [10, 10, 20, 20]
+    holds = {GRANT: RobotHold(("robot/a",)), next_grant: RobotHold(("robot/b",))}
+    with Timeline("lab", path=path) as timeline:
+        tracker = RobotTracker(timeline)
+        tracker.held(CAMERA, holds)
+        say(tracker, 0, "net/a", "alert", camera=CAMERA, boxes=[box])  # no picture to draw on yet
+        tracker.frame(1, CAMERA, head(1), picture)
+        bad = [[150, 110, 20, 20], [-1, 0, 5, 5], [160, 0, 5, 5], [0, 0, 161, 5], [0, 0, 0, 5], [10**9] * 4]
+        say(tracker, 2, "net/a", "alert", camera=CAMERA, boxes=bad)
+        say(tracker, 3, "net/a", "watch", camera=CAMERA)
+        say(tracker, 4, "net/b", "alert", camera=CAMERA, boxes=[box])
+        say(tracker, 5, "net/b", "wait")  # the hold is over: it names no camera
+        say(tracker, 6, "net/c", "alert", camera=CAMERA, boxes=[box])
+        tracker.frame(7, CAMERA, head(2, next_grant), picture)  # another robot is seen
+        say(tracker, 8, "net/d", "alert", camera=CAMERA, boxes=[box])
+        tracker.left(9, NET)
+    drawn = [(at, len(value)) for _, at, value in rows(path, "/camera/fgrab1/boxes", "Boxes2D:half_sizes")]
+    assert drawn == [(2, 1), (4, 1), (6, 1), (8, 1)]
+    assert [at for _, at, _ in rows(path, "/camera/fgrab1/boxes", "Clear:is_recursive")] == [3, 5, 7, 9]
+
+
+def test_what_is_no_picture_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "MAX_CAMERAS", 2)
+    path = tmp_path / "run.rrd"
+    good = jpeg(0, "scout33", None)
+    size = good.index(b"\xff\xc0") + 5
+    with Timeline("lab", path=path) as timeline:
+        for bad in (
+            b"",
+            b"\xff\xd8",
+            png(),
+            good[:size],
+            good[:size] + b"\xff\xff\xff\xff" + good[size + 4 :],
+        ):
+            timeline.robots.picture(0, "bad", bad, "", PALE)
+        for number in range(4):
+            timeline.robots.picture(1, f"cam{number}", good, "", PALE)
+    assert {entity for entity, _, _ in rows(path, "/camera/**", "EncodedImage:blob")} == {
+        "/camera/cam0",
+        "/camera/cam1",
+    }
+    assert events(path) == [
+        "timeline: bad sends what is no JPEG of at most 4096 pixels a side: left out",
+        "timeline: more than 2 cameras: the pictures of the others are not shown",
+    ]
+
+
+@given(st.integers(1, 200), st.integers(1, 200), st.integers(1, 100), st.data())
+def test_the_head_of_a_picture_tells_its_size(
+    width: int, height: int, quality: int, data: st.DataObject
+) -> None:
+    picture = np.full((height, width, 3), 90, np.uint8)
+    as_jpeg = bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+    as_png = bytes(cv2.imencode(".png", picture)[1])
+    assert jpeg_size(as_jpeg) == png_size(as_png) == (width, height)
+    assert jpeg_size(as_png) is None
+    assert png_size(as_jpeg) is None
+    # Whatever is cut off or spoiled, an answer is a size or none, and no error.
+    cut = data.draw(st.integers(0, len(as_jpeg) - 1))
+    spoiled = as_jpeg[:cut] + data.draw(st.binary(max_size=8)) + as_jpeg[cut + 1 :]
+    for size in (
+        jpeg_size(as_jpeg[:cut]),
+        jpeg_size(spoiled),
+        png_size(as_png[: len(as_png) * cut // len(as_jpeg)]),
+    ):
+        assert size is None or min(size) > 0

@@ -1,0 +1,277 @@
+"""What the recorder writes of components, read back from real recordings."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rerun as rr
+
+from tests.live.lab import START, Lab
+from tests.services.recorder.paper_run import (
+    colours,
+    events,
+    lanes,
+    rows,
+)
+from tests.services.recorder.placed_hour import TERM, placement, play
+from zscout.behaviors.client.client import Client
+from zscout.keyexpr import Sender
+from zscout.mesh import IncomingQuery, Supervisor, ZenohMesh
+from zscout.messages import ListPlacements, Placement, Placements, PlacerOperation
+from zscout.services.recorder import host_pane as module
+from zscout.services.recorder.host_pane import Running, Use
+from zscout.services.recorder.placement_tracker import PlacementFollower, PlacementTracker
+from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.types import Term
+
+SCALARS = "Scalars:scalars"
+
+
+@pytest.fixture(autouse=True)
+def _strict() -> Iterator[None]:
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def marks(path: Path) -> list[tuple[float, str, str, str]]:
+    """Second, what happened, component, host; in order of time."""
+    components, hosts = (rows(path, "/mark/**", column) for column in ("component", "host"))
+    return sorted(
+        (at, entity.removeprefix("/mark/"), component, host)
+        for (entity, at, (component,)), (_, _, (host,)) in zip(components, hosts, strict=True)
+    )
+
+
+def curve(path: Path, entity: str) -> list[float]:
+    points = sorted((at, values[0]) for _, at, values in rows(path, entity, SCALARS) if values)
+    return [value for _, value in points]
+
+
+def test_an_hour_reads_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        play(timeline)
+    shown = lanes(path, "/host/**")
+    assert set(shown) == {"/host/anvil", "/host/basil", "/host/crucible"}
+    assert [change for change in shown["/host/basil"] if 1800 < change[0] < 2300] == [
+        (1900, ["counter · gets ready", ""]),
+        (1906, ["counter", ""]),
+        (2100, ["counter", "shaky · starting"]),
+        (2104, ["counter", "shaky"]),
+        (2220, ["counter", ""]),
+        (2240, ["counter", "shaky"]),
+    ]
+    assert shown["/host/crucible"][-1:] == [(3000, ["", ""])]
+
+    said = events(path)
+    assert "counter moved anvil -> basil, dead 34 ms" in said
+    assert "basil is being emptied: nothing is placed there any more" in said
+    assert "shaky failed on basil, and is tried again: " in "\n".join(said)
+    assert "watch-2 is restarted on anvil, it was on crucible: crucible is gone" in said
+    levels = [level for _, _, level in rows(path, "/events", "TextLog:level") if level == ["ERROR"]]
+    assert len(levels) == 1
+
+    happened = marks(path)
+    assert [one[1:] for one in happened if one[0] == 1906] == [
+        ("came", "counter", "basil"),
+        ("left", "counter", "anvil"),
+    ]
+    assert [one[2:] for one in happened if one[1] == "placed"] == [
+        ("counter", "anvil"),
+        ("mapper", "anvil"),
+        ("watch-1", "basil"),
+        ("watch-2", "crucible"),
+        ("watch-3", "basil"),
+        ("shaky", "basil"),
+    ]
+    assert [one for one in happened if one[1] == "given_up"] == [(2600, "given_up", "shaky", "basil")]
+    # A mark stands on its host's curve.
+    loads = {at: value for _, at, value in rows(path, "/load/anvil", SCALARS)}
+    (left,) = [value for _, at, value in rows(path, "/mark/left", SCALARS) if at == 1906]
+    assert left == loads[1905]
+
+
+def test_a_component_has_the_colour_of_its_arc(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        timeline.holders(0, "robot/a", [HolderRow("first"), HolderRow("counter")])
+        timeline.runs(1, "anvil", [Running("counter"), Running("other")])
+        timeline.holders(2, "robot/a", [HolderRow("other"), HolderRow("next")])
+    rc, host = colours(path, "/rc/**")["/rc/robot/a"], colours(path, "/host/**")["/host/anvil"]
+    assert host == {name: rc[name] for name in ("counter", "other")}
+    assert len(set(rc.values())) == 4
+
+
+def test_a_move_that_failed_is_told_and_leaves_no_mark(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        tracker = PlacementTracker(timeline)
+        say(tracker, 0, placement("counter", "running", "anvil", 1))
+        say(tracker, 1, placement("counter", "moving", "anvil", 1, to="basil"))
+        say(tracker, 2, placement("counter", "running", "anvil", 1, reason="not at a safe point for 5 s"))
+        say(tracker, 3, placement("picky", "waiting", None, 0, reason="no host has label gpu"))
+        say(tracker, 4, placement("picky", "waiting", None, 0, reason="no host has label gpu"))
+    assert [mark for _, mark, _, _ in marks(path)] == ["placed"]
+    assert events(path)[1:] == [
+        "counter moves from anvil to basil",
+        "counter stays on anvil: not at a safe point for 5 s",
+        "picky waits for a host: no host has label gpu",
+    ]
+    assert lanes(path, "/host/**")["/host/basil"] == [(1, ["counter · gets ready"]), (2, [""])]
+
+
+def say(tracker: PlacementTracker, at: float, *told: Placement, term: Term = TERM) -> None:
+    tracker.published(at, Placements(term, list(told)))
+
+
+def test_what_a_late_recorder_reads_did_not_happen_now(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        tracker = PlacementTracker(timeline)
+        say(tracker, 1, placement("newer", "running", "anvil", 2))
+        older = [placement("newer", "starting", "anvil", 1), placement("counter", "running", "basil", 7)]
+        tracker.listed(2, Placements(TERM, older, ["crucible"]), {"newer"})
+        say(tracker, 3, placement("counter", "running", "basil", 8))
+        # An answer of an RCM that was overthrown meanwhile, and one that has not heard of `newer`.
+        say(tracker, 4, term=Term(2, "next"))
+        tracker.listed(5, Placements(TERM), set())
+        tracker.listed(6, Placements(Term(2, "next"), [placement("counter", "running", "basil", 8)]), set())
+    assert [(at, mark, name) for at, mark, name, _ in marks(path)] == [
+        (1, "placed", "newer"),
+        (3, "restarted", "counter"),
+    ]
+    assert lanes(path, "/host/**") == {
+        "/host/anvil": [(1, ["newer"]), (6, [""])],
+        "/host/basil": [(2, ["counter"])],
+    }
+    assert "counter (counter) runs on basil already" in events(path)
+    assert "crucible is being emptied: nothing is placed there any more" in events(path)
+
+
+def test_bad_names_are_left_out_and_lanes_are_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MAX_HOSTS", 2)
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        tracker = PlacementTracker(timeline)
+        say(tracker, 0, placement("a/b", "running", "anvil", 1), placement("a", "running", "h" * 70, 1))
+        for number in range(4):
+            say(tracker, 1, placement(f"c{number}", "running", f"host{number}", 1))
+    assert set(lanes(path, "/host/**")) == {"/host/host0", "/host/host1"}
+    assert sum(text.startswith("timeline: more than 2 hosts") for text in events(path)) == 1
+
+
+def test_the_heaviest_components_have_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_CURVES", 3)
+    monkeypatch.setattr(module, "MAX_DRAWN", 5)
+    path = tmp_path / "run.rrd"
+    many = [Use(f"c{number}", cpu=0.1 * number, memory=0) for number in range(1, 7)]
+    with Timeline("lab", path=path) as timeline:
+        timeline.uses(0, "anvil", many)
+        timeline.uses(1, "basil", [Use("heavy", cpu=0.3, memory=2e9)])
+        timeline.uses(2, "anvil", many)
+        timeline.uses(3, "anvil", [Use("c6", cpu=0.6, memory=5e6)])
+        timeline.uses(4, "anvil", [Use(f"d{number}", cpu=9, memory=float("nan")) for number in range(3)])
+        timeline.uses(5, "anvil", [Use(f"d{number}", cpu=9, memory=0) for number in range(3)])
+    drawn = {entity for entity, _, _ in rows(path, "/use/cpu/**", SCALARS)}
+    assert drawn == {
+        "/use/cpu/anvil/c6",
+        "/use/cpu/anvil/c5",
+        "/use/cpu/anvil/c4",
+        "/use/cpu/basil/heavy",
+        "/use/cpu/anvil/d0",
+    }
+    # c4 gave way to the heavy one; c5 and c6 went on until they were gone.
+    assert [len(curve(path, f"/use/cpu/anvil/c{number}")) for number in (4, 5, 6)] == [1, 2, 3]
+    assert curve(path, "/use/memory/anvil/c6") == [0, 0, 5]
+    ends = {entity: at for entity, at, _ in rows(path, "/use/cpu/**", "Clear:is_recursive")}
+    assert ends == {"/use/cpu/anvil/c4": 1, "/use/cpu/anvil/c5": 3, "/use/cpu/anvil/c6": 4}
+    assert sum("more than 5 components" in text for text in events(path)) == 1
+
+
+def test_no_line_is_drawn_through_a_host_s_silence(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        for at in (0, 9, 60):
+            timeline.load(at, "anvil", 1.0, 0.5)
+    for folder in ("load", "cpu"):
+        breaks = [at for _, at, _ in rows(path, f"/{folder}/anvil", "Clear:is_recursive")]
+        assert breaks == [9 + module.SILENCE]
+        assert len(curve(path, f"/{folder}/anvil")) == 3
+
+
+def test_marks_of_one_moment_stand_above_each_other(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        timeline.load(0, "anvil", 2.0)
+        for at, name in ((1.0, "a"), (1.5, "b"), (1.9, "c"), (9.0, "d")):
+            timeline.mark(at, "anvil", "placed", name)
+    heights = curve(path, "/mark/placed")
+    assert heights[0] == heights[3] == 2.0
+    assert heights[0] < heights[1] < heights[2]
+
+
+@pytest.mark.live
+def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -> None:
+    """The words are a placer's, the mesh is real."""
+    path = tmp_path / "run.rrd"
+
+    async def run() -> None:
+        async with Lab(tmp_path) as lab:
+            speaker: Client = await lab.client("speaker")
+            mesh, asked = speaker.mesh, asyncio.Event()
+
+            def answer(request: IncomingQuery[PlacerOperation]) -> None:
+                assert isinstance(request.message, ListPlacements)
+                request.answer(Placements(TERM, [placement("counter", "running", "anvil", 1)]))
+                asked.set()
+
+            served = mesh.serve(mesh.keys.placer, PlacerOperation, answer)
+            fleet = lab.fleet
+            async with await ZenohMesh.open(fleet.name, Sender("here", "recorder"), fleet.mesh) as ears:
+                supervisor = Supervisor("recorder", lambda error: pytest.fail(str(error)))
+                with Timeline("lab", path=path) as timeline:
+                    follower = PlacementFollower(ears, timeline, lambda: 1.0, supervisor)
+                    there = asyncio.Event()
+                    follower.tracker.timeline = Watched(timeline, there)  # type: ignore[assignment]
+                    heard = follower.subscribe()
+                    reading = asyncio.create_task(follower.keep_reading())
+                    async with asyncio.timeout(START):
+                        await asked.wait()
+                        await there.wait()
+                        there.clear()
+                        mesh.put(
+                            mesh.keys.placements,
+                            Placements(
+                                TERM, [placement("counter", "running", "basil", 2, moves=1, dead=0.5)]
+                            ),
+                        )
+                        await there.wait()
+                    reading.cancel()
+                    heard.close()
+            served.close()
+
+    asyncio.run(run())
+    assert events(path) == [
+        "counter (counter) runs on anvil already",
+        "counter moved anvil -> basil, dead 500 ms",
+    ]
+
+
+class Watched:
+    """A timeline, and an event whenever lanes were written."""
+
+    def __init__(self, timeline: Timeline, there: asyncio.Event) -> None:
+        self._timeline, self._there = timeline, there
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._timeline, name)
+
+    def runs(self, at: float, host: str, components: list[Running]) -> None:
+        self._timeline.runs(at, host, components)
+        self._there.set()

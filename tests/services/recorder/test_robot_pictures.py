@@ -1,0 +1,115 @@
+"""Pictures of recordings with robots, taken by the real viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from tests.services.recorder.robot_run import jpeg, png, record
+from tests.services.recorder.test_viewer_picture import (
+    DIMMED,
+    WIDTH,
+    Rgb,
+    rgb,
+    settled_picture,
+    viewer,
+)
+from zscout.services.recorder.blueprint import FLOOR_WORDS
+from zscout.services.recorder.colours import (
+    ALERT,
+    DOING,
+    HIDDEN,
+    IN_THE_OPEN,
+    OPERATOR,
+    PALE,
+    PERSON,
+)
+from zscout.services.recorder.timeline import Timeline
+
+HEIGHT = 900
+PANES = 0.57
+"""Part of the width that the panes at the left have."""
+FLOOR, CAMERAS = (65, 410), (440, 620)
+"""From and to which row of pixels these panes reach."""
+
+
+def pixels(picture: Image.Image, colour: Rgb, off: int = 3) -> list[tuple[int, int]]:
+    """Where a colour is that is at most `off` from this one: x and y."""
+    far = np.abs(np.asarray(picture, np.int16) - np.array(colour, np.int16)).max(axis=2)
+    return [(int(x), int(y)) for y, x in np.argwhere(far <= off)]
+
+
+def test_a_minute_of_robots_at_a_glance(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    record(path, until=37)
+    with viewer(path, tmp_path, panes=9, height=HEIGHT) as client:
+        picture = settled_picture(client, tmp_path / "picture.png")
+        views = client.get_state().views
+    assert [report for view in views for report in view.reports] == []
+    assert {view.name for view in views} == {
+        "Who holds each resource",
+        "What each ARC is doing",
+        "What each behavior is doing",
+        "Load average (1 min) per host",
+        f"Floor   {FLOOR_WORDS}",
+        "fgrab1",
+        "fgrab2",
+        "Events",
+        "Devices (point at a curve)",
+    }
+    left = round(WIDTH * PANES)
+    lanes = picture.crop((0, 550, left, 740))
+    for word in ("search", "approach", "enter", "turn", "hidden", "watch", "alert", "unstick", "wait"):
+        assert len(pixels(lanes, rgb(DOING[word], DIMMED))) > 100, word
+    floor = picture.crop((left, FLOOR[0], WIDTH, FLOOR[1]))
+    # Points are shaded as balls are.
+    for colour in (HIDDEN, IN_THE_OPEN, OPERATOR, ALERT, PERSON):
+        assert len(pixels(floor, rgb(colour), 30)) > 20, f"{colour:08X}"
+    # The first camera has the detector's box, the second is the operator's.
+    middle = (WIDTH + left) // 2
+    one, two = (
+        picture.crop((start, CAMERAS[0], end, CAMERAS[1])) for start, end in ((left, middle), (middle, WIDTH))
+    )
+    frame = pixels(one, rgb(ALERT))
+    across, down = ([spot[axis] for spot in frame] for axis in (0, 1))
+    assert len(frame) > 200
+    # 26 by 44 of the picture's 160 by 120 pixels, and half a line at each side.
+    assert abs((max(across) - min(across)) / (max(down) - min(down)) - 26 / 44) < 0.08
+    assert pixels(two, rgb(ALERT)) == []
+    assert is_a_picture(one)
+    assert is_a_picture(two)
+
+
+def is_a_picture(pane: Image.Image) -> bool:
+    """Whether there are as many greys as a noisy picture has."""
+    greys = {pixel for _, pixel in pane.getcolors(WIDTH * HEIGHT) or [] if len(set(pixel)) == 1}  # type: ignore[arg-type]
+    return len(greys) > 100
+
+
+def test_garbled_pictures_and_words_do_not_end_the_viewer(tmp_path: Path) -> None:
+    """Seen as a live view shows it: the layout has grown with what came."""
+    path, live = tmp_path / "run.rrd", tmp_path / "live.rrd"
+    good, plan = jpeg(0, "scout33", None), bytearray(png())
+    torn = bytearray(good)
+    torn[700::7] = b"\xff" * len(torn[700::7])
+    plan[200:400] = bytes(200)
+    words = "日本 \U0001f916 ✖ عربى"
+    with Timeline("lab", path=path) as timeline:
+        robots = timeline.robots
+        robots.behavior(0, f"net/{words}", "search", words)
+        robots.picture(0, "half", good[: len(good) // 2], words, PALE)
+        robots.picture(0, "torn", bytes(torn), words, PALE)
+        robots.picture(0, words, good, words, PALE)
+        assert robots.plan(0, 6, 4.5, bytes(plan)) == ""
+        robots.figures(0, words, {words: 1.0})
+        robots.old_picture(1, "half", words, PALE)
+        for number in range(4):
+            robots.picture(1, f"fgrab{number}", good, "", PALE)
+        timeline._recording.flush(timeout_sec=10)
+        live.write_bytes(path.read_bytes())
+    # Seven cameras on two pages, and each of the other panes.
+    with viewer(live, tmp_path, panes=7 + 7, height=HEIGHT) as client:
+        settled_picture(client, tmp_path / "picture.png")
+        assert [report for view in client.get_state().views for report in view.reports] == []

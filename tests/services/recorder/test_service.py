@@ -1,0 +1,87 @@
+"""The recorder as a service on a mesh in memory: it follows an RCM, and fails as a whole."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from decimal import Decimal
+from pathlib import Path
+
+import pytest
+
+from tests.mesh.kit import run, until
+from tests.services.recorder.paper_run import SCOUT33, events, lanes
+from zscout.config.fleet import default_fleet
+from zscout.keyexpr import Role, Sender, Token
+from zscout.mesh.memory import MemoryMesh, MemoryNetwork
+from zscout.messages import Grants, Holder, Notice, RcmState, StateAsk
+from zscout.services.recorder.recorder import Recorder, RecorderFailed
+from zscout.services.recorder.timeline import Timeline
+from zscout.types import Grant, Place, Term
+
+TERM = Term(1, "anvil")
+GRANT = Grant(TERM, 1)
+PLACE = Place(TERM, 1)
+
+
+def leader(network: MemoryNetwork) -> MemoryMesh:
+    """An RCM that has nothing yet."""
+    mesh = network.open("lab", Sender("anvil", "rcm"))
+    mesh.serve(mesh.keys.rcm_state, StateAsk, lambda query: query.answer(RcmState(TERM, 0, "anvil")))
+    mesh.alive(Token("anvil", Role.RCM, "rcm", "i1"))
+    return mesh
+
+
+def grants(seq: int, *holders: Holder) -> Grants:
+    return Grants(TERM, seq, seq - 1, 1, {SCOUT33: list(holders)})
+
+
+def test_it_reads_the_state_and_follows_what_is_published(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    async def play() -> None:
+        network, stop = MemoryNetwork(), asyncio.Event()
+        rcm, here = leader(network), network.open("lab", Sender("basil", "recorder"))
+        ready: list[Token] = []
+        rcm.watch(rcm.keys.alive_any(Role.RECORDER), lambda token, alive: ready.append(token))
+        with Timeline("lab", path=path) as timeline:
+            recording = asyncio.create_task(Recorder(here, default_fleet(), timeline).run(stop))
+            await until(lambda: ready)
+            me = Sender("cart", "net")
+            notice = Notice("a1", "hide", str(me), "queued", TERM, 1, reason="robot/scout33 is held by drive")
+            rcm.put(rcm.keys.notice(me), notice)
+            await asyncio.sleep(1)
+            holder = Holder("a1", "hide", str(me), GRANT, PLACE, [SCOUT33], Decimal(5), 5, priority=1)
+            rcm.put(rcm.keys.grants, grants(1, holder))
+            await asyncio.sleep(1)
+            rcm.put(rcm.keys.grants, grants(2))
+            await asyncio.sleep(1)
+            stop.set()
+            await recording
+
+    run(play())
+    assert [state for _, state in lanes(path, "/rc/**")[f"/rc/{SCOUT33}"]] == [["hide"], [""]]
+    doing = [state[0] for _, state in lanes(path, "/arc/**")["/arc/hide"]]
+    assert doing == ["waiting · robot/scout33 is held by drive", "running · priority 1 · min 5 s"]
+    assert "hide runs on robot/scout33" in events(path)
+
+
+def test_a_part_that_raises_is_logged_and_ends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def play() -> None:
+        network = MemoryNetwork()
+        rcm, here = leader(network), network.open("lab", Sender("basil", "recorder"))
+        with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
+            recorder = Recorder(here, default_fleet(), timeline)
+            recording = asyncio.create_task(recorder.run(asyncio.Event()))
+            await asyncio.sleep(1)
+            monkeypatch.setattr(timeline, "holders", lambda *_: 1 / 0)
+            rcm.put(rcm.keys.grants, grants(1))
+            async with asyncio.timeout(60):
+                await recording
+
+    with caplog.at_level(logging.ERROR), pytest.raises(RecorderFailed):
+        run(play())
+    assert "the recorder failed" in caplog.text
+    assert "ZeroDivisionError" in caplog.text

@@ -1,0 +1,228 @@
+"""A real picture: the recording of the paper's example, opened by the real viewer without a screen."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import groupby
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+from PIL import Image, ImageChops
+from rerun.experimental import ViewerClient
+
+from tests.services.recorder.paper_run import (
+    FGRAB1,
+    FGRAB2,
+    RCS,
+    RERUN,
+    SCOUT33,
+    SCOUT35,
+    TABLE2,
+    lanes,
+    play_table1,
+    second_by_second,
+)
+from zscout.services.recorder.blueprint import LIVE_WINDOW, MARGIN, TIME
+from zscout.services.recorder.colours import LINES, OPERATOR, PALETTE, STATES
+from zscout.services.recorder.timeline import Timeline
+
+SECONDS = 18
+WIDTH, HEIGHT = 1600, 1000
+PANES = 0.62
+"""Part of the width that the panes with a time axis have."""
+HOSTS = {"anvil": 4.0, "bellows": 10.0, "crucible": 16.0}
+"""When each host's load is at its peak, in seconds."""
+DIMMED = 200 / 255
+"""The viewer paints a state's bar with this part of its colour."""
+
+ARCS = {"0": PALETTE[0], "1": PALETTE[1], "2": PALETTE[2], "3": PALETTE[3], "4": OPERATOR}
+"""arc4 is the operator's."""
+WORDS = {state[0]: colour for state, colour in STATES.items()}
+
+Rgb = tuple[int, int, int]
+T = TypeVar("T")
+
+
+def record(path: Path) -> None:
+    with Timeline("lab", path=path) as timeline:
+        play_table1(timeline)
+        for quarter in range(SECONDS * 4 + 1):
+            for host, peak in HOSTS.items():
+                load = 0.1 + 1.5 * math.exp(-(((quarter / 4 - peak) / 3.5) ** 2))
+                timeline.load(quarter / 4, host, load, cpu=0.5)
+
+
+@contextmanager
+def viewer(recording: Path, home: Path, *, panes: int = 4, height: int = HEIGHT) -> Iterator[ViewerClient]:
+    """A viewer without a window that has the recording open; skips where it finds no graphics driver.
+
+    `panes` are those that the recording's layout has, hidden ones among them."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    size = f"{WIDTH}x{height}"
+    command: list[str | Path] = [RERUN, "--headless", "--window-size", size, "--bind", "127.0.0.1"]
+    log = home / "viewer.log"
+    with (
+        log.open("wb") as output,
+        subprocess.Popen(
+            [*command, "--port", port, recording],
+            stdout=output,
+            stderr=output,
+            env=os.environ | {"HOME": str(home), "RUST_LOG": "error"},
+        ) as process,
+    ):
+        try:
+            client = until(lambda: opened(process, log, f"rerun+http://127.0.0.1:{port}/proxy", panes))
+            yield client
+        finally:
+            process.kill()
+
+
+def opened(process: subprocess.Popen[bytes], log: Path, url: str, panes: int) -> ViewerClient | None:
+    """The viewer, once it has all panes."""
+    if process.poll() is not None:
+        words = log.read_text(errors="replace")
+        if "render context" in words or "graphics adapter" in words:
+            pytest.skip("no Vulkan driver: apt-get install libvulkan1 mesa-vulkan-drivers")
+        pytest.fail(f"the viewer ended with {process.returncode}: {words}")
+    try:
+        client = ViewerClient.connect(url)
+        return client if len(client.get_state().views) == panes else None
+    except (RuntimeError, ConnectionError):
+        return None
+
+
+def until(ask: Callable[[], T | None]) -> T:
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        if (answer := ask()) is not None:
+            return answer
+        time.sleep(0.05)
+    pytest.fail("the viewer was not ready within a minute")
+
+
+def settled_picture(client: ViewerClient, path: Path) -> Image.Image:
+    """The picture, once two in a row are the same: panes and columns find their sizes over some frames."""
+
+    def shoot() -> Image.Image:
+        client.save_screenshot(str(path))
+        with Image.open(path) as shot:
+            return shot.convert("RGB")
+
+    last = shoot()
+
+    def same() -> Image.Image | None:
+        nonlocal last
+        before, last = last, shoot()
+        return last if ImageChops.difference(before, last).getbbox() is None else None
+
+    return until(same)
+
+
+def rgb(rgba: int, part: float = 1.0) -> Rgb:
+    red, green, blue = (round((rgba >> shift & 0xFF) * part) for shift in (24, 16, 8))
+    return red, green, blue
+
+
+def near(one: Rgb, two: Rgb) -> bool:
+    return max(abs(left - right) for left, right in zip(one, two, strict=True)) <= 3
+
+
+def bars_of(picture: Image.Image, colours: dict[str, int], start: float, length: float) -> list[str]:
+    """What the bars say, from top to bottom, in the form of Table 2: one letter per second, "-" for no bar.
+
+    The axis is `length` seconds wide, from `start`. Each second is read at two places, and a pixel row counts
+    where they agree, so not where texts or edges are; four such rows make a bar."""
+    names = {name: rgb(colour, DIMMED) for name, colour in colours.items()}
+    scale = WIDTH * PANES / length
+
+    def read(at: float, y: int) -> str:
+        pixel = picture.getpixel((round((at - start) * scale), y))
+        assert isinstance(pixel, tuple)
+        red, green, blue = pixel
+        return next((name for name, colour in names.items() if near((red, green, blue), colour)), "-")
+
+    rows: list[str] = []
+    for y in range(picture.height):
+        pairs = [(read(second + 0.4, y), read(second + 0.8, y)) for second in range(SECONDS)]
+        agreed = all(first == second for first, second in pairs)
+        rows.append(" ".join(first for first, _ in pairs) if agreed else "")
+    bars = [text for text, run in groupby(rows) if len(list(run)) >= 4 and set(text) - {"-", " "}]
+    return [text for text, _ in groupby(bars)]
+
+
+def test_the_paper_s_example_in_the_viewer(tmp_path: Path) -> None:
+    record(tmp_path / "run.rrd")
+    with viewer(tmp_path / "run.rrd", tmp_path) as client:
+        picture = settled_picture(client, tmp_path / "picture.png")
+        state = client.get_state()
+
+    assert [report for view in state.views for report in view.reports] == []
+    assert {view.name for view in state.views} == {
+        "Who holds each resource",
+        "What each ARC is doing",
+        "Load average (1 min) per host",
+        "Events",
+    }
+    (shown,) = state.recordings
+    assert [(timeline.name, timeline.time_type) for timeline in shown.timelines] == [(TIME, "duration")]
+
+    # The file opens on the whole run, and the picture says what Table 2 says.
+    length = SECONDS * (1 + MARGIN)
+    held = bars_of(picture.crop((0, 0, WIDTH, HEIGHT // 3)), ARCS, 0, length)
+    assert held == [TABLE2[rc] for rc in (FGRAB1, FGRAB2, SCOUT33, SCOUT35)]
+
+    doing = bars_of(picture.crop((0, HEIGHT // 3, WIDTH, HEIGHT)), WORDS, 0, length)
+    assert doing == [
+        "r r r r r d d d d d d d d d d d d d",
+        "w w w w w r r r r r d d d d d d d d",
+        "- w w w w w w w r r r p p p r r r r",
+        "- - w w w r r r d d d d d d d d d d",
+        "- - - - - - - - - - - r r r d d d d",
+    ]
+
+    counts = picture.getcolors(WIDTH * HEIGHT)
+    assert counts is not None
+    pixels = {colour: count for count, colour in counts}
+    for colour in LINES[: len(HOSTS)]:
+        assert pixels.get(rgb(colour), 0) > 500
+
+
+def test_a_recorder_that_was_killed_leaves_a_recording_that_opens(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    code = (
+        "import pathlib, sys, threading; from tests.services.recorder.paper_run import *;"
+        "timeline = Timeline('lab', path=pathlib.Path(sys.argv[1]));"
+        "play_table1(timeline); threading.Event().wait()"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, path], cwd=Path(__file__).parents[3]) as recorder:
+        try:
+            until(lambda: written(path))
+        finally:
+            recorder.kill()
+    with viewer(path, tmp_path) as client:
+        picture = settled_picture(client, tmp_path / "picture.png")
+        assert [report for view in client.get_state().views for report in view.reports] == []
+    # It has the live layout: the last minute, and two seconds to come.
+    held = bars_of(picture.crop((0, 0, WIDTH, HEIGHT // 3)), ARCS, SECONDS - LIVE_WINDOW, LIVE_WINDOW + 2)
+    assert held == [TABLE2[rc] for rc in (FGRAB1, FGRAB2, SCOUT33, SCOUT35)]
+
+
+def written(path: Path) -> bool | None:
+    """True once all of Table 2 is in the file that is still open."""
+    with suppress(ValueError, RuntimeError, OSError, KeyError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        shown = lanes(path, "/rc/**")
+        done = lanes(path, "/arc/**")
+        if len(done) == 5 and {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS} == TABLE2:
+            return True
+    return None

@@ -1,0 +1,46 @@
+"""What may differ from what was recorded: each by its path, as the tests print it, and with its reason.
+
+A path stands for all below it as well, but in `CHANGED`, which also has the value as it is now.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+_STARTS_IN: Final = "a notice carries its estimate, so that who waits need not ask for the fleet's state"
+_CONTEXT: Final = (
+    "the field's word for what a component is given; Stage is the same class. It is given by position"
+)
+_WHY: Final = "what `reason` says in words, as data: no program need read English"
+
+ADDED: Final[dict[str, str]] = {
+    "messages > zscout.Ask.v1 > fields > estimate": _STARTS_IN,
+    "messages > zscout.Notice.v1 > fields > starts_in": _STARTS_IN,
+    "python > zscout.Component > methods > run > takes > context": _CONTEXT,
+    "python > zscout.ComponentContext": _CONTEXT,
+    "python > zscout.Client > methods > start": "tests begin a client on a mesh in memory with it",
+    "python > zscout.Client > methods > request > takes > estimate": _STARTS_IN,
+    "python > what Client.request gives > attributes > estimate": _STARTS_IN,
+    "python > what Client.request gives > attributes > start": _STARTS_IN,
+    "messages > zscout.Notice.v1 > fields > why": _WHY,
+    "messages > zscout.ReasonInfo.v1": _WHY,
+    "messages > zscout.ReasonParty.v1": _WHY,
+    "messages > zscout.Revocation.v1 > fields > why": _WHY,
+    "messages > zscout.WaitView.v1 > fields > why": _WHY,
+    "python > what Client.request gives > attributes > why": _WHY,
+    "live > status > .queue[].why": _WHY,
+    "live > why waiter > .arcs[].why": _WHY,
+    "python > zscout.Held > methods > now": "the clock by which the hold ends, for bodies that keep a pace",
+}
+
+REMOVED: Final[dict[str, str]] = {
+    "python > zscout.Component > methods > run > takes > stage": _CONTEXT,
+}
+
+CHANGED: Final[dict[str, tuple[object, str]]] = {
+    "python > zscout.Client > methods > connect > gives": (
+        "Connecting[Self]",
+        "it can be awaited, as before, and entered",
+    ),
+}
+"""The value now, and the reason."""

@@ -1,0 +1,82 @@
+"""What programs and people see of zscout, as one JSON text: `python -m tests.surface.record`.
+
+It is printed, or with `--into FILE` written. `surface.json` beside this was recorded on the commit before
+the rebuild (0df377c) and is not recorded again: what changes on purpose is listed in `changes.py`. To record
+another commit, copy this folder into a checkout of it and run it there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from tests.surface import commands, files, interfaces
+from tests.surface.compare import SEPARATOR
+
+RECORDED: Final = Path(__file__).with_name("surface.json")
+SECTIONS: Final[Mapping[str, Callable[[], Any]]] = {
+    "commands": commands.commands,
+    "what commands print": commands.calls,
+    "exit codes": interfaces.exit_codes,
+    "environment variables": interfaces.variables,
+    "files": files.files,
+    "components": interfaces.components,
+    "python": interfaces.python,
+    "keys": interfaces.keys,
+    "messages": interfaces.wire,
+}
+WIDTH: Final = 110
+
+
+def text(value: Any, indent: int = 0, before: int = 0) -> str:
+    """JSON with what fits on one line there. `before`: columns that are written on this line already."""
+    line = json.dumps(value, ensure_ascii=False)
+    if not isinstance(value, (dict, list)) or indent + before + len(line) < WIDTH:
+        return line
+    pad = " " * (indent + 1)
+    if isinstance(value, list):
+        parts = [pad + text(one, indent + 1) for one in value]
+        return "[\n" + ",\n".join(parts) + "\n" + " " * indent + "]"
+    names = [json.dumps(name, ensure_ascii=False) + ": " for name in value]
+    parts = [
+        pad + name + text(one, indent + 1, len(name)) for name, one in zip(names, value.values(), strict=True)
+    ]
+    return "{\n" + ",\n".join(parts) + "\n" + " " * indent + "}"
+
+
+def flat(value: Any, path: str) -> Iterator[tuple[str, object]]:
+    """Everything in a recorded value by its path. Texts in a list count by themselves, in whatever order, but
+    lines of output as one text."""
+    if isinstance(value, dict) and value:
+        for name, one in value.items():
+            yield from flat(one, f"{path}{SEPARATOR}{name}")
+    elif isinstance(value, list) and value:
+        if path.endswith((f"{SEPARATOR}out", f"{SEPARATOR}err")):
+            yield path, "\n".join(value)
+            return
+        for number, one in enumerate(value):
+            if isinstance(one, str):
+                yield f"{path}{SEPARATOR}{one}", True
+            else:
+                yield from flat(one, f"{path}{SEPARATOR}{number}")
+    else:
+        yield path, "null" if value is None else value
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.surface.record", description=__doc__)
+    parser.add_argument("--into", type=Path, metavar="FILE", help="write it into FILE")
+    given = parser.parse_args()
+    found = text({name: collect() for name, collect in SECTIONS.items()}) + "\n"
+    if given.into is None:
+        sys.stdout.write(found)
+    else:
+        given.into.write_text(found)
+
+
+if __name__ == "__main__":
+    main()

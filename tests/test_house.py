@@ -1,0 +1,93 @@
+"""How the house is built, from its source alone: what the contracts of `pyproject.toml` can't say."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import zscout
+
+ROOT = Path(__file__).parents[1]
+MODULES = {
+    path.relative_to(ROOT): ast.parse(path.read_text()) for path in sorted((ROOT / "zscout").rglob("*.py"))
+}
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SOURCES = {path.name for tree in ("zscout", "tests", "benchmarks") for path in (ROOT / tree).rglob("*.py")}
+WROTE = re.compile(r"`([\w./]+)`")
+TREES = {"zscout", "tests", "benchmarks", "examples"} | {path.parts[1] for path in MODULES}
+LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
+
+
+def imports(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute here"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def test_a_public_class_name_stands_in_one_module() -> None:
+    homes = defaultdict(set)
+    for path, tree in MODULES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes[node.name].add(str(path))
+    assert len(homes) > 400
+    assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
+
+
+def test_nothing_but_the_command_line_imports_the_lab() -> None:
+    outside = {
+        path: found
+        for path, tree in MODULES.items()
+        if path.parts[1] not in ("lab", "cli")
+        and (found := [name for name in imports(tree) if f"{name}.".startswith("zscout.lab.")])
+    }
+    assert outside == {}
+    users = {
+        path.parts[1]
+        for path, tree in MODULES.items()
+        if any("zscout.lab." in name for name in imports(tree))
+    }
+    assert users == {"lab", "cli"}
+
+
+@pytest.mark.parametrize("name", zscout.__all__)
+def test_a_public_name_of_the_package_resolves(name: str) -> None:
+    assert getattr(zscout, name) is not None
+
+
+def exists(written: str) -> bool:
+    """Whether a path is there, below the project, `zscout/` or `docs/`; a name alone: anywhere."""
+    if "/" in written:
+        return any((ROOT / base / written).exists() for base in ("", "zscout", "docs"))
+    return written in SOURCES
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_path_of_source_that_a_page_names_exists(page: Path) -> None:
+    words = WROTE.findall(page.read_text())
+    trees = {word for word in words if word.endswith("/") and word.partition("/")[0] in TREES}
+    named = {word for word in words if word.endswith(".py")} | trees
+    assert {word for word in named if not exists(word)} == set()
+
+
+@pytest.mark.parametrize("page", PAGES[:2], ids=lambda page: page.name)
+def test_a_file_that_a_page_links_exists(page: Path) -> None:
+    assert {link for link in LINK.findall(page.read_text()) if not (page.parent / link).exists()} == set()
+
+
+def test_the_page_on_the_architecture_names_every_room() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    rooms = {
+        f"{path.name}/" if path.is_dir() else path.name
+        for path in (ROOT / "zscout").iterdir()
+        if path.name not in ("__init__.py", "__pycache__", "py.typed")
+    }
+    assert {room for room in rooms if f"`{room}`" not in page} == set()

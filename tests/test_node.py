@@ -1,0 +1,117 @@
+"""A node whose services fail: what ends it, and with which exit code."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from tests.mesh.kit import run, until
+from zscout import node as node_module
+from zscout.config.node import Node, load_node
+from zscout.drivers.generic import ExclusiveDriver
+from zscout.keyexpr import Role, Sender, Token
+from zscout.mesh.memory import MemoryNetwork
+from zscout.node import NodeFailed, run_services
+from zscout.services.node.component_host import ComponentHost
+
+
+class Faulty(ExclusiveDriver):
+    """Its figures raise when they are looked at, once it is told to."""
+
+    broken = False
+
+    def figures(self) -> dict[str, float]:
+        if self.broken:
+            raise KeyError("a fault of the driver")
+        return {}
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> Node:
+    file = tmp_path / "node.toml"
+    file.write_text(
+        '[node]\nhost = "anvil"\ncandidate = false\nload = false\n'
+        '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
+    )
+    return load_node(file)
+
+
+def test_an_rc_that_fails_ends_its_node(
+    node: Node, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    driver = Faulty()
+    monkeypatch.setattr(node_module, "driver_for", lambda _rc: driver)
+
+    async def story() -> None:
+        network = MemoryNetwork()
+        mesh, watcher = network.open("f", Sender("anvil", "node")), network.open("f", Sender("w", "watcher"))
+        tokens: dict[str, bool] = {}
+
+        def on_token(token: Token, alive: bool) -> None:
+            tokens[token.name] = alive
+
+        watches = [watcher.watch(watcher.keys.alive_any(role), on_token) for role in (Role.NODE, Role.RC)]
+        running = asyncio.create_task(run_services(node, mesh, asyncio.Event()))
+        await until(lambda: tokens == {"node": True, "robot/a": True})
+        driver.broken = True
+        with pytest.raises(NodeFailed, match="a fault of the driver"):
+            await running
+        await until(lambda: tokens == {"node": False, "robot/a": False})
+        for watch in watches:
+            watch.close()
+        for one in (mesh, watcher):
+            await one.close()
+
+    run(story())
+    logged = next(record for record in caplog.records if record.levelno == logging.ERROR)
+    assert logged.message == "robot/a failed"
+    assert logged.exc_info is not None
+
+
+def test_a_component_host_that_fails_ends_its_node(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    hosts: list[ComponentHost] = []
+    begin = ComponentHost.start
+
+    async def start(host: ComponentHost) -> None:
+        hosts.append(host)
+        await begin(host)
+
+    monkeypatch.setattr(ComponentHost, "start", start)
+
+    async def story() -> None:
+        mesh = MemoryNetwork().open("f", Sender("anvil", "node"))
+        running = asyncio.create_task(run_services(node, mesh, asyncio.Event()))
+        await until(lambda: bool(hosts))
+        hosts[0].supervisor.fail(OSError("no more processes"))
+        with pytest.raises(NodeFailed, match="no more processes"):
+            await running
+        await mesh.close()
+
+    run(story())
+
+
+def test_a_node_that_is_told_to_stop_stops_in_peace(node: Node) -> None:
+    async def story() -> None:
+        mesh, stop = MemoryNetwork().open("f", Sender("anvil", "node")), asyncio.Event()
+        running = asyncio.create_task(run_services(node, mesh, stop))
+        await asyncio.sleep(5)
+        assert not running.done()
+        stop.set()
+        await running
+        await mesh.close()
+
+    run(story())
+
+
+def test_a_node_that_can_not_go_on_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def failing(_node: Node) -> None:
+        raise NodeFailed("a service failed: KeyError('x'); see the log")
+
+    monkeypatch.setattr(node_module, "_main", failing)
+    done = CliRunner().invoke(node_module.main, [])
+    assert done.exit_code == 1
+    assert "zscout-node: a service failed: KeyError('x'); see the log" in done.stderr

@@ -1,0 +1,215 @@
+"""An ARC in a few lines: a context manager that waits for the grant and ends its body when it is over.
+
+    async with Client.connect() as client:
+        async with hold(client, "survey", {"robot/scout33": {}}, min_runtime=5) as held:
+            await held.command("robot/scout33", {"name": "echo", "value": 1})
+
+The body is cancelled when the hold is taken away (`Revoked` comes out of the `async with`), and when its
+minimum runtime is over (nothing comes out: it had its time). `holds` goes again when it is granted again:
+
+    async for attempt in holds(client, "survey", {"robot/scout33": {}}, min_runtime=5):
+        async with attempt as held:
+            ...
+
+A need may be a pattern, which any one RC meets: with `{"framegrabber/*": {}}` as needs,
+`held.rc("framegrabber/*")` is the one that was given, and `held.command("framegrabber/*", ...)` goes to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping
+from decimal import Decimal
+from types import TracebackType
+from typing import Any
+
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import HoldEnd, Needs, OpenArc
+from zscout.keyexpr import is_pattern
+from zscout.messages import Done
+from zscout.types import SECOND, Grant, Ns
+
+
+class Revoked(Exception):
+    """The hold was taken away; `outcome` is the protocol's word, the message the reason."""
+
+    def __init__(self, arc: OpenArc) -> None:
+        ending = arc.ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
+        super().__init__(ending.reason or ending.outcome)
+        self.outcome = ending.outcome
+        self.by = ending.by
+
+
+class Held:
+    """A hold in force, inside the body."""
+
+    def __init__(self, client: Client, arc: OpenArc, grant: Grant) -> None:
+        self._client = client
+        self.arc = arc
+        self.grant = grant
+        self.rcs: list[str] = list(arc.rcs)
+        """All that it holds, sorted."""
+        self.bound: dict[str, str] = dict(arc.bound)
+        """By each pattern of the needs: the RC that meets it."""
+
+    def rc(self, need: str) -> str:
+        """The RC that meets a need: `held.rc("framegrabber/*")`; an RC that is held meets its own name.
+
+        Raises KeyError for what was not asked for."""
+        rc = self.bound.get(need, need)
+        if rc not in self.rcs:
+            asked = ", ".join(sorted(self.arc.needs))
+            raise KeyError(f"{need} is no need of {self.arc.name}; it asked for {asked}")
+        return rc
+
+    def now(self) -> Ns:
+        """The time by this host's clock."""
+        return self._client.mesh.now()
+
+    @property
+    def active(self) -> bool:
+        """Whether the hold still stands, as far as this client has heard."""
+        return self.arc.grant == self.grant
+
+    @property
+    def remaining(self) -> float:
+        """Seconds of the minimum runtime that are left."""
+        return (self.arc.end - self.now()) / SECOND
+
+    @property
+    def completed(self) -> bool:
+        """Whether the hold is over because it had its minimum runtime."""
+        if self.active:
+            return not self.arc.keep and self.remaining <= 0
+        return self.arc.outcome == "completed"
+
+    async def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
+        """Has one of the held RCs do something: the one of this name, or that meets this pattern.
+
+        Raises CommandRefused, and KeyError for a pattern that was not asked for."""
+        rc = self.rc(need) if is_pattern(need) else need
+        return await self._client.command(rc, self.grant, do, ttl=ttl)
+
+    async def resumed(self) -> None:
+        """Waits while the client is paused: whatever becomes of the hold meanwhile is told then."""
+        await self._client.resumed()
+
+    async def over(self) -> None:
+        """Waits until the hold is over; for bodies that work elsewhere."""
+        while self.active:
+            if self.arc.keep:
+                await self._client.changed(self.arc)
+                continue
+            try:
+                async with asyncio.timeout(max(0.0, self.remaining)):
+                    await self._client.changed(self.arc)
+            except TimeoutError:
+                return
+
+
+class Attempt:
+    """One entry into an ARC's body. `again` lets a hold that was taken away be waited for once more."""
+
+    def __init__(self, client: Client, arc: OpenArc | None, ask: dict[str, Any], *, again: bool) -> None:
+        self._client, self._ask, self._again = client, ask, again
+        self.arc = arc
+        self._entered: _Entered | None = None
+
+    async def granted(self) -> Held:
+        """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused."""
+        if self.arc is None:
+            self.arc = await self._client.request(**self._ask)
+        try:
+            grant = await self._client.granted(self.arc)
+        except asyncio.CancelledError:
+            await self._client.end(self.arc)
+            raise
+        if grant is None:
+            raise Revoked(self.arc)
+        return Held(self._client, self.arc, grant)
+
+    async def __aenter__(self) -> Held:
+        held = await self.granted()
+        body = asyncio.current_task()
+        assert body is not None  # noqa: S101 - this is a coroutine
+        self._entered = _Entered(held, body)
+        self._entered.watch = asyncio.create_task(self._entered.interrupt_when_over())
+        return held
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        assert self._entered is not None  # noqa: S101 - entered before left
+        held, arc = self._entered.held, self._entered.held.arc
+        interrupted = self._entered.leave() and kind is asyncio.CancelledError
+        if held.completed:
+            self._client.complete(arc)
+            return interrupted
+        failed = kind is not None and not interrupted
+        if held.active or failed:
+            if arc.open:
+                await self._client.end(arc)
+            return False
+        if self._again and arc.open:
+            return interrupted
+        revoked = Revoked(arc)
+        if arc.open:
+            await self._client.end(arc)
+        raise revoked from None
+
+
+class _Entered:
+    """A body that runs, and the watch that cancels it when its hold is over."""
+
+    def __init__(self, held: Held, body: asyncio.Task[Any]) -> None:
+        self.held, self.body = held, body
+        self.watch: asyncio.Task[None] | None = None
+        self._interrupted = False
+
+    async def interrupt_when_over(self) -> None:
+        await self.held.over()
+        await self.held.resumed()
+        self._interrupted = True
+        self.body.cancel()
+
+    def leave(self) -> bool:
+        """Ends the watch. True if it was the watch that cancelled the body, and nobody else besides."""
+        if self.watch is not None:
+            self.watch.cancel()
+        # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
+        return self._interrupted and self.body.uncancel() == 0
+
+
+def hold(
+    client: Client,
+    name: str,
+    needs: Needs,
+    *,
+    priority: int = 0,
+    min_runtime: float | Decimal = 1.0,
+    keep: bool = False,
+) -> Attempt:
+    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds."""
+    ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
+    return Attempt(client, None, ask, again=False)
+
+
+async def holds(
+    client: Client,
+    name: str,
+    needs: Needs,
+    *,
+    priority: int = 0,
+    min_runtime: float | Decimal = 1.0,
+    keep: bool = False,
+) -> AsyncIterator[Attempt]:
+    """The same, entered again whenever it was taken away and is granted again, until a body ends by itself
+    or has had its time."""
+    arc: OpenArc | None = None
+    ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
+    while arc is None or arc.open:
+        attempt = Attempt(client, arc, ask, again=True)
+        yield attempt
+        arc = attempt.arc
+        if arc is None:
+            return

@@ -1,0 +1,416 @@
+"""A program's side of the mesh: requests ARCs, follows what becomes of them, commands what it holds."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import socket
+from collections.abc import Callable, Coroutine, Generator, Mapping, Sequence
+from decimal import Decimal
+from typing import Any, Generic, Self, TypeVar
+
+from zscout.behaviors.client.handover import Handover
+from zscout.behaviors.client.leader_tracker import LeaderTracker
+from zscout.behaviors.client.request import (
+    CommandRefused,
+    Needs,
+    OpenArc,
+    RequestRefused,
+    RequestStore,
+    amounts,
+)
+from zscout.behaviors.client.request_sender import (
+    BACKOFF,
+    QUERY_TIMEOUT,
+    TRY_AGAIN,
+    RequestSender,
+    answered,
+)
+from zscout.config.fleet import Fleet, fleet_from_env
+from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
+from zscout.mesh import Declaration, Mesh, ZenohMesh
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import (
+    Cancel,
+    Command,
+    Done,
+    Foresee,
+    Foresight,
+    HandOver,
+    Notice,
+    OpenRequest,
+    Problem,
+    RcmState,
+    Release,
+    StateAsk,
+)
+from zscout.types import SECOND, Grant, Term
+
+__all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "RequestRefused"]
+
+log = logging.getLogger(__name__)
+
+CONFIRM_TIMEOUT = 1.0
+"""Seconds within which all RCs of a grant must have confirmed it."""
+CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
+"""Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
+
+
+class Client:
+    """One program on the mesh. Open with `async with Client.connect(...) as client`, or `await
+    Client.connect(...)` and `close` it."""
+
+    def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
+        self.mesh, self.fleet = mesh, fleet
+        self._supervisor = Supervisor(f"client {mesh.me}", self._failed)
+        self._store = RequestStore(mesh.now)
+        self._tracker = LeaderTracker(mesh, fleet, self._store)
+        self._sender = RequestSender(mesh, self._store, self._tracker)
+        self._handover = Handover(mesh, self._store, self._tracker, self._sender, self._supervisor)
+        self._may_end = asyncio.Event()
+        """Set unless the client is paused, and once it has left."""
+        self._may_end.set()
+        self._leaving: asyncio.Task[None] | None = None
+        self._declared: list[Declaration] = []
+
+    @classmethod
+    def connect(
+        cls, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None
+    ) -> Connecting[Self]:
+        """Joins the mesh: await the result, or enter it. `name` must be the only one of this host; the
+        default is.
+
+        Without a `fleet`, the one that ZSCOUT_FLEET names, or the default. Raises MeshError, BadInput."""
+        return Connecting(cls._connect(name, fleet, host))
+
+    @classmethod
+    async def _connect(cls, name: str | None, fleet: Fleet | None, host: str | None) -> Self:
+        fleet = fleet or fleet_from_env()
+        host = host or os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
+        me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
+        return cls(await ZenohMesh.open(fleet.name, me, fleet.mesh), fleet).start()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self.close()
+
+    def start(self) -> Self:
+        """Declares on the mesh what a client has; `connect` does so."""
+        keys, mesh = self.mesh.keys, self.mesh
+        self._declared = [
+            mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice),
+            *self._tracker.start(),
+            mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance())),
+        ]
+        self._supervisor.spawn(self._sender.keep_asking())
+        self._supervisor.spawn(self._tracker.watch_lease())
+        return self
+
+    async def close(self) -> None:
+        """Gives back everything and leaves the mesh."""
+        try:
+            if self._leaving is None:
+                self._store.resumed.set()
+                self._may_end.set()
+                await self._supervisor.close()
+                await asyncio.gather(*(self.end(arc) for arc in self._store.open))
+        finally:
+            await self.leave()
+
+    async def leave(self) -> None:
+        """Leaves the mesh without ending anything or giving it back: for who has handed over all. What is
+        still this client's goes when the RCM sees that its token has gone."""
+        if self._leaving is None:
+            self._leaving = asyncio.get_running_loop().create_task(self._leave())
+        # Its token must go even if the caller is cancelled.
+        await asyncio.shield(self._leaving)
+
+    async def _leave(self) -> None:
+        self._may_end.set()
+        try:
+            await self._supervisor.close()
+        finally:
+            for declared in reversed(self._declared):
+                declared.close()
+            self._tracker.stop()
+            await self.mesh.close()
+
+    def _failed(self, error: Exception) -> None:
+        """A task of this client failed: its holds end here, and at the RCM when its token has gone."""
+        for arc in self._store.open:
+            arc.finish("lost", f"this client failed: {error!r}", self.mesh.now())
+            self._store.notify(arc)
+        self._leaving = self._leaving or asyncio.get_running_loop().create_task(self._leave())
+
+    @property
+    def term(self) -> Term:
+        """The highest term received or promised; what is of an older one is ignored."""
+        return self._tracker.term
+
+    @property
+    def leader(self) -> str | None:
+        """The host whose node leads, or None where no RCM is seen."""
+        return self._tracker.leader
+
+    # Requests
+
+    async def request(
+        self,
+        name: str,
+        needs: Needs,
+        *,
+        priority: int = 0,
+        min_runtime: float | Decimal = 1.0,
+        keep: bool = False,
+        estimate: bool = False,
+    ) -> OpenArc:
+        """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
+
+        A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
+        more. With `estimate` its notices say when it will start. Raises RequestRefused where the request
+        can't be taken as it is.
+
+        An ARC of this name and these needs that another client hands over is returned instead, as it is."""
+        wanted = amounts(needs)
+        expected = await self._handover.claim(check_name(name, "arc"), wanted)
+        if expected is not None:
+            return expected
+        arc = OpenArc(
+            id=new_instance(),
+            name=name,
+            needs=wanted,
+            priority=priority,
+            min_runtime=min_runtime if isinstance(min_runtime, Decimal) else Decimal(str(min_runtime)),
+            keep=keep,
+            estimate=estimate,
+            since=self.mesh.now(),
+        )
+        self._store.add(arc)
+        try:
+            await self._sender.submit(arc)
+        except BaseException as error:
+            self._store.forget(arc)
+            if not isinstance(error, RequestRefused):
+                # The RCM may have it.
+                self._supervisor.spawn(self._sender.give_back(Cancel(id=arc.id)))
+            raise
+        return arc
+
+    async def changed(self, arc: OpenArc) -> None:
+        """Waits until there is news of `arc`."""
+        await self._store.changed(arc)
+
+    async def granted(self, arc: OpenArc) -> Grant | None:
+        """Waits until `arc` is granted and all its RCs have confirmed it; None if it ended instead.
+
+        Nothing is entered while the client is paused, nor is what it hands over reported as ended."""
+        while True:
+            await self._store.resumed.wait()
+            if not arc.open:
+                return None
+            if arc.state == "running" and arc.grant is not None:
+                grant = arc.grant
+                refusal = await self._confirm(arc, grant)
+                if arc.grant != grant:
+                    continue
+                if refusal is None:
+                    return grant
+                log.warning("the grant of %s is given back: %s", arc.name, refusal)
+                await self.end(arc)
+                raise refusal
+            await self.changed(arc)
+
+    async def _confirm(self, arc: OpenArc, grant: Grant) -> CommandRefused | None:
+        """Asks all RCs of a grant, side by side, whether they know of it."""
+        deadline = self.mesh.now() + round(CONFIRM_TIMEOUT * SECOND)
+
+        async def one(rc: str) -> CommandRefused | None:
+            pause, longest = BACKOFF
+            while True:
+                left = (deadline - self.mesh.now()) / SECOND
+                try:
+                    await self.command(rc, grant, {"name": "confirm"}, timeout=max(pause, left))
+                except CommandRefused as refused:
+                    if arc.grant != grant or refused.code not in CONFIRM_AGAIN or left <= pause:
+                        return refused
+                else:
+                    return None
+                await asyncio.sleep(pause)
+                pause = min(longest, pause * 2)
+
+        refusals = await asyncio.gather(*(one(rc) for rc in arc.rcs))
+        return next((refused for refused in refusals if refused is not None), None)
+
+    async def end(self, arc: OpenArc) -> None:
+        """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed
+        over then. Tried a few times; the RCM sees our token die otherwise."""
+        await self._may_end.wait()
+        if self._leaving is not None:
+            return
+        if arc.state == "moved":
+            self._store.forget(arc)
+            return
+        await self._sender.end(arc)
+
+    def complete(self, arc: OpenArc) -> None:
+        """An ARC has had its time by this host's clock; RCs and RCM end it by theirs."""
+        arc.finish("completed", "its minimum runtime is over", self.mesh.now())
+        self._store.notify(arc)
+        self._store.forget(arc)
+
+    async def hand_over(self, arc: OpenArc, to: Sender) -> None:
+        """Lets one ARC, queued or running, go on in another client. Raises RequestRefused."""
+        operation = HandOver(id=arc.id, to=str(to))
+        reply = await self.mesh.ask_one(self._sender.key, operation, Notice, timeout=QUERY_TIMEOUT)
+        if reply is None or reply.message is None:
+            unknown = Problem("unknown", "the RCM did not answer; ask how the ARC stands")
+            raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
+
+    def watch(self, watcher: Callable[[OpenArc], None]) -> None:
+        """Calls `watcher(arc)` whenever there is news of any of this client's requests."""
+        self._store.watch(watcher)
+
+    # Moving: all that this client has goes on in another one
+
+    def pause(self) -> None:
+        """From now on nothing is asked again or ended and no body is entered or interrupted, until `resume`,
+        `take_back`, `close` or `leave`. Notices are taken as before."""
+        self._handover.pause()
+        self._may_end.clear()
+
+    @property
+    def paused(self) -> bool:
+        return not self._store.resumed.is_set()
+
+    async def resumed(self) -> None:
+        """Waits while the client is paused; without end where it leaves like that."""
+        await self._store.resumed.wait()
+
+    def resume(self) -> None:
+        """Goes on. All that is open is asked again, and what was withheld happens now."""
+        self._may_end.set()
+        self._handover.resume()
+
+    def open_requests(self) -> list[OpenRequest]:
+        """What is queued or running: what `hand_over_all` would hand over now."""
+        now = self.mesh.now()
+        return [arc.open_request(now) for arc in self._store.standing]
+
+    def expect(self, requests: Sequence[OpenRequest]) -> None:
+        """These will be handed to this client: `request` then returns them, by name and needs. They replace
+        what was expected before and has not come.
+
+        What has come and was not asked for within 10 s is given back. Raises BadName, and ValueError for more
+        than 256 of them, or for one that is open here."""
+        self._handover.expect(requests)
+
+    @property
+    def expected_came(self) -> asyncio.Event:
+        """Set at the first notice of an ARC that is expected: from then on it is this client's."""
+        return self._handover.came
+
+    async def hand_over_all(self, to: Sender) -> None:
+        """Hands all `open_requests` of this paused client to another one, which expects them, in one step. On
+        return that is done, and they go on there.
+
+        Raises RequestRefused where nothing was handed over; with code `unknown` where no RCM could tell
+        within 10 s: call it again; or see to it that the other client is gone, and `take_back`."""
+        await self._handover.hand_over_all(to)
+
+    def take_back(self) -> None:
+        """The client to which all was handed is gone: this one goes on, and asks anew for each, at its place.
+
+        Bodies are interrupted as by any other lost hold. What was not handed over after all, where that was
+        unknown, simply stands."""
+        self._may_end.set()
+        self._handover.take_back()
+
+    # Operators' questions
+
+    async def state(
+        self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT
+    ) -> RcmState | None:
+        """The RCM's state, with the history of `arc` if one is named, and with a `forecast` of when those who
+        wait will start; None if no RCM answered."""
+        asked = StateAsk(arc=arc, forecast=forecast)
+        replies = await self.mesh.ask(
+            self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout, enough=answered
+        )
+        states = [reply.message for reply in replies if reply.message is not None]
+        return max(states, key=lambda state: state.term, default=None)
+
+    async def foresee(
+        self, name: str, needs: Needs, *, priority: int, min_runtime: Decimal, keep: bool = False
+    ) -> Foresight | None:
+        """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
+        asked = Foresee(
+            id=new_instance(),
+            arc=name,
+            needs=amounts(needs),
+            priority=priority,
+            min_runtime=min_runtime,
+            keep=keep,
+        )
+        reply = await self.mesh.ask_one(self._sender.key, asked, Foresight, timeout=QUERY_TIMEOUT)
+        if reply is not None and reply.problem is not None:
+            raise RequestRefused(reply.problem)
+        return reply.message if reply is not None else None
+
+    async def command(
+        self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
+    ) -> Done:
+        """Has an RC do something under `grant`. Raises CommandRefused."""
+        key = self.mesh.keys.command(rc, self.mesh.me)
+        command = Command(grant=grant, do=dict(do), ttl=ttl)
+        reply = await self.mesh.ask_one(key, command, Done, timeout=timeout)
+        if reply is None:
+            raise CommandRefused(rc, Problem("unknown", "no answer; it may have been done or not"))
+        if reply.message is None:
+            raise CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
+        return reply.message
+
+    def _on_notice(self, _key: str, notice: Notice) -> None:
+        if not self._tracker.accept(notice.term):
+            return
+        arc = self._store.arcs.get(notice.id)
+        if arc is not None:
+            self._store.take(arc, notice)
+        elif not self._handover.take(notice) and notice.state == "running":
+            # A grant that nobody here asked for, or gave up meanwhile, is given back.
+            self._supervisor.spawn(self._sender.give_back(Release(id=notice.id)))
+
+
+C = TypeVar("C", bound=Client)
+
+
+class Connecting(Coroutine[Any, Any, C], Generic[C]):
+    """A client on its way to the mesh: await it, or enter it, which closes it at the end of the body."""
+
+    def __init__(self, connecting: Coroutine[Any, Any, C]) -> None:
+        self._connecting = connecting
+        self._client: C | None = None
+
+    def __await__(self) -> Generator[Any, Any, C]:
+        return self._connecting.__await__()
+
+    async def __aenter__(self) -> C:
+        self._client = await self._connecting
+        return self._client
+
+    async def __aexit__(self, *exc: object) -> None:
+        if self._client is not None:
+            await self._client.close()
+
+    # A coroutine as before, which a task can run.
+
+    def send(self, value: Any) -> Any:
+        return self._connecting.send(value)
+
+    def throw(self, *error: Any) -> Any:
+        return self._connecting.throw(*error)
+
+    def close(self) -> None:
+        self._connecting.close()

@@ -1,0 +1,206 @@
+"""A client that moves: paused, it hands all that it has to another one, which expects it.
+
+The RCM's answer to the hand-over is the commit point. Before it the old client can go on as if nothing had
+been; after it only the new one, unless that is gone: then the old one takes back, and asks anew.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Sequence
+
+from zscout.behaviors.client.leader_tracker import LeaderTracker
+from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStore
+from zscout.behaviors.client.request_sender import (
+    BACKOFF,
+    QUERY_TIMEOUT,
+    TRY_AGAIN,
+    RequestSender,
+    answered,
+)
+from zscout.keyexpr import Sender
+from zscout.mesh import Mesh
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import Amounts, HandOver, Notice, OpenRequest, Problem
+from zscout.messages.scheduling import MAX_OTHERS
+from zscout.types import SECOND
+
+log = logging.getLogger(__name__)
+
+HAND_OVER = 10.0
+"""Seconds within which the outcome of a hand-over must be known."""
+COME = 2.0
+"""Seconds for which a request waits for the ARC that is expected in its stead."""
+JUST_COME = 1.0
+"""Seconds within which the RCM sees the token of a client that sees the RCM's."""
+CLAIM = 10.0
+"""Seconds after which an ARC that came and that nobody asked for is given back."""
+
+
+class Handover:
+    """What one client hands over, and what it expects to be handed over to it."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        store: RequestStore,
+        tracker: LeaderTracker,
+        sender: RequestSender,
+        supervisor: Supervisor,
+    ) -> None:
+        self.mesh, self.store, self.tracker, self.sender = mesh, store, tracker, sender
+        self._supervisor = supervisor
+        self.came = asyncio.Event()
+        self._unclaimed: dict[str, OpenArc] = {}
+        """What is expected, come or not, and was not asked for yet."""
+
+    # The new client
+
+    def expect(self, requests: Sequence[OpenRequest]) -> None:
+        """These will be handed to this client; they replace what was expected and has not come.
+
+        Raises BadName, and ValueError for what is too much or open here already."""
+        if len(requests) > MAX_OTHERS + 1:
+            raise ValueError(f"{len(requests)} ARCs are too many to take over; at most {MAX_OTHERS + 1} are")
+        now = self.mesh.now()
+        arcs = {request.id: OpenArc.expected(request, now) for request in requests}
+        if here := arcs.keys() & self.store.arcs.keys():
+            raise ValueError(f"request {min(here)} is open here already; nobody else can hand it over")
+        for arc in list(self.store.expected.values()):
+            self._unclaimed.pop(arc.id, None)
+            self.store.forget(arc)
+        self.store.expected.update(arcs)
+        self._unclaimed |= arcs
+        self.came.clear()
+        for arc in arcs.values():
+            # What comes back: notices from before it went are old.
+            if (before := self.store.moved.pop(arc.id, None)) is not None:
+                arc.last = before.last
+            self.store.withdrawn.pop(arc.id, None)
+            self.store.listen(arc)
+
+    def take(self, notice: Notice) -> bool:
+        """Applies a notice of what is expected, or was handed over. False if it is of neither."""
+        arc = self.store.expected.get(notice.id)
+        if arc is not None:
+            if arc.take_first(notice, self.mesh.now()):
+                del self.store.expected[arc.id]
+                self.store.add(arc)
+                self.store.notify(arc)
+                self.came.set()
+                self._supervisor.spawn(self._give_back_unwanted(arc))
+            return True
+        arc = self.store.moved.get(notice.id)
+        if arc is not None and notice.state == "ended" and notice.outcome != "handed_over":
+            # It was over before it could be handed over: there is nothing to take back.
+            arc.finish(notice.outcome or "lost", notice.reason, self.mesh.now())
+            self.store.notify(arc)
+            self.store.forget(arc)
+            return True
+        return False
+
+    async def claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
+        """The ARC of this name and these needs that is expected, once it has come; None if there is none."""
+        unclaimed = self._unclaimed.values()
+        arc = next((arc for arc in unclaimed if (arc.name, arc.needs) == (name, needs)), None)
+        if arc is None:
+            return None
+        del self._unclaimed[arc.id]
+        try:
+            async with asyncio.timeout(COME):
+                while arc.id in self.store.expected:
+                    await self.store.changed(arc)
+        except TimeoutError:
+            log.warning("%s was not handed over within %g s; it is asked for anew", name, COME)
+        finally:
+            if arc.id in self.store.expected:
+                self.store.forget(arc)
+        return arc if arc.open else None
+
+    async def _give_back_unwanted(self, arc: OpenArc) -> None:
+        await asyncio.sleep(CLAIM)
+        if self._unclaimed.get(arc.id) is arc:
+            del self._unclaimed[arc.id]
+            if arc.open:
+                log.warning("%s was handed over and nobody asked for it: it is given back", arc.name)
+                await self.sender.end(arc)
+
+    # The old client
+
+    def pause(self) -> None:
+        self.store.resumed.clear()
+        self.store.undecided.clear()
+        self.store.reclaimed.clear()
+
+    def resume(self) -> None:
+        self.store.resumed.set()
+        for arc in self.store.open:
+            self._supervisor.spawn(self._ask_again(arc))
+
+    async def _ask_again(self, arc: OpenArc) -> None:
+        """What stands is asked once; what was lost or taken back until there is an answer."""
+        try:
+            if arc.state != "asking":
+                await self.sender.ask(arc)
+            await self.sender.submit(arc)
+        except RequestRefused as refused:
+            log.warning("%s is not taken back: %s", arc.name, refused)
+            self.store.notify(arc)
+            self.store.forget(arc)
+
+    async def hand_over_all(self, to: Sender) -> None:
+        """Hands over all that is queued or running, in one step. Raises RequestRefused: nothing has moved,
+        or, with code `unknown`, nobody could tell."""
+        if self.store.resumed.is_set():
+            raise RuntimeError("pause() the client before it hands over all: it would ask for it again")
+        arcs = sorted(self.store.standing, key=lambda arc: arc.grant is None)
+        if len(arcs) > MAX_OTHERS + 1:
+            raise RequestRefused(
+                Problem("too_many", f"{len(arcs)} ARCs can't be handed over at once; {MAX_OTHERS + 1} can")
+            )
+        try:
+            async with asyncio.timeout(HAND_OVER):
+                await self._hand_over(arcs, to)
+        except TimeoutError:
+            self.store.undecided = {arc.id for arc in arcs if arc.open}
+            unknown = f"no RCM told within {HAND_OVER:g} s whether {to} has taken over; ask again"
+            raise RequestRefused(Problem("unknown", unknown)) from None
+
+    async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:
+        """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
+        term = self.tracker.term
+        pause, longest = BACKOFF
+        known_by = self.mesh.now() + round(JUST_COME * SECOND)
+        while arcs := [arc for arc in arcs if arc.open]:
+            first, *others = arcs
+            operation = HandOver(id=first.id, to=str(to), others=[arc.id for arc in others])
+            self.tracker.leader_came.clear()
+            replies = await self.mesh.ask(
+                self.sender.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=answered
+            )
+            notices = [reply.message for reply in replies if reply.message is not None]
+            notice = next((notice for notice in notices if self.tracker.accept(notice.term)), None)
+            if notice is not None:
+                # An RCM that came in between answers for the first alone: it may not know of the others.
+                for arc in arcs if notice.term == term else [first]:
+                    self.store.move(arc, notice)
+                continue
+            problem = next((reply.problem for reply in replies if reply.problem is not None), None)
+            if problem is not None and problem.code == "not_running":
+                # It is over, or an RCM that has just taken the lead has not heard of it: this settles which.
+                await self.sender.ask(first)
+            elif problem is not None and problem.code == "unknown_client" and self.mesh.now() < known_by:
+                # It sees the RCM; the RCM may not have seen its token yet.
+                pause = BACKOFF[0]
+            elif problem is not None and problem.code not in TRY_AGAIN:
+                raise RequestRefused(problem)
+            if not await self.tracker.leader_within(pause):
+                pause = min(longest, pause * 2)
+
+    def take_back(self) -> None:
+        """Asks anew for all that was handed over, at its old place: its new client is gone."""
+        for arc in list(self.store.moved.values()):
+            self.store.reclaim(arc)
+        self.store.reclaimed, self.store.undecided = self.store.undecided, set()
+        self.resume()

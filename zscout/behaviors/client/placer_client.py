@@ -1,0 +1,181 @@
+"""Requests to the component placer, and what it publishes."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection
+from contextlib import ExitStack, suppress
+from types import TracebackType
+from typing import Final, Self, TypeVar
+
+from zscout.behaviors.client.request import RequestRefused
+from zscout.behaviors.client.request_sender import TRY_AGAIN
+from zscout.mesh import Mesh
+from zscout.messages import (
+    ComponentSpec,
+    EndComponent,
+    ListPlacements,
+    PlaceComponent,
+    Placement,
+    PlacementOperation,
+    Placements,
+    PlacerOperation,
+    Problem,
+    absurd,
+)
+from zscout.types import NO_TERM, SECOND, ComponentId, HostName, Term
+
+TIMEOUT: Final = 5.0
+"""Seconds of one query beyond its own `wait`: a placer that begins first asks all nodes what runs there."""
+PATIENCE: Final = 30.0
+AGAIN: Final = 0.2
+REFRESH_EVERY: Final = 1.0
+
+R = TypeVar("R")
+
+
+class PlacerSilent(RequestRefused):
+    """No component placer answered: what was requested may be done or not."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(Problem("unknown", message))
+
+
+class PlacerClient:
+    """The component placer, as one program knows it. `patience`: seconds within which some placer answers,
+    though the lead changes meanwhile.
+
+    As a context manager it follows `placements` (of the components in `only`, if given) by what is published
+    and by each answer."""
+
+    def __init__(
+        self, mesh: Mesh, only: Collection[ComponentId] | None = None, *, patience: float = PATIENCE
+    ) -> None:
+        self.mesh, self.only, self._patience = mesh, only, patience
+        self.placements: dict[ComponentId, Placement] = {}
+        self.cordoned: frozenset[HostName] = frozenset()
+        self.term: Term = NO_TERM
+        self.changed = asyncio.Event()
+        self._subscribed = ExitStack()
+
+    def __enter__(self) -> Self:
+        subscription = self.mesh.subscribe(self.mesh.keys.placements, Placements, self._on_placements)
+        self._subscribed.callback(subscription.close)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._subscribed.close()
+
+    # Requests
+
+    async def place(self, component: ComponentId, spec: ComponentSpec, *, wait: float = 3.0) -> Placement:
+        """Has it run somewhere, or returns how it stands if it does. Raises RequestRefused."""
+        return await self.request(PlaceComponent(component, spec, wait=wait), Placement)
+
+    async def stop(self, component: ComponentId, *, wait: float = 0.0) -> Placement:
+        """Stops it for good. Raises RequestRefused."""
+        return await self.request(EndComponent(component, wait=wait), Placement)
+
+    async def request(self, operation: PlacerOperation, kind: type[R]) -> R:
+        """Repeats the operation, which must be idempotent, until a placer answers. Raises RequestRefused,
+        PlacerSilent."""
+        deadline = self._deadline()
+        while True:
+            answer = await self._ask(operation, kind)
+            if answer is not None:
+                return answer
+            if self.mesh.now() > deadline:
+                raise PlacerSilent(
+                    f"the component placer of fleet {self.mesh.keys.fleet} did not answer for "
+                    f"{self._patience:.0f} s; see zscout status, and the log of zscout-node where it leads"
+                )
+            await asyncio.sleep(AGAIN)
+
+    async def request_once(
+        self, operation: PlacementOperation, done: Callable[[Placement], bool]
+    ) -> Placement:
+        """Does not repeat the operation where `done(placement)` says that it was done though its answer is
+        missing. Raises RequestRefused, PlacerSilent."""
+        deadline = self._deadline()
+        while True:
+            answer = await self._ask(operation, Placement)
+            if answer is not None:
+                self.take(answer)
+                return answer
+            await self.refresh()
+            placement = self.placements.get(operation.component)
+            if placement is not None and done(placement):
+                return placement
+            if self.mesh.now() > deadline:
+                raise PlacerSilent(
+                    "the component placer did not answer: it may be done or not; see zscout components"
+                )
+            await asyncio.sleep(AGAIN)
+
+    # Placements
+
+    async def refresh(self) -> None:
+        """Lists all placements, or those in `only`. Raises RequestRefused, PlacerSilent."""
+        self._listed(await self.request(self._list(), Placements))
+
+    async def try_refresh(self) -> None:
+        """The same with one query: without an answer `placements` stay as they are."""
+        listed = await self._ask(self._list(), Placements)
+        if listed is not None:
+            self._listed(listed)
+
+    async def wait_changed(self) -> None:
+        """Waits until something is published, and lists the placements if nothing is for a second. Raises
+        RequestRefused, PlacerSilent."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(REFRESH_EVERY):
+                await self.changed.wait()
+        if not self.changed.is_set():
+            await self.refresh()
+        self.changed.clear()
+
+    def take(self, *placements: Placement) -> None:
+        """Takes them in as the newest."""
+        for placement in placements:
+            if self.only is None or placement.component in self.only:
+                self.placements[placement.component] = placement
+        self.changed.set()
+
+    def _deadline(self) -> int:
+        return self.mesh.now() + round(self._patience * SECOND)
+
+    async def _ask(self, operation: PlacerOperation, kind: type[R]) -> R | None:
+        """One query; None: no answer, or the placer can't answer now. Raises RequestRefused."""
+        replies = await self.mesh.ask(
+            self.mesh.keys.placer,
+            operation,
+            kind,
+            timeout=TIMEOUT + (operation.wait if isinstance(operation, PlacementOperation) else 0.0),
+            enough=lambda reply: reply.message is not None,
+        )
+        for reply in replies:
+            if reply.message is not None:
+                return reply.message
+        problem = next((reply.problem for reply in replies if reply.problem is not None), None)
+        if problem is not None and problem.code not in TRY_AGAIN:
+            raise RequestRefused(problem)
+        return None
+
+    def _list(self) -> ListPlacements:
+        one = next(iter(self.only)) if self.only is not None and len(self.only) == 1 else None
+        return ListPlacements(one)
+
+    def _listed(self, listed: Placements) -> None:
+        self.placements = {}
+        self.term, self.cordoned = listed.term, frozenset(listed.cordoned)
+        self.take(*listed.components)
+
+    def _on_placements(self, _key: str, published: Placements) -> None:
+        if published.term < self.term or absurd(published.term, self.term):
+            return
+        self.term, self.cordoned = published.term, frozenset(published.cordoned)
+        self.take(*published.components)
+        for component in published.forgotten:
+            self.placements.pop(component, None)

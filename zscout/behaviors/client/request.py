@@ -1,0 +1,349 @@
+"""A client's requests: what was asked for, and how each stands by the newest notice. Time is passed in."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from decimal import Decimal
+from typing import Any, NamedTuple, Self
+
+import msgspec
+
+from zscout.keyexpr import BadName, check_name, check_need, check_rc, is_pattern, matcher, new_instance
+from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release
+from zscout.types import (
+    NO_TERM,
+    SECOND,
+    Grant,
+    Ns,
+    Place,
+    Term,
+)
+
+Needs = Mapping[str, Mapping[str, Any]]
+
+
+class RequestRefused(Exception):
+    """The RCM will not take this request as it is; the message says why, `code` is the protocol's."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem.message)
+        self.code = problem.code
+
+
+class CommandRefused(Exception):
+    """An RC did not obey; `code` is the protocol's, or `unknown` where no answer came."""
+
+    def __init__(self, rc: str, problem: Problem) -> None:
+        super().__init__(f"{rc}: {problem.message}")
+        self.code = problem.code
+
+
+class HoldEnd(NamedTuple):
+    """How a hold ended: the protocol's outcome, the reason in words, and the ARC that it was taken for."""
+
+    outcome: str
+    reason: str
+    by: str | None = None
+
+
+@dataclass(slots=True)
+class OpenArc:
+    """A request from its first asking to its end.
+
+    `state` is `asking` until the first notice, then `queued`, `running`, `ended` or `refused`. One that
+    another client is to hand over is `expected` until the first notice; one that was handed over is `moved`.
+    """
+
+    id: str
+    name: str
+    needs: dict[str, Amounts]
+    priority: int
+    min_runtime: Decimal
+    keep: bool = False
+    estimate: bool = False
+    """Whether the RCM is asked to estimate when it will start."""
+    state: str = "asking"
+    reason: str = ""
+    why: ReasonInfo | None = None
+    """What `reason` says, as data, where the RCM said so."""
+    outcome: str | None = None
+    by: str | None = None
+    place: Place | None = None
+    ahead: int | None = None
+    start: Ns | None = None
+    """While it is queued: when it will start by the RCM's last estimate, on this host's clock."""
+    grant: Grant | None = None
+    rcs: list[str] = field(default_factory=list)
+    """What it holds, or held last."""
+    bound: dict[str, str] = field(default_factory=dict)
+    """By each of its patterns: the RC among them that meets it."""
+    end: Ns = 0
+    """When the minimum runtime of the present hold is over, on this host's clock."""
+    since: Ns = 0
+    """When `state` began."""
+    waits_since: Ns | None = None
+    """When it was last queued: its present wait began then, whichever RCM leads."""
+    ending: HoldEnd | None = None
+    """How the last hold ended; `outcome` and `reason` are of the newest notice, whatever it is about."""
+    last: tuple[Term, int] = field(default=(NO_TERM, 0))
+
+    @classmethod
+    def expected(cls, request: OpenRequest, now: Ns) -> Self:
+        """What another client will hand over. Raises BadName."""
+        for need in request.needs:
+            check_need(need)
+        return cls(
+            id=check_name(request.id, "id"),
+            name=check_name(request.arc, "arc"),
+            needs=request.needs,
+            priority=request.priority,
+            min_runtime=request.min_runtime,
+            keep=request.keep,
+            state="expected",
+            reason="another client is to hand it over",
+            place=request.place,
+            since=now,
+            waits_since=now - round(request.waited * SECOND),
+        )
+
+    @property
+    def open(self) -> bool:
+        return self.state in ("asking", "queued", "running")
+
+    def take(self, notice: Notice, now: Ns) -> bool:
+        """Applies a newer notice of this request. False if it is an old one, a replaced RCM's, or reports a
+        hold that is not what was asked for."""
+        if (notice.term, notice.step) <= self.last or not self.open:
+            return False
+        bound = self._binding(notice)
+        if bound is None:
+            return False
+        self.last = (notice.term, notice.step)
+        if notice.state != self.state or notice.grant != self.grant:
+            self.since = now
+        if notice.state != "running":
+            self._close(HoldEnd(notice.outcome or "lost", notice.reason, notice.by), now)
+        elif notice.grant != self.grant:
+            self._close(HoldEnd("lost", "it was granted anew"), now)
+        self.state = notice.state
+        self.reason, self.why = notice.reason, notice.why
+        self.outcome, self.by = notice.outcome, notice.by
+        self.ahead = notice.ahead
+        self.start = None if notice.starts_in is None else now + round(notice.starts_in * SECOND)
+        if notice.place is not None:
+            self.place = notice.place
+        if notice.state == "running":
+            self.grant = notice.grant
+            self.bound, self.rcs = bound, sorted(bound.get(need, need) for need in self.needs)
+            self.end = now + round((notice.remaining or 0.0) * SECOND)
+        return True
+
+    def _binding(self, notice: Notice) -> dict[str, str] | None:
+        """The RC that meets each pattern, each another one; None: this is no binding of what was asked."""
+        bound = {need: notice.bound.get(need, "") for need in self.needs if is_pattern(need)}
+        if notice.state != "running" or not bound:
+            return {}
+        rcs = {bound.get(need, need) for need in self.needs}
+        fits = all(_is_rc(rc) and matcher(need)(rc) for need, rc in bound.items())
+        return bound if fits and len(rcs) == len(self.needs) else None
+
+    def _close(self, ending: HoldEnd, now: Ns) -> None:
+        if self.grant is not None:
+            self.grant, self.ending, self.waits_since = None, ending, now
+        elif self.waits_since is None:
+            self.waits_since = now
+
+    def lose(self, reason: str, now: Ns) -> None:
+        """The hold is over by the client's own judgement; the request is asked again."""
+        self._close(HoldEnd("lost", reason), now)
+        self.state, self.reason, self.outcome, self.since = "asking", reason, "lost", now
+        self.why = None
+
+    def finish(self, outcome: str, reason: str, now: Ns) -> None:
+        """The request is over by the client's own judgement."""
+        self._close(HoldEnd(outcome, reason), now)
+        self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
+
+    def take_first(self, notice: Notice, now: Ns) -> bool:
+        """Applies the first notice of an expected request. False if it is none: an old one, or not
+        credible."""
+        self.state = "asking"
+        if notice.state != "ended" and self.take(notice, now):
+            return True
+        self.state = "expected"
+        return False
+
+    def move(self, now: Ns) -> None:
+        """It goes on in another client."""
+        self._close(HoldEnd("handed_over", "handed over"), now)
+        self.state, self.since = "moved", now
+
+    def take_back(self, new_id: str, reason: str, now: Ns) -> None:
+        """The client to which it was handed over is gone: it is asked for anew, at its old place."""
+        if self.ending is not None and self.ending.outcome == "handed_over":
+            self.ending = HoldEnd("lost", reason)
+        self.id, self.last = new_id, (NO_TERM, 0)
+        self.state, self.reason, self.outcome, self.since = "asking", reason, None, now
+        self.why = None
+
+    def _waited(self, now: Ns) -> float:
+        since = self.waits_since
+        return 0.0 if since is None or self.grant is not None else max(0, now - since) / SECOND
+
+    def ask(self, now: Ns) -> Ask:
+        return Ask(
+            id=self.id,
+            arc=self.name,
+            needs=self.needs,
+            priority=self.priority,
+            min_runtime=self.min_runtime,
+            keep=self.keep,
+            place=self.place,
+            waited=self._waited(now),
+            estimate=self.estimate,
+        )
+
+    def open_request(self, now: Ns) -> OpenRequest:
+        """As it is reported to an RCM that takes the lead."""
+        return OpenRequest(
+            id=self.id,
+            arc=self.name,
+            needs=self.needs,
+            priority=self.priority,
+            min_runtime=self.min_runtime,
+            keep=self.keep,
+            place=self.place,
+            waited=self._waited(now),
+            grant=self.grant,
+        )
+
+
+def _is_rc(name: str) -> bool:
+    try:
+        check_rc(name)
+    except BadName:
+        return False
+    return True
+
+
+def amounts(needs: Needs) -> dict[str, Amounts]:
+    """Needs as people write them (ints, floats, Decimals), as they are sent. 0.1 means one tenth."""
+    return {
+        rc: {
+            name: value if isinstance(value, Decimal) else Decimal(str(value))
+            for name, value in params.items()
+        }
+        for rc, params in needs.items()
+    }
+
+
+class RequestStore:
+    """All that a client has asked for and that is not over, by request id; who waits for news of it; and
+    whether the client is paused."""
+
+    def __init__(self, now: Callable[[], Ns]) -> None:
+        self._now = now
+        self.arcs: dict[str, OpenArc] = {}
+        self.moved: dict[str, OpenArc] = {}
+        """What was handed over while this client was paused, and may be taken back."""
+        self.expected: dict[str, OpenArc] = {}
+        """What is to be handed to this client, and of which no notice has come yet."""
+        self.withdrawn: dict[str, Release | Cancel] = {}
+        """What this client gave up, until an RCM has answered that."""
+        self.undecided: set[str] = set()
+        """Ids of what was to be handed over, where nobody could tell whether it was."""
+        self.reclaimed: set[str] = set()
+        """Those of them that are this client's in any case: under a new id if they were handed over."""
+        self.resumed = asyncio.Event()
+        """Not set while the client is paused."""
+        self.resumed.set()
+        self._news: dict[str, asyncio.Event] = {}
+        self._watchers: list[Callable[[OpenArc], None]] = []
+
+    @property
+    def open(self) -> list[OpenArc]:
+        return [arc for arc in self.arcs.values() if arc.open]
+
+    @property
+    def standing(self) -> list[OpenArc]:
+        """Those that the RCM has answered: queued or running."""
+        return [arc for arc in self.open if arc.state != "asking"]
+
+    def add(self, arc: OpenArc) -> None:
+        self.arcs[arc.id] = arc
+        self.listen(arc)
+
+    def listen(self, arc: OpenArc) -> None:
+        """From now on somebody may wait for news of `arc`."""
+        self._news.setdefault(arc.id, asyncio.Event())
+
+    def forget(self, arc: OpenArc) -> None:
+        self.arcs.pop(arc.id, None)
+        self.moved.pop(arc.id, None)
+        self.expected.pop(arc.id, None)
+        self._news.pop(arc.id, None)
+
+    def watch(self, watcher: Callable[[OpenArc], None]) -> None:
+        self._watchers.append(watcher)
+
+    def notify(self, arc: OpenArc) -> None:
+        """Wakes all who wait for news of `arc`."""
+        event = self._news.get(arc.id)
+        if event is not None:
+            event.set()
+        for watcher in self._watchers:
+            watcher(arc)
+
+    async def changed(self, arc: OpenArc) -> None:
+        """Waits for the next news; not at all where none is to come."""
+        event = self._news.get(arc.id)
+        if event is not None:
+            event.clear()
+            await event.wait()
+
+    def take(self, arc: OpenArc, notice: Notice) -> None:
+        """Applies a notice of the RCM about one of `arcs`."""
+        if notice.id != arc.id:
+            # An answer that was on its way when the ARC was taken back under another id.
+            return
+        if notice.outcome == "handed_over" and not self.resumed.is_set():
+            # Not before the hand-over is answered: an RCM that dies first may not have notified the other.
+            return
+        if notice.outcome == "handed_over" and arc.id in self.reclaimed:
+            self.move(arc, notice)
+            self.reclaim(arc)
+        elif arc.take(notice, self._now()):
+            self.reclaimed.discard(arc.id)
+            self.notify(arc)
+            if not arc.open:
+                self.forget(arc)
+
+    def open_requests(self) -> list[OpenRequest]:
+        """All, as it is reported to an RCM that takes the lead. What is expected has no place: it is this
+        client's if the RCs report it so, and nothing is queued for it otherwise."""
+        now = self._now()
+        expected = [
+            msgspec.structs.replace(arc.open_request(now), place=None) for arc in self.expected.values()
+        ]
+        return [*(arc.open_request(now) for arc in self.open), *expected]
+
+    def move(self, arc: OpenArc, notice: Notice) -> None:
+        """`arc` goes on in another client, as of `notice`; earlier notices are old."""
+        arc.move(self._now())
+        arc.last = max(arc.last, (notice.term, notice.step))
+        self.arcs.pop(arc.id, None)
+        self.moved[arc.id] = arc
+        self.notify(arc)
+
+    def reclaim(self, arc: OpenArc) -> None:
+        """A moved one is this client's again, under a new id; it is to be asked for."""
+        del self.moved[arc.id]
+        self.reclaimed.discard(arc.id)
+        news = self._news.pop(arc.id, None)
+        arc.take_back(new_instance(), "it was handed over, and its new client is gone", self._now())
+        self.arcs[arc.id] = arc
+        # Who waits for news goes on waiting for those of the same ARC.
+        self._news[arc.id] = news or asyncio.Event()
+        self.notify(arc)

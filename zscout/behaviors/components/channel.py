@@ -1,0 +1,174 @@
+"""What a node and a component's process exchange: frames over a socket pair.
+
+A frame is its length in 4 bytes, big-endian, and one JSON object. The node sends orders, the process reports.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+from typing import Any, Final, Literal, TypeAlias
+
+import msgspec
+
+from zscout.config.fleet import Fleet
+from zscout.messages import MAX_MOVE, HowEnded, OpenRequest
+
+MAX_FRAME: Final = MAX_MOVE + 65_536
+"""Bytes."""
+_HEADER: Final = struct.Struct(">I")
+
+
+class BadFrame(Exception):
+    """The other side does not keep to the form; says what came."""
+
+
+class ComponentJob(msgspec.Struct, frozen=True, tag="job"):
+    """The first order: what to run, and as whom."""
+
+    component: str
+    incarnation: int
+    kind: str
+    where: str
+    """`module:class` of the kind."""
+    params: dict[str, Any]
+    host: str
+    fleet: Fleet
+    tag: str
+    """Stands in the environment of this process and of all that it starts."""
+    standby: bool = False
+    memory: int = 0
+    """Bytes that each process may allocate; 0: no limit of this sort."""
+
+
+class StopOrder(msgspec.Struct, frozen=True, tag="stop"):
+    """End by yourself."""
+
+
+class CheckpointOrder(msgspec.Struct, frozen=True, tag="checkpoint"):
+    """Answered with Taken."""
+
+    number: int
+    patience: float
+
+
+class MoveOrder(msgspec.Struct, frozen=True, tag="move"):
+    """Answered with Gone, and then it ends."""
+
+    number: int
+    to: str
+    incarnation: int
+    patience: float
+
+
+class RestoreOrder(msgspec.Struct, frozen=True, tag="restore"):
+    """Answered with Done."""
+
+    number: int
+    state: bytes
+    requests: list[OpenRequest]
+
+
+class ActivateOrder(msgspec.Struct, frozen=True, tag="activate"):
+    """It is not answered, but PhaseReport follows when it runs."""
+
+
+Order: TypeAlias = StopOrder | CheckpointOrder | MoveOrder | RestoreOrder | ActivateOrder
+
+
+class PhaseReport(msgspec.Struct, frozen=True, tag="stands"):
+    """How far the component has come."""
+
+    phase: Literal["standby", "running"]
+    movable: bool
+
+
+class CheckpointTaken(msgspec.Struct, frozen=True, tag="taken"):
+    number: int
+    state: bytes
+
+
+class MovedAway(msgspec.Struct, frozen=True, tag="gone"):
+    """It goes on elsewhere; `dead` seconds lay between."""
+
+    number: int
+    dead: float
+
+
+class OrderDone(msgspec.Struct, frozen=True, tag="done"):
+    number: int
+
+
+class OrderDeclined(msgspec.Struct, frozen=True, tag="declined"):
+    """An order that was not carried out; the component goes on."""
+
+    number: int
+    code: str
+    message: str
+
+
+class EndReport(msgspec.Struct, frozen=True, tag="ends"):
+    """The last report: how it ended, and the reason in words."""
+
+    how: HowEnded
+    reason: str = ""
+
+
+OrderAnswer: TypeAlias = CheckpointTaken | MovedAway | OrderDone | OrderDeclined
+ComponentReport: TypeAlias = PhaseReport | OrderAnswer | EndReport
+
+
+def pack(message: msgspec.Struct) -> bytes:
+    """A message as a frame. Raises BadFrame if it is too long."""
+    body = msgspec.json.encode(message, enc_hook=str)
+    if len(body) > MAX_FRAME:
+        raise BadFrame(f"{len(body)} bytes are too many; at most {MAX_FRAME} go in one frame")
+    return _HEADER.pack(len(body)) + body
+
+
+def receive(connection: socket.socket, kind: Any) -> Any:
+    """The next message, of `kind`, on a blocking socket; None when the other side has closed, be it half-way.
+
+    Raises BadFrame."""
+    header = _exactly(connection, _HEADER.size)
+    body = _exactly(connection, _length(header)) if header is not None else None
+    return None if body is None else _unpack(body, kind)
+
+
+async def read(stream: asyncio.StreamReader, kind: Any) -> Any:
+    """The same for a stream."""
+    try:
+        header = await stream.readexactly(_HEADER.size)
+        body = await stream.readexactly(_length(header))
+    except (asyncio.IncompleteReadError, ConnectionError):
+        return None
+    return _unpack(body, kind)
+
+
+def _length(header: bytes) -> int:
+    length: int = _HEADER.unpack(header)[0]
+    if length > MAX_FRAME:
+        raise BadFrame(f"a frame of {length} bytes is announced; at most {MAX_FRAME} are taken")
+    return length
+
+
+def _unpack(body: bytes, kind: Any) -> Any:
+    try:
+        return msgspec.json.decode(body, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise BadFrame(f"a frame is not understood: {str(error)[:200]}") from None
+
+
+def _exactly(connection: socket.socket, count: int) -> bytes | None:
+    parts, missing = [], count
+    while missing:
+        try:
+            part = connection.recv(min(missing, 1 << 20))
+        except ConnectionError:
+            return None
+        if not part:
+            return None
+        parts.append(part)
+        missing -= len(part)
+    return b"".join(parts)

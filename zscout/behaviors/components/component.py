@@ -1,0 +1,122 @@
+"""What the author of a component writes, and what a component is given.
+
+    class Survey(Component):
+        def __init__(self, params):            # of the spec; raise ValueError("one line") for bad ones
+            self.done = 0
+
+        async def run(self, context):            # to return is to complete, to raise is to fail
+            async for attempt in holds(context.client, "survey", {"robot/scout33": {}}, min_runtime=60):
+                async with attempt as held:
+                    while True:
+                        await held.command("robot/scout33", {"name": "echo", "value": self.done})
+                        self.done += 1
+                        await context.safe_point()
+
+        def checkpoint(self):                  # both of these: it can be moved to another host
+            return str(self.done).encode()
+
+        def restore(self, state):
+            self.done = int(state)
+
+It is found by its entry point of the group `zscout.components`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # a node looks at this module and needs no client
+    from zscout.behaviors.client.client import Client
+
+
+class Component:
+    """Base of all components. It is made in the process that runs it, before that process is on the mesh."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        """`params` are the spec's. Raise ValueError, with one line that says what to mend, for bad ones."""
+
+    async def run(self, context: ComponentContext) -> None:
+        """Does the work. Cancelled when the component is to end: let `async with` give back its ARCs."""
+        raise NotImplementedError(f"{type(self).__name__} has no run(); write one")
+
+    def checkpoint(self) -> bytes:
+        """Its state, MAX_CHECKPOINT bytes at most. Called while `run` is held at a safe point."""
+        raise NotImplementedError
+
+    def restore(self, state: bytes) -> None:
+        """Takes in what `checkpoint` gave in another process. Called before `run`."""
+        raise NotImplementedError
+
+
+def is_movable(component: Component) -> bool:
+    """Whether a component can give and take a checkpoint."""
+    kind = type(component)
+    return kind.checkpoint is not Component.checkpoint and kind.restore is not Component.restore
+
+
+class ComponentContext:
+    """What a component runs with: its client on the mesh, its name and its incarnation."""
+
+    def __init__(self, client: Client, component: str, incarnation: int, gate: SafePointGate) -> None:
+        self.client = client
+        self.component = component
+        """Its name."""
+        self.incarnation = incarnation
+        """Which start of it this is."""
+        self._gate = gate
+
+    async def safe_point(self) -> None:
+        """Says: my state is whole here, I may be checkpointed or moved. Call it often; it costs next to
+        nothing, and gives the event loop a turn. What else the component does must not touch its state
+        while this has not returned."""
+        await self._gate.come()
+
+
+Stage = ComponentContext
+"""Its former name, for components written with it."""
+
+
+class SafePointGate:
+    """Where `run` is held at a safe point."""
+
+    def __init__(self) -> None:
+        self._open = asyncio.Event()
+        self._open.set()
+        self._come = asyncio.Event()
+        self._held = 0
+
+    async def come(self) -> None:
+        await asyncio.sleep(0)
+        while not self._open.is_set():
+            self._held += 1
+            self._come.set()
+            try:
+                await self._open.wait()
+            finally:
+                self._held -= 1
+
+    @property
+    def holds(self) -> bool:
+        """Whether something is held here now: not any more where it was cancelled."""
+        return self._held > 0
+
+    async def hold(self, patience: float) -> bool:
+        """Holds what comes from now on; False, and nothing is held, if nothing came within `patience`
+        seconds. `release` ends it."""
+        self._open.clear()
+        self._come.clear()
+        try:
+            async with asyncio.timeout(patience):
+                while not self.holds:
+                    self._come.clear()
+                    await self._come.wait()
+        except BaseException as error:
+            self.release()
+            if isinstance(error, TimeoutError):
+                return False
+            raise
+        return True
+
+    def release(self) -> None:
+        self._open.set()

@@ -1,0 +1,333 @@
+"""The life of one component in its process: made, standing by, running, held, moved, ended."""
+
+from __future__ import annotations
+
+import asyncio
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.components import channel, kinds
+from zscout.behaviors.components.channel import (
+    ComponentJob,
+    ComponentReport,
+    EndReport,
+    Order,
+    PhaseReport,
+)
+from zscout.behaviors.components.component import (
+    Component,
+    ComponentContext,
+    SafePointGate,
+    is_movable,
+)
+from zscout.behaviors.components.migration import NotMoved, OutgoingMove, state_of
+from zscout.behaviors.components.processes import limit_allocations
+from zscout.keyexpr import BadName, Role, Token, incarnation_of, new_instance
+from zscout.mesh import Declaration, MeshError
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import MAX_ERROR
+
+STAND_BY: Final = 30.0
+"""Seconds that one stands by without being restored or activated, and then again until it is activated."""
+LINKED: Final = 1.0
+"""Seconds in which one that stands by may find the RCM: without a link to it, it can't be handed anything."""
+CLOSE: Final = 4.0
+"""Seconds for giving back what it holds."""
+SUPERSEDED: Final = 0.5
+"""Seconds that a superseded one has to clean up."""
+
+
+class ComponentLifecycle:
+    """Runs the component of `job`. `tell` sends a word to the node, waited for or not."""
+
+    def __init__(self, job: ComponentJob, tell: Callable[[ComponentReport], asyncio.Future[None]]) -> None:
+        self._job, self._tell = job, tell
+        self._story: asyncio.Task[EndReport] | None = None
+        self._wanted: EndReport | None = None
+        """How it is to end, once something wants it to."""
+        self._client: Client | None = None
+        self._component: Component | None = None
+        self._gate = SafePointGate()
+        self._holding = asyncio.Lock()
+        self._move: OutgoingMove | None = None
+        self._running = False
+        self._restored = asyncio.Event()
+        self._activated = asyncio.Event()
+        self._left = asyncio.Event()
+        """It is over here, whatever run() does: another one goes on."""
+        self._away: EndReport | None = None
+        """How, once that is so."""
+        self._supervisor = Supervisor(
+            f"component {job.component}.{job.incarnation}",
+            lambda error: self.end(EndReport("failed", _words(error))),
+        )
+
+    async def run(self) -> EndReport:
+        """Returns how it ended, when all that it held has been given back, or handed over."""
+        story = self._story = asyncio.create_task(self._tell_story())
+        if self._wanted is not None:
+            story.cancel()
+        left = asyncio.create_task(self._left.wait())
+        await asyncio.wait({story, left}, return_when=asyncio.FIRST_COMPLETED)
+        if left.done():
+            # run() stays where it is: to unwind it would give up what another one holds now.
+            ends = self._away or EndReport("moved")
+            if self._client is not None:
+                await self._client.leave()
+            return ends
+        left.cancel()
+        try:
+            ends = story.result()
+        except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - the author's code
+            if self._wanted is None or not isinstance(error, asyncio.CancelledError):
+                traceback.print_exception(error)
+            ends = self._wanted or EndReport("failed", _words(error))
+        await self._close(ends)
+        return ends
+
+    def order(self, order: Order) -> None:
+        """Carries out an order of the node."""
+        match order:
+            case channel.StopOrder():
+                self.end(EndReport("stopped"))
+            case channel.ActivateOrder():
+                self._activated.set()
+            case channel.CheckpointOrder():
+                self._supervisor.spawn(self._take_checkpoint(order))
+            case channel.MoveOrder():
+                self._supervisor.spawn(self._move_away(order))
+            case channel.RestoreOrder():
+                self._supervisor.spawn(self._take_in(order))
+
+    def end(self, ends: EndReport) -> None:
+        """Has it end; of several ends that are wanted the first is told. A move that has begun is called off;
+        if it is committed, another one goes on and this one is over anyhow."""
+        if self._wanted is not None:
+            return
+        self._wanted = ends
+        if self._move is not None:
+            self._move.called_off = "it is to end"
+        if self._story is not None and (self._move is None or not self._move.began):
+            self._story.cancel()
+
+    # What happens to it
+
+    async def _tell_story(self) -> EndReport:
+        job = self._job
+        connecting = asyncio.create_task(
+            Client.connect(f"{job.component}.{job.incarnation}", fleet=job.fleet, host=job.host)
+        )
+        # It joins the mesh in a thread: what follows is done meanwhile.
+        await asyncio.sleep(0)
+        kind = self._load()
+        try:
+            client = self._client = await connecting
+        except MeshError as error:
+            return EndReport("failed", str(error))
+        made = kind if isinstance(kind, EndReport) else self._make(kind)
+        if isinstance(made, EndReport):
+            return made
+        self._component = made
+        movable = is_movable(made)
+        watch = client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)
+        try:
+            if job.standby:
+                await self._linked(client)
+                await self._tell(PhaseReport("standby", movable))
+                if not await self._called(client):
+                    return EndReport(
+                        "stopped", f"it stood by for {STAND_BY:g} s and nothing was handed to it"
+                    )
+            return await self._perform(client, made, movable)
+        finally:
+            watch.close()
+
+    def _load(self) -> type[Component] | EndReport:
+        try:
+            return kinds.load(self._job.kind, self._job.where)
+        except kinds.BadKind as error:
+            return EndReport("failed", str(error))
+        except Exception as error:  # noqa: BLE001 - the author's code
+            traceback.print_exc()
+            return EndReport("failed", f"its kind can't be imported: {_words(error)}")
+
+    def _make(self, kind: type[Component]) -> Component | EndReport:
+        limit_allocations(self._job.memory)
+        try:
+            return kind(self._job.params)
+        except ValueError as error:
+            return EndReport("failed", f"these parameters are no good: {_words(error, named=False)}")
+        except Exception as error:  # noqa: BLE001 - the author's code
+            traceback.print_exc()
+            return EndReport("failed", f"it can't be made: {_words(error)}")
+
+    async def _linked(self, client: Client) -> None:
+        found = asyncio.Event()
+        watch = client.mesh.watch(client.mesh.keys.alive_any(Role.RCM), lambda _, alive: found.set())
+        try:
+            async with asyncio.timeout(LINKED):
+                await found.wait()
+        except TimeoutError:
+            pass  # no RCM leads now; there may be one when it matters
+        finally:
+            watch.close()
+
+    async def _called(self, client: Client) -> bool:
+        """Waits until it is to run: it was activated, or handed an ARC."""
+        if await _first(STAND_BY, self._activated, client.expected_came, self._restored):
+            return await _first(STAND_BY, self._activated, client.expected_came)
+        return False
+
+    async def _perform(self, client: Client, component: Component, movable: bool) -> EndReport:
+        job = self._job
+        instance = f"{job.incarnation}-{new_instance()}"
+        token: Declaration = client.mesh.alive(Token(job.host, Role.COMPONENT, job.component, instance))
+        self._running = True
+        try:
+            # Not waited for: nothing comes between this and its first step.
+            self._tell(PhaseReport("running", movable))
+            await component.run(ComponentContext(client, job.component, job.incarnation, self._gate))
+        except asyncio.CancelledError:
+            if self._wanted is None:
+                raise
+        except SystemExit as left:
+            if left.code:
+                return self._wanted or EndReport("failed", f"it left with {left.code!r}")
+        except Exception as error:
+            if self._wanted is None:
+                raise
+            traceback.print_exception(error)
+        finally:
+            self._running = False
+            token.close()
+        return self._wanted or EndReport("completed")
+
+    async def _close(self, ends: EndReport) -> None:
+        await self._supervisor.close()
+        if self._client is None:
+            return
+        with suppress(TimeoutError):
+            async with asyncio.timeout(SUPERSEDED if ends.how == "superseded" else CLOSE):
+                await self._client.close()
+
+    # What it is asked for
+
+    async def _take_checkpoint(self, order: channel.CheckpointOrder) -> None:
+        component = self._component
+        if component is None or not self._running:
+            await self._decline(order.number, "bad_request", "it does not run")
+            return
+        if not is_movable(component):
+            await self._decline(order.number, "not_movable", _NOT_MOVABLE)
+            return
+        async with self._holding:
+            if not await self._gate.hold(order.patience):
+                words = f"it came to no safe point within {order.patience:g} s"
+                await self._decline(order.number, "not_safe", words)
+                return
+            try:
+                state = state_of(component)
+            except NotMoved as refused:
+                await self._decline(order.number, refused.code, str(refused))
+                return
+            finally:
+                self._gate.release()
+        await self._tell(channel.CheckpointTaken(order.number, state))
+
+    async def _move_away(self, order: channel.MoveOrder) -> None:
+        component, client = self._component, self._client
+        if component is None or client is None or not self._running:
+            await self._decline(order.number, "bad_request", "it does not run")
+            return
+        if not is_movable(component):
+            await self._decline(order.number, "not_movable", _NOT_MOVABLE)
+            return
+        async with self._holding:
+            move = OutgoingMove(
+                client, component, self._gate, self._job.component, order.to, order.incarnation
+            )
+            self._move = move
+            try:
+                dead = await move.carry_out(order.patience)
+            except BaseException as error:
+                self._move = None
+                if self._wanted is not None and self._story is not None:
+                    self._story.cancel()
+                if not isinstance(error, Exception):
+                    raise
+                refused = error if isinstance(error, NotMoved) else NotMoved("move_failed", _words(error))
+                if refused is not error:
+                    traceback.print_exc()
+                await self._decline(order.number, refused.code, str(refused))
+                return
+            self._away = EndReport("moved")
+            await self._tell(channel.MovedAway(order.number, dead))
+            self._left.set()
+
+    async def _take_in(self, order: channel.RestoreOrder) -> None:
+        component, client = self._component, self._client
+        if component is None or client is None or not self._job.standby or self._running:
+            await self._decline(order.number, "bad_request", "it does not stand by")
+            return
+        if not is_movable(component):
+            await self._decline(order.number, "not_movable", _NOT_MOVABLE)
+            return
+        try:
+            component.restore(order.state)
+        except Exception as error:  # noqa: BLE001 - the author's code
+            traceback.print_exc()
+            await self._decline(order.number, "start_failed", f"restore() failed: {_words(error)}")
+            self.end(EndReport("failed", f"restore() failed: {_words(error)}"))
+            return
+        try:
+            client.expect(order.requests)
+        except (BadName, ValueError) as error:
+            await self._decline(order.number, "bad_request", _words(error, named=False))
+            return
+        self._restored.set()
+        await self._tell(channel.OrderDone(order.number))
+
+    async def _decline(self, number: int, code: str, message: str) -> None:
+        await self._tell(channel.OrderDeclined(number, code, message[:MAX_ERROR]))
+
+    def _on_component(self, token: Token, alive: bool) -> None:
+        if not alive or token.name != self._job.component:
+            return
+        try:
+            incarnation = incarnation_of(token.instance)
+        except BadName:
+            return
+        if self._move is not None and incarnation == self._move.incarnation:
+            self._move.successor_runs.set()
+        elif incarnation > self._job.incarnation:
+            self._superseded(incarnation, token.host)
+
+    def _superseded(self, incarnation: int, host: str) -> None:
+        ends = EndReport("superseded", f"incarnation {incarnation} runs on {host}")
+        self._away = self._away or ends
+        self.end(ends)
+        asyncio.get_running_loop().call_later(SUPERSEDED, self._left.set)
+
+
+_NOT_MOVABLE: Final = "it can't be moved: its kind has no checkpoint() and restore()"
+
+
+async def _first(timeout: float, *events: asyncio.Event) -> bool:
+    """Waits until one of these is set; False if none is within `timeout` seconds."""
+    waits = [asyncio.ensure_future(event.wait()) for event in events]
+    try:
+        done, _ = await asyncio.wait(waits, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for wait in waits:
+            wait.cancel()
+    return bool(done)
+
+
+def _words(error: BaseException, *, named: bool = True) -> str:
+    """An error in one line."""
+    text = " ".join(str(error).split())[:MAX_ERROR]
+    name = type(error).__name__
+    return f"{name}: {text}" if text and named else text or name

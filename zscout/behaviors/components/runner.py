@@ -1,0 +1,115 @@
+"""The process of one component: `python -m zscout.behaviors.components.runner FD`, started by a node.
+
+FD is its end of a socket pair to the node. When the other end closes, for whatever reason, this process and
+all that it started are killed at once: a component can't outlive its node.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import Final
+
+import uvloop
+
+from zscout.behaviors.components import channel
+from zscout.behaviors.components.channel import (
+    BadFrame,
+    ComponentJob,
+    ComponentReport,
+    EndReport,
+    Order,
+)
+from zscout.behaviors.components.lifecycle import ComponentLifecycle
+from zscout.behaviors.components.processes import kill_family
+
+_PR_SET_PDEATHSIG: Final = 1
+SAY_LAST: Final = 2.0
+"""Seconds for the last word to the node."""
+
+
+def main() -> None:
+    """Exit codes: 0 where the component ended well, 1 where it failed."""
+    if len(sys.argv) != 2 or not sys.argv[1].isdecimal() or os.getpgrp() != os.getpid():
+        sys.exit("zscout: this program is started by a node; `zscout start` starts a component")
+    logging.basicConfig(level="WARNING", format="%(levelname)s %(message)s", stream=sys.stderr)
+    # A process that stands still sees no end of file: the end of its parent wakes it.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)
+    connection = socket.socket(fileno=int(sys.argv[1]))
+    connection.set_inheritable(False)
+    try:
+        job: ComponentJob | None = channel.receive(connection, ComponentJob)
+    except BadFrame as error:
+        sys.exit(f"zscout.behaviors.components.runner: {error}")
+    if job is None:
+        return
+    ends = uvloop.run(_live(job, connection))
+    sys.exit(1 if ends.how == "failed" else 0)
+
+
+async def _live(job: ComponentJob, connection: socket.socket) -> EndReport:
+    loop = asyncio.get_running_loop()
+    # In a thread: a node that stands still must not hold up the component. In one, so that frames stay whole.
+    speaker = ThreadPoolExecutor(1)
+
+    def tell(telling: ComponentReport) -> asyncio.Future[None]:
+        return loop.run_in_executor(speaker, _send, connection, channel.pack(telling))
+
+    life = ComponentLifecycle(job, tell)
+
+    def deliver(order: Order) -> None:
+        loop.call_soon_threadsafe(life.order, order)
+
+    threading.Thread(target=_listen, args=(connection, job.tag, deliver), daemon=True).start()
+    loop.add_signal_handler(signal.SIGTERM, life.end, EndReport("failed", "ended by SIGTERM"))
+    ends = await life.run()
+    with suppress(TimeoutError):
+        async with asyncio.timeout(SAY_LAST):
+            await tell(ends)
+    if ends.how in ("moved", "superseded"):
+        # Nothing that is left here may unwind: another one runs.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
+    return ends
+
+
+def _send(connection: socket.socket, frame: bytes) -> None:
+    with suppress(OSError):  # the node is gone; whoever listens sees it
+        connection.sendall(frame)
+
+
+def _listen(connection: socket.socket, tag: str, deliver: Callable[[Order], None]) -> None:
+    """Hears orders until there is nobody any more who gives them. In a thread: it must work while the
+    component computes."""
+    try:
+        while True:
+            order: Order | None = channel.receive(connection, Order)
+            if order is None:
+                break
+            deliver(order)
+    except (BadFrame, RuntimeError):  # the latter: the loop is closed
+        pass
+    finally:
+        die(tag)
+
+
+def die(tag: str) -> None:
+    """Kills all processes of this component, this one last."""
+    try:
+        kill_family(tag, spare=os.getpid())
+    finally:
+        os.killpg(0, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,259 @@
+"""`zscout components`: what runs where and how it does, and what each host can start."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, ExitStack, suppress
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from zscout.cli import common, completions
+from zscout.cli.components.placing import (
+    component_named,
+    placement_object,
+    placer_of,
+    tail_of,
+    unknown,
+)
+from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView
+from zscout.cli.fleet.overview import Overview, Table, print_overview
+from zscout.cli.fleet.watching import display_for, pause, show_once
+from zscout.config.strict import BadInput
+from zscout.keyexpr import Role
+from zscout.mesh import clock
+from zscout.messages import ComponentList, ComponentUse, ListComponents, Placement
+from zscout.types import SECOND, Ns
+
+if TYPE_CHECKING:
+    from zscout.behaviors.client.client import Client
+
+ASK_NODES: Final = 1.0
+QUIET: Final = 0.3
+"""Seconds without a new host after which all have been seen."""
+STYLES: Final = {
+    "running": "green",
+    "waiting": "yellow",
+    "backing_off": "yellow",
+    "ended": "dim",
+    "given_up": "red",
+}
+
+
+@click.command()
+@click.argument("name", required=False, shell_complete=completions.components)
+@click.option("--kinds", is_flag=True, help="List what can be started, and on which hosts.")
+@click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
+@common.json_option("Print one JSON object; with --watch, one on each line.")
+def components(name: str | None, kinds: bool, watch: bool, as_json: bool) -> int:
+    """List the components of the fleet: where each runs, since when, what it uses, and why it is there.
+
+    Ended ones are listed for an hour. RESTARTS are those in a row, CORES and MEMORY what it uses with all its
+    processes; MOVES has the time that the last one took. With NAME only that one, and the end of its output
+    where it has failed. Exit code 3: no RCM.
+
+    \b
+    Examples:
+      zscout components
+      zscout components --watch
+      zscout components counter --json | jq -r .components[0].host
+      zscout components --kinds
+    """
+    if kinds and (name is not None or watch):
+        raise BadInput("--kinds lists what can be started; leave NAME and --watch out")
+    if kinds:
+        return common.run(_kinds(as_json=as_json))
+    if name is not None:
+        component_named(name)
+    return common.run(_watch(name, as_json=as_json) if watch else _once(name, as_json=as_json))
+
+
+class Listing:
+    """Components as placer, nodes and load reports describe them."""
+
+    def __init__(self, client: Client, name: str | None) -> None:
+        self.client, self.name = client, name
+        self.placer = placer_of(client, None if name is None else {name})
+        self.fleet_view = FleetView(client)
+        self._began: dict[tuple[str, int], Ns] = {}
+        """When each incarnation that runs was started, on this host's clock."""
+
+    async def find(self) -> None:
+        """All of them, with what they use. Raises NobodyThere; Failed for a name that nobody knows."""
+        await self.placer.refresh()
+        if self.name is not None and self.name not in self.placer.placements:
+            async with AsyncExitStack() as stack:
+                everyone = stack.enter_context(placer_of(self.client))
+                await everyone.refresh()
+            raise unknown(self.name, everyone.placements)
+        hosts = {one.host for one in self._running()}
+
+        def reported() -> bool:
+            found = [self.fleet_view.hosts.get(host or "") for host in hosts]
+            return all(host is not None and (host.load or not host.has(Role.LOAD)) for host in found)
+
+        await self.fleet_view.until(reported, FIND_LOADS)
+        await self.find_ages()
+
+    async def find_ages(self) -> None:
+        """Asks the nodes since when what runs has run, where that is not known."""
+        running = {(one.component, one.incarnation) for one in self._running()}
+        self._began = {key: began for key, began in self._began.items() if key in running}
+        if running <= self._began.keys():
+            return
+        for node in await ask_nodes(self.client, ListComponents(self.name)):
+            now = clock.now()
+            for view in node.components:
+                key = (view.component, view.incarnation)
+                if key in running:
+                    self._began[key] = now - round(view.uptime * SECOND)
+
+    def overview(self) -> Overview:
+        rows, styles = [], []
+        for one in self._all():
+            use, up = self._use(one), self._uptime(one)
+            rows.append(
+                (
+                    one.component,
+                    one.spec.kind,
+                    one.state.replace("_", " "),
+                    f"{one.host or '-'} > {one.to}" if one.to is not None else one.host or "-",
+                    "-" if up is None else common.span(up),
+                    str(one.restarts),
+                    str(one.moves) + (f" ({one.dead * 1000:.0f} ms)" if one.dead is not None else ""),
+                    "-" if use is None else f"{use.cpu:.2f}",
+                    "-" if use is None else f"{use.memory / 2**20:.0f} MiB",
+                    one.reason,
+                )
+            )
+            styles.append(STYLES.get(one.state, ""))
+        columns = ("NAME", "KIND", "STATE", "HOST", "UP", "RESTARTS", "MOVES", "CORES", "MEMORY", "WHY")
+        table = Table("Components", columns, rows, styles, ("KIND", "RESTARTS", "MOVES"))
+        return Overview(self._headline(), [table])
+
+    def as_object(self) -> dict[str, Any]:
+        """What `--json` prints: `cpu` in cores, `memory` in bytes, spans in seconds."""
+        found = []
+        for one in self._all():
+            use = self._use(one)
+            found.append(
+                placement_object(one)
+                | {
+                    "uptime": self._uptime(one),
+                    "cpu": None if use is None else use.cpu,
+                    "memory": None if use is None else use.memory,
+                    "processes": None if use is None else use.processes,
+                }
+            )
+        return {
+            "fleet": self.client.fleet.name,
+            "components": found,
+            "cordoned": sorted(self.placer.cordoned),
+        }
+
+    def _headline(self) -> str:
+        running = self._running()
+        hosts = len({one.host for one in running})
+        on = f" on {hosts} host{'' if hosts == 1 else 's'}" if running else ""
+        cordoned = f"; cordoned: {', '.join(sorted(self.placer.cordoned))}" if self.placer.cordoned else ""
+        return f"Fleet {self.client.fleet.name}: {len(running)} of {len(self._all())} run{on}{cordoned}"
+
+    def _all(self) -> list[Placement]:
+        return [one for _, one in sorted(self.placer.placements.items())]
+
+    def _running(self) -> list[Placement]:
+        return [one for one in self._all() if one.state in ("running", "moving")]
+
+    def _use(self, one: Placement) -> ComponentUse | None:
+        host = self.fleet_view.hosts.get(one.host or "")
+        if host is None or host.load is None or self.fleet_view.stale(host):
+            return None
+        uses = (use for use in host.load.components if use.component == one.component)
+        return next((use for use in uses if use.incarnation == one.incarnation), None)
+
+    def _uptime(self, one: Placement) -> float | None:
+        began = self._began.get((one.component, one.incarnation))
+        return None if began is None else (clock.now() - began) / SECOND
+
+
+async def ask_nodes(client: Client, asked: ListComponents) -> list[ComponentList]:
+    """The lists of the nodes that answer in time, by host."""
+    replies = await client.mesh.ask(client.mesh.keys.component_any, asked, ComponentList, timeout=ASK_NODES)
+    lists = (reply.message for reply in replies if reply.message is not None)
+    return sorted(lists, key=lambda one: one.host)
+
+
+async def _once(name: str | None, *, as_json: bool) -> int:
+    async with common.connected("components") as client:
+        listing = Listing(client, name)
+        with listing.placer:
+            await listing.find()
+        show_once(listing, as_json=as_json)
+        if name is not None and not as_json and (tail := tail_of(listing.placer.placements[name])):
+            common.print_line("\nThe end of its output:")
+            for line in tail:
+                common.print_line(line)
+    return 0
+
+
+async def _watch(name: str | None, *, as_json: bool) -> int:
+    stop = asyncio.Event()
+    async with AsyncExitStack() as stack:
+        client = await stack.enter_async_context(common.connected("components"))
+        listing = Listing(client, name)
+        placer = stack.enter_context(listing.placer)
+        stack.callback(listing.fleet_view.close)
+        await listing.find()
+
+        def end() -> None:
+            stop.set()
+            placer.changed.set()
+
+        show = display_for(stack, as_json=as_json, end=end)
+        while not stop.is_set():
+            show(listing)
+            await pause(placer.changed, stop)
+            # Without a leader what was known last is shown on.
+            await placer.try_refresh()
+            await listing.find_ages()
+    return 0
+
+
+async def _kinds(*, as_json: bool) -> int:
+    async with common.connected("components", need_rcm=False) as client:
+        with suppress(common.NobodyThere):
+            await common.see_rcm(client)
+        with ExitStack() as stack:
+            fleet_view = FleetView(client)
+            stack.callback(fleet_view.close)
+            await all_hosts_seen(fleet_view)
+        nodes = await ask_nodes(client, ListComponents())
+        fleet = client.fleet.name
+    if not nodes:
+        raise common.NobodyThere(
+            f"no host of fleet {fleet} told what it can start; start zscout-node there, or see its log"
+        )
+    if as_json:
+        hosts = [{"host": one.host, "kinds": sorted(one.kinds)} for one in nodes]
+        common.print_json({"fleet": fleet, "hosts": hosts})
+        return 0
+    kinds = sorted({kind for one in nodes for kind in one.kinds})
+    rows = [(kind, ", ".join(one.host for one in nodes if kind in one.kinds)) for kind in kinds]
+    nothing = [one.host for one in nodes if not one.kinds]
+    without = f"; nothing on {', '.join(nothing)}" if nothing else ""
+    print_overview(
+        Overview(
+            f"Fleet {fleet}: {len(kinds)} kinds can be started{without}",
+            [Table("Kinds", ("KIND", "ON"), rows, [""] * len(rows))],
+        )
+    )
+    return 0
+
+
+async def all_hosts_seen(fleet_view: FleetView) -> None:
+    """Returns when no host has come into sight for a while: links are made one after another."""
+    deadline = clock.now() + round(FIND_LOADS * SECOND)
+    while clock.now() < deadline:
+        known = set(fleet_view.hosts)
+        if not await fleet_view.until(lambda known=known: set(fleet_view.hosts) != known, QUIET):  # type: ignore[misc]
+            return

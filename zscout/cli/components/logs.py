@@ -1,0 +1,236 @@
+"""`zscout logs`: what a component wrote, and what it writes."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from contextlib import ExitStack, suppress
+from typing import Final
+
+import click
+
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
+from zscout.cli import common, completions
+from zscout.cli.components.components import all_hosts_seen
+from zscout.cli.components.placing import (
+    OVER,
+    component_named,
+    placer_of,
+    standing,
+    unknown,
+)
+from zscout.cli.fleet.fleet_view import FleetView
+from zscout.keyexpr import check_name
+from zscout.messages import Output, Placement, ReadOutput
+
+READ_TIMEOUT: Final = 2.0
+READ_EVERY: Final = 0.25
+"""Seconds between two looks for more."""
+UNKNOWN: Final = 3
+"""Looks in a row at which the placer does not know a component that has ended, until that is believed."""
+
+
+@click.command()
+@click.argument("name", shell_complete=completions.components)
+@click.option("-f", "--follow", is_flag=True, help="Go on until it has ended, wherever it moves.")
+@click.option(
+    "--lines", type=click.IntRange(0, 100_000), help="Only the last so many lines of what there is."
+)
+@click.option(
+    "--host",
+    metavar="HOST",
+    shell_complete=completions.hosts,
+    help="What it wrote there; else where it ran last.",
+)
+def logs(name: str, follow: bool, lines: int | None, host: str | None) -> int:
+    """Print the output of a component, of its running or its last incarnation.
+
+    Its host keeps the last 64 KiB of each, until zscout-node ends there. With --follow also what comes, on
+    whichever host it goes on; changes of host and its end are told on stderr. At a terminal control
+    characters are left out.
+
+    \b
+    Examples:
+      zscout logs counter
+      zscout logs counter --follow --lines 10
+      zscout logs counter --host anvil > before-it-moved.txt
+    """
+    component_named(name)
+    if host is not None:
+        check_name(host, "--host")
+    return common.run(_logs(name, follow=follow, lines=lines, host=host))
+
+
+async def _logs(name: str, *, follow: bool, lines: int | None, host: str | None) -> int:
+    async with common.connected("logs", need_rcm=False) as client:
+        with placer_of(client, {name}) as placer:
+            reader = Reader(client, placer, name, host)
+            output = await reader.first(follow=follow)
+            reader.write(last(output.text, lines))
+            if follow:
+                await reader.follow(output)
+            elif common.at_terminal() and output.text and not output.text.endswith("\n"):
+                reader.write("\n")
+    return 0
+
+
+class Reader:
+    """Reads one component's output, from one host after another. `host`: only there."""
+
+    def __init__(self, client: Client, placer: PlacerClient, name: str, host: str | None) -> None:
+        self._client, self._placer, self._name = client, placer, name
+        self._only = host is not None
+        self._host = host
+        self._incarnation = 0
+        self._at = 0
+        """Bytes that were read of this incarnation."""
+
+    @property
+    def _record(self) -> Placement | None:
+        return self._placer.placements.get(self._name)
+
+    async def first(self, *, follow: bool) -> Output:
+        """What it has written, as soon as it was started. Raises Failed, NobodyThere."""
+        try:
+            await common.see_rcm(self._client)
+            await self._placer.refresh()
+        except (common.NobodyThere, PlacerSilent):
+            # The nodes answer without an RCM as well.
+            await self._see_hosts()
+        while True:
+            if self._record is not None and self._host is None:
+                self._host = self._record.host
+            output = await self._read()
+            if output is not None:
+                return output
+            await self._see_hosts()
+            output = await self._read_anywhere()
+            if output is not None:
+                return output
+            if self._record is None or self._record.state in OVER or self._only or not follow:
+                raise await self._nothing()
+            await self._placer.wait_changed()
+
+    async def follow(self, output: Output) -> None:
+        """Writes what comes until it has ended for good."""
+        over = output.over
+        while True:
+            if over and (self._only or not await self._successor()):
+                break
+            if not over and not output.text:
+                await self._pause()
+            found = await self._read()
+            if found is None:
+                # Its host is gone or busy, or has forgotten it; the placer knows which.
+                if self._only or not await self._successor(silent=True):
+                    break
+                over = False
+                continue
+            output, over = found, found.over
+            self.write(output.text)
+        record = self._record
+        ended = standing(record) if record is not None and not self._only else "has ended"
+        self._tell(f"{self._name} {ended}")
+
+    async def _read(self) -> Output | None:
+        """What is new at its host; None where that does not answer, or knows nothing of it."""
+        if self._host is None:
+            return None
+        key = self._client.mesh.keys.component(self._host)
+        reply = await self._client.mesh.ask_one(
+            key, ReadOutput(self._name, self._at), Output, timeout=READ_TIMEOUT
+        )
+        output = reply.message if reply is not None else None
+        if output is None or output.incarnation < self._incarnation:
+            return None
+        if output.incarnation > self._incarnation:
+            begun, self._incarnation = self._incarnation, output.incarnation
+            if begun:
+                self._tell(f"{self._name} goes on on {self._host}")
+            if self._at:
+                self._at = 0
+                return await self._read()
+        if output.start > self._at and self._at:
+            self._tell(f"{output.start - self._at} bytes came too fast, and are lost")
+        self._at = output.end
+        return output
+
+    async def _read_anywhere(self) -> Output | None:
+        """The same from the host that knows its latest incarnation, whichever that is."""
+        if self._only:
+            return None
+        mesh = self._client.mesh
+        asked = ReadOutput(self._name)
+        replies = await mesh.ask(mesh.keys.component_any, asked, Output, timeout=READ_TIMEOUT)
+        found = [
+            (reply.message.incarnation, mesh.keys.host_of(reply.key))
+            for reply in replies
+            if reply.message is not None
+        ]
+        if not found:
+            return None
+        _, self._host = max(found)
+        return await self._read()
+
+    async def _successor(self, *, silent: bool = False) -> bool:
+        """Waits until it goes on somewhere, if only where it was and its host is merely `silent`; False: it
+        has ended for good. Raises NobodyThere."""
+        missed = 0
+        await self._placer.refresh()
+        while True:
+            record = self._record
+            missed = missed + 1 if record is None else 0
+            if missed >= UNKNOWN:
+                return False
+            if record is not None and record.incarnation >= self._incarnation:
+                newer = record.incarnation > self._incarnation
+                if record.state in OVER and not newer:
+                    return False
+                if (newer or silent) and record.host is not None and record.state in (*OVER, "running"):
+                    self._host = record.host
+                    return True
+            await self._placer.wait_changed()
+
+    async def _pause(self) -> None:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(READ_EVERY):
+                await self._placer.changed.wait()
+        self._placer.changed.clear()
+
+    async def _see_hosts(self) -> None:
+        with ExitStack() as stack:
+            fleet_view = FleetView(self._client)
+            stack.callback(fleet_view.close)
+            await all_hosts_seen(fleet_view)
+
+    async def _nothing(self) -> common.Failed:
+        """What to raise where there is no output."""
+        if self._only:
+            return common.Failed(
+                f"{self._host} knows no output of {self._name}; leave --host out to see where it ran last"
+            )
+        if self._record is not None:
+            return common.Failed(
+                common.clean(f"no host knows any output of {self._name}: it {standing(self._record)}")
+            )
+        with placer_of(self._client) as everyone:
+            await everyone.refresh()
+        return unknown(self._name, everyone.placements)
+
+    def write(self, text: str) -> None:
+        """To stdout, as it is; at a terminal without what could draw on it."""
+        if common.at_terminal():
+            text = "".join(char if char.isprintable() or char in "\n\t" else " " for char in text)
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+    def _tell(self, text: str) -> None:
+        common.print_line(common.clean(f"-- {text}"), sys.stderr)
+
+
+def last(text: str, lines: int | None) -> str:
+    """The last lines of a text; all of them for None."""
+    if lines is None:
+        return text
+    return "".join(text.splitlines(keepends=True)[-lines:]) if lines else ""

@@ -1,0 +1,349 @@
+"""`zscout start` and `zscout stop`: have a component run somewhere, and end it."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import sys
+from collections.abc import Sequence
+from decimal import Decimal
+from typing import Any, Final
+
+import click
+import msgspec
+
+from zscout.behaviors.client.placer_client import PlacerClient
+from zscout.behaviors.client.request import RequestRefused
+from zscout.cli import common, completions
+from zscout.cli.components.placing import (
+    OVER,
+    Progress,
+    component_named,
+    placement_object,
+    placer_of,
+    standing,
+    tail_of,
+    unknown,
+)
+from zscout.cli.requests.arguments import Duration
+from zscout.config.strict import BadInput, quoted
+from zscout.keyexpr import check_name
+from zscout.messages import (
+    MAX_COMPONENT_NAME,
+    MAX_LABELS,
+    MAX_PARAMS_SIZE,
+    MAX_RANKED,
+    ComponentSpec,
+    EndComponent,
+    ListPlacements,
+    PlaceComponent,
+    Placement,
+    Placements,
+)
+from zscout.types import METRICS, POLICIES
+
+MAX_BYTES: Final = 1 << 60
+MAX_CORES: Final = 1_000_000
+RESTARTS: Final = ("never", "on-failure", "always")
+
+_SIZE: Final = re.compile(r"([0-9]{1,19}(?:\.[0-9]{1,6})?)([KMGT]?)i?B?", re.IGNORECASE)
+_POWERS: Final = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
+
+
+class Size(click.ParamType[int]):
+    """Bytes from `500M`, `1.5G` or `1048576`: K, M, G, T are powers of 1024."""
+
+    name = "size"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        return value if isinstance(value, int) else parse_size(str(value), param.opts[0] if param else "size")
+
+
+class Cores(click.ParamType[float]):
+    """Cores of a processor, from `0.5` or `2`."""
+
+    name = "cores"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        what = param.opts[0] if param else "cores"
+        try:
+            cores = float(value)
+        except ValueError:
+            cores = math.nan
+        if not 0 < cores <= MAX_CORES:
+            raise BadInput(f"{what}: {quoted(str(value))} is no number of cores; write one, as in 0.5 or 2")
+        return cores
+
+
+def parse_size(text: str, what: str) -> int:
+    """Bytes, as `Size` has them. Raises BadInput."""
+    found = _SIZE.fullmatch(text)
+    size = int(Decimal(found[1]) * (1 << _POWERS[found[2].upper()])) if found else 0
+    if not 0 < size <= MAX_BYTES:
+        raise BadInput(f"{what}: {quoted(text)} is no size; write bytes, or with a unit: 500M, 1.5G")
+    return size
+
+
+def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
+    """The parameters of a component: a JSON object, and `KEY=VALUE` over it; a VALUE that is not JSON is a
+    text. Raises BadInput."""
+    params: dict[str, Any] = {}
+    if given is not None:
+        try:
+            params = msgspec.json.decode(given, type=dict[str, Any])
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            raise BadInput(
+                f'--params: {quoted(given)} is not a JSON object; write one, as in {{"a": 1}}'
+            ) from None
+    seen: set[str] = set()
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        if not key or not equals:
+            raise BadInput(f"--set {quoted(setting)} sets nothing; write KEY=VALUE")
+        if key in seen:
+            raise BadInput(f"--set: {quoted(key)} is given twice; give it once")
+        seen.add(key)
+        params[key] = _value(value)
+    try:
+        size = len(msgspec.json.encode(params))
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        raise BadInput("the parameters can't be written as JSON; mend --set or --params") from None
+    if size > MAX_PARAMS_SIZE:
+        raise BadInput(f"the parameters have {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are taken")
+    return params
+
+
+def _value(text: str) -> Any:
+    try:
+        return msgspec.json.decode(text)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return text
+
+
+@click.command()
+@click.argument("kind", shell_complete=completions.kinds)
+@click.option("--name", metavar="NAME", help="What the component is called. Default: its kind.")
+@click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON."
+)
+@click.option("--params", metavar="JSON", help="All parameters, as a JSON object.")
+@click.option(
+    "--host",
+    "hosts",
+    multiple=True,
+    metavar="HOST",
+    shell_complete=completions.hosts,
+    help="Run nowhere but there; given several times, on one of them.",
+)
+@click.option("--label", "labels", multiple=True, metavar="LABEL", help="What its host must have.")
+@click.option("--memory", type=Size(), default=0, help="What its host must have available, as in 500M.")
+@click.option("--metric", type=click.Choice(METRICS), default="composite", help="What hosts are judged by.")
+@click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How one is chosen of them.")
+@click.option(
+    "--restart",
+    type=click.Choice(RESTARTS),
+    default="on-failure",
+    show_default=True,
+    help="Whether it is started again when it has ended.",
+)
+@click.option("--memory-limit", type=Size(), default=0, help="What it may use at most, as in 500M.")
+@click.option("--cpu-limit", type=Cores(), help="Cores that it may use at most, as in 0.5.")
+@click.option("--no-wait", is_flag=True, help="Don't wait until it runs.")
+@click.option("--timeout", type=Duration(), help="Wait at most so long until it runs, then exit with 1.")
+@common.json_option("Print one JSON object.")
+def start(
+    kind: str, name: str | None, no_wait: bool, timeout: Decimal | None, as_json: bool, **wanted: Any
+) -> int:
+    """Have a component run on the best host of the fleet, and keep it running.
+
+    KIND is the name of what is installed on the hosts: zscout components --kinds lists them. The component
+    stays placed when this command ends, also by Ctrl-C or --timeout: it is started as soon as a host will do,
+    and elsewhere when its host dies, until zscout stop. Asked for again with the same settings, it is not
+    started twice.
+
+    \b
+    Exit code: 0 it runs, or has completed already; 1 it was refused or given up, or
+    did not run in time; 3 no RCM. The last output of one that is given up goes to stderr.
+
+    \b
+    Examples:
+      zscout start counter
+      zscout start counter --name blue --set rc=robot/scout33 --set period=0.5
+      zscout start spin --params '{"cpu": 0.5}' --label gpu --memory 2G --cpu-limit 1
+      zscout start counter --host anvil --restart never --timeout 30
+    """
+    called = gather_name(kind, name)
+    spec = gather_spec(kind, **wanted)
+    seconds = None if timeout is None else float(timeout)
+    return common.run(_start(called, spec, wait=not no_wait, timeout=seconds, as_json=as_json))
+
+
+def gather_name(kind: str, name: str | None) -> str:
+    """What the component is called. Raises BadName, BadInput."""
+    check_name(kind, "kind")
+    called = check_name(kind if name is None else name, "--name")
+    if len(called) > MAX_COMPONENT_NAME:
+        raise BadInput(
+            f"the name {quoted(called)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name"
+        )
+    return called
+
+
+def gather_spec(
+    kind: str,
+    *,
+    settings: Sequence[str],
+    params: str | None,
+    hosts: Sequence[str],
+    labels: Sequence[str],
+    restart: str,
+    cpu_limit: float | None,
+    **same: Any,
+) -> ComponentSpec:
+    """What is asked for, checked before anybody is asked. Raises BadName, BadInput."""
+    for host in hosts:
+        check_name(host, "--host")
+    for label in labels:
+        check_name(label, "--label")
+    # In order, as the placer lists them.
+    hosts, labels = sorted(set(hosts)), sorted(set(labels))
+    if len(hosts) > MAX_RANKED:
+        raise BadInput(f"{len(hosts)} hosts; name at most {MAX_RANKED}, or give them a label")
+    if len(labels) > MAX_LABELS:
+        raise BadInput(f"{len(labels)} labels; at most {MAX_LABELS} are taken")
+    return ComponentSpec(
+        kind=kind,
+        params=gather_params(params, settings),
+        restart=restart.replace("-", "_"),  # type: ignore[arg-type]
+        labels=labels,
+        hosts=hosts or None,
+        cpu_limit=cpu_limit or 0.0,
+        **same,
+    )
+
+
+async def _start(name: str, spec: ComponentSpec, *, wait: bool, timeout: float | None, as_json: bool) -> int:
+    stays = f"{name} stays placed; to end it: zscout stop {name}"
+    async with common.connected("start") as client:
+        with Progress(quiet=as_json) as shown, placer_of(client, {name}) as placer:
+
+            def late() -> str:
+                record = placer.placements.get(name)
+                now = f" {standing(record)};" if record is not None else ""
+                return f"{name} does not run after {common.span(timeout or 0)}:{now} {stays}"
+
+            await placer.refresh()
+            before = placer.placements.get(name)
+            placement = await _place(placer, name, spec, before)
+            if wait:
+                async with shown.within(timeout, late, stays):
+                    placement = await _until_settled(placer, shown, name, spec)
+    if as_json:
+        common.print_json(placement_object(placement))
+    if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
+        for line in tail_of(placement):
+            common.print_line(line, sys.stderr)
+        raise common.Failed(f"{name} {standing(placement)}")
+    ran = before is not None and before.state == placement.state == "running"
+    if placement.state == "running" or not wait:
+        shown.say(f"{name} {'already ' if ran else ''}{standing(placement)}")
+    else:
+        shown.say(f"{name} {standing(placement)}")
+    return 0
+
+
+async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: Placement | None) -> Placement:
+    """Has it placed, without waiting for what comes of that. Raises Failed."""
+    known = before.incarnation if before is not None else 0
+
+    def done(record: Placement) -> bool:
+        return record.spec == spec and (record.state not in OVER or record.incarnation > known)
+
+    try:
+        return await placer.request_once(PlaceComponent(name, spec, wait=0.0), done)
+    except RequestRefused as refused:
+        if refused.code != "exists":
+            raise
+        raise common.Failed(
+            f"{name} exists already, as another kind or with other settings; give this one another --name, "
+            f"or end that one first: zscout stop {name}"
+        ) from None
+
+
+async def _until_settled(placer: PlacerClient, shown: Progress, name: str, spec: ComponentSpec) -> Placement:
+    """Tells how it goes until it runs, or will not. Raises Failed."""
+    while True:
+        placement = placer.placements.get(name)
+        if placement is None:
+            # A new placer that does not know it: placed again it is not placed twice.
+            placement = await _place(placer, name, spec, None)
+        if placement.state == "running" or placement.state in OVER:
+            return placement
+        shown.update(f"{name} {standing(placement)}")
+        await placer.wait_changed()
+
+
+@click.command()
+@click.argument("names", nargs=-1, required=True, metavar="NAME...", shell_complete=completions.components)
+@click.option("--timeout", type=Duration(), help="Wait at most so long for the end, then exit with 1.")
+@common.json_option("Print one JSON object.")
+def stop(names: Sequence[str], timeout: Decimal | None, as_json: bool) -> int:
+    """End components for good: they are asked to end, and killed if they don't.
+
+    Returns when they have ended. What they held is given back. One that has ended before is no error.
+
+    \b
+    Examples:
+      zscout stop counter
+      zscout stop blue green --timeout 10
+    """
+    wanted = sorted({component_named(name) for name in names})
+    return common.run(_stop(wanted, None if timeout is None else float(timeout), as_json=as_json))
+
+
+async def _stop(names: list[str], timeout: float | None, *, as_json: bool) -> int:
+    stays = f"{', '.join(names)} will be stopped all the same; zscout components tells how that goes"
+    async with common.connected("stop") as client:
+        with Progress(quiet=as_json) as shown, placer_of(client, names) as placer:
+            await placer.refresh()
+
+            def lasting() -> list[str]:
+                records = (placer.placements.get(name) for name in names)
+                return [
+                    f"{one.component} {standing(one)}" for one in records if one and one.state not in OVER
+                ]
+
+            def late() -> str:
+                return f"after {common.span(timeout or 0)} {'; '.join(lasting())}; {stays}"
+
+            async with shown.within(timeout, late, stays):
+                ends = await asyncio.gather(*(_end(placer, name) for name in names), return_exceptions=True)
+                while lasting():
+                    shown.update("; ".join(lasting()))
+                    await placer.wait_changed()
+            last = {end.component: end for end in ends if isinstance(end, Placement)}
+            last |= {name: record for name, record in placer.placements.items() if name in last}
+    if as_json:
+        common.print_json({"components": [placement_object(one) for one in last.values()]})
+    for one in last.values():
+        shown.say(f"{one.component} {standing(one)}")
+    failures = [end for end in ends if isinstance(end, BaseException)]
+    # All of one kind as a rule; what can't be mended here comes first.
+    known = (common.Failed, RequestRefused)
+    failures.sort(key=lambda failure: isinstance(failure, known))
+    if len(failures) > 1 and isinstance(failures[0], known):
+        raise common.Failed("; ".join(map(str, failures)))
+    if failures:
+        raise failures[0]
+    return 0
+
+
+async def _end(placer: PlacerClient, name: str) -> Placement:
+    try:
+        return await placer.request_once(EndComponent(name, wait=0.0), lambda record: not record.wanted)
+    except RequestRefused as refused:
+        if refused.code != "unknown_component":
+            raise
+    everyone = await placer.request(ListPlacements(), Placements)
+    raise unknown(name, (one.component for one in everyone.components))

@@ -1,0 +1,113 @@
+"""`zscout keys`: what is alive on the mesh, and the key expressions that each serves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from zscout.cli import common
+from zscout.cli.fleet.fleet_view import FleetView
+from zscout.keyexpr import Keys, Role, Sender, Token
+
+
+@click.command()
+@common.json_option("Print one JSON object.")
+def keys(as_json: bool) -> None:
+    """List who is alive on the mesh, by host, and the keys that each serves, publishes or hears.
+
+    For writing a client in another language, or access rules, and to see whether two hosts see each other.
+    HOW: `query` is answered, `put` published, `hear` subscribed to. Exit code 3: nobody is there.
+
+    \b
+    Examples:
+      zscout keys
+      zscout keys --json | jq -r '.alive[].keys[].key'
+    """
+    common.run(_list(as_json))
+
+
+async def _list(as_json: bool) -> None:
+    async with common.connected("keys", need_rcm=False) as client:
+        fleet_view = FleetView(client)
+        sharable: set[str] | None = None
+        try:
+            state = await fleet_view.settled(loads=False)
+            sharable = {view.rc for view in state.rcs if view.sharable}
+        except common.NobodyThere:
+            if not fleet_view.hosts:
+                raise
+        fleet_view.close()
+        tokens = sorted(token for host in fleet_view.hosts.values() for token in host.tokens)
+        own, links = client.mesh.keys, client.mesh.links()
+        if as_json:
+            alive = [
+                {**token._asdict(), "token": own.alive(token), "keys": served(own, token, sharable)}
+                for token in tokens
+            ]
+            common.print_json({"fleet": own.fleet, "base": own.base, "links": links, "alive": alive})
+        else:
+            _print(own, tokens, links, sharable)
+
+
+def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str, Any]]:
+    """The keys behind a token: `how` is query (it answers), put (it publishes) or hear (it subscribes).
+
+    `sharable` names the RCs that vote; None where nobody knows, so that all may."""
+    match token.role:
+        case Role.RCM:
+            found = [
+                ("query", own.schedule_any, "request, cancel, release, hand over"),
+                ("query", own.rcm_state, "who holds, who waits and why"),
+                ("put", own.grants, "holders of each RC touched, revocations, heartbeat"),
+                ("put", own.notice_any, "what becomes of each ARC, to its client"),
+                ("query", own.rank, "the best hosts for a component"),
+                ("query", own.placer, "place, stop, migrate, drain, uncordon, list"),
+                ("put", own.placements, "how components stand, at each change"),
+            ]
+        case Role.NODE:
+            found = [("query", own.component(token.host), "components here: start, stop, list, logs, move")]
+        case Role.RC:
+            found = [
+                ("query", own.command_any(token.name), "do this, under a grant"),
+                ("query", own.rc_state(token.name), "holders, term, health"),
+                ("put", own.rc_state(token.name), "the same, at each change"),
+                ("hear", own.grants, "who holds it from now on"),
+            ]
+            if sharable is None or token.name in sharable:
+                found.insert(0, ("query", own.vote(token.name), "would it carry these holders"))
+        case Role.LOAD:
+            found = [("put", own.load(token.host), "load report, once a second")]
+        case Role.CLIENT:
+            sender = Sender(token.host, token.name)
+            found = [
+                ("query", own.requests(sender), "its open requests"),
+                ("hear", own.notice(sender), "what becomes of them"),
+            ]
+        case Role.CANDIDATE | Role.RECORDER:
+            found = [
+                ("hear", own.grants, "who holds what"),
+                ("hear", own.placements, "how components stand"),
+            ]
+        case _:
+            found = []
+    return [{"how": how, "key": key, "what": what} for how, key, what in found]
+
+
+def _print(own: Keys, tokens: list[Token], links: int, sharable: set[str] | None) -> None:
+    common.print_line(
+        f"Fleet {own.fleet}: {len(tokens)} alive, {links} links; all keys lie under {own.base}/"
+    )
+    rows: list[tuple[str, ...]] = []
+    # Two lives of one name are two tokens, and serve the same keys.
+    for token in {token[:3]: token for token in tokens}.values():
+        keys = served(own, token, sharable) or [{"how": "-", "key": "-", "what": "it is alive"}]
+        for number, key in enumerate(keys):
+            # People see at once whom a key belongs to; programs want it on each line.
+            who = token[:3] if number == 0 or not common.at_terminal() else ("", "", "")
+            rows.append((*who, key["how"], key["key"].removeprefix(f"{own.base}/"), key["what"]))
+    common.print_line("")
+    columns: tuple[str, ...] = ("HOST", "ROLE", "NAME", "HOW", "KEY", "WHAT")
+    if common.at_terminal() and common.narrow():
+        columns, rows = columns[:-1], [row[:-1] for row in rows]
+    common.print_table(columns, rows)

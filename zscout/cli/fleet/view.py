@@ -1,0 +1,191 @@
+"""`zscout view`: a recording, or the fleet live, in the Rerun viewer: its own window, or a browser's."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import os
+import socket
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+import click
+
+from zscout.cli import common
+from zscout.cli.fleet.children import (
+    Child,
+    child,
+    first_to_end,
+    viewer_binary,
+)
+from zscout.config.node import RecorderConfig
+from zscout.config.strict import BadInput, quoted
+from zscout.keyexpr import valid_name
+from zscout.services.recorder.process import RecorderJob, Recording, encode_job
+
+WEB_PORT: Final = 9090
+MAGIC: Final = b"RRF"
+"""How every recording begins."""
+HOSTING: Final = "Hosting a web-viewer at"
+
+
+@click.command()
+@click.argument("file", required=False, type=click.Path(path_type=Path))
+@click.option("--web", is_flag=True, help="Serve the viewer to a browser, and print the address to open.")
+@click.option(
+    "--bind",
+    metavar="IP",
+    default="127.0.0.1",
+    show_default=True,
+    help="Where web page and live stream are served; anything but loopback shows them to other hosts.",
+)
+@click.option(
+    "--port",
+    type=click.IntRange(1, 65_535),
+    help=f"Port of the web page, or without --web of the live stream. [default: {WEB_PORT} if free, or any]",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("runs"),
+    show_default=True,
+    help="Without FILE: the folder in which the live recording is kept.",
+)
+@common.json_option("Print one JSON object as soon as it is served or recorded: url, live, file.")
+def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path, as_json: bool) -> None:
+    """Open the recording FILE (.rrd), or record the fleet and show it live.
+
+    The viewer is a window of its own, which ends the command when it is closed. On a host without a display
+    use --web. Ctrl-C ends everything that was started; a live recording is complete then.
+
+    \b
+    Examples:
+      zscout view
+      zscout view --web
+      zscout view runs/lab.rrd
+      zscout view --web --json | jq -r --unbuffered .url
+    """
+    try:
+        address = ipaddress.ip_address("127.0.0.1" if bind == "localhost" else bind)
+    except ValueError:
+        raise BadInput(f"--bind: {quoted(bind)} is not an IP address; write one, as in 127.0.0.1") from None
+    if file is not None:
+        _check(file)
+        file = file.absolute()  # it may begin with a dash
+    if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise common.Failed(
+            "no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser"
+        )
+    common.run(_view(file, web, str(address), port, out, as_json=as_json))
+
+
+async def _view(
+    file: Path | None, web: bool, bind: str, port: int | None, out: Path, *, as_json: bool
+) -> None:
+    # The page comes last, so what it shows needs its own port first.
+    async with _source(file, bind, None if web else port, out) as (recording, recorder):
+        children = [recorder] if recorder is not None else []
+        shown = recording.url or recording.file
+        if not as_json and recorder is not None:
+            common.print_line(f"Recording to {recording.file}")
+            common.print_line(f"Live at {recording.url}")
+        address: str | None = None
+        command = [str(viewer_binary())]
+        if not web:
+            command += ["--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen"]
+            command += ["--connect", shown] if file is None else [shown]
+        else:
+            page = free_port(bind, port) if port is not None else free_port(bind, WEB_PORT, 0)
+            stream = free_port(bind, 0)
+            command += ["--serve-web", "--bind", bind, "--web-viewer-port", str(page), "--port", str(stream)]
+            command += [shown]
+        async with child("the viewer", command, {"RUST_LOG": "info" if web else "error"}) as viewer:
+            if web:
+                await viewer.says(HOSTING)
+                source = shown if file is None else f"rerun+http://{_host(bind)}:{stream}/proxy"
+                url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
+                address = f"http://{_host(bind)}:{page}/?url={url}&renderer=webgl&hide_welcome_screen=1"
+            if as_json:
+                common.print_json({"url": address, "live": recording.url, "file": recording.file})
+            elif web:
+                common.print_line(f"Open {address}")
+                common.print_line("Ctrl-C ends")
+            await first_to_end([viewer, *children])
+
+
+@asynccontextmanager
+async def _source(
+    file: Path | None, bind: str, port: int | None, out: Path
+) -> AsyncIterator[tuple[Recording, Child | None]]:
+    """What the viewer opens, and the recorder behind it where that is a live stream."""
+    if file is not None:
+        yield Recording(str(file), None), None
+        return
+    fleet = common.the_fleet()
+    host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
+    job = RecorderJob(RecorderConfig(out, bind, port or 0), fleet, host)
+    command = [sys.executable, "-m", "zscout.services.recorder"]
+    async with child("the recorder", command, {}, job=encode_job(job)) as recorder:
+        recording = await recorder.recording()
+        if recording.url is None:
+            raise common.Failed("the recorder serves no live stream; report this as a bug")
+        alone = asyncio.create_task(_say_if_alone())
+        try:
+            yield recording, recorder
+        finally:
+            alone.cancel()
+            await asyncio.gather(alone, return_exceptions=True)
+
+
+async def _say_if_alone() -> None:
+    """Without an RCM the view is empty: a line tells so, and it may fill later."""
+    try:
+        async with common.connected("view"):
+            pass
+    except common.NobodyThere as error:
+        common.print_line(f"zscout: {error}", sys.stderr)
+
+
+def _check(file: Path) -> None:
+    """Raises BadInput where FILE can't be a recording."""
+    try:
+        if not file.is_file():
+            raise BadInput(
+                f"{file}: there is no such file; recordings of nodes and of zscout view lie in runs/"
+            )
+        with file.open("rb") as recording:
+            begin = recording.read(len(MAGIC))
+    except OSError as error:
+        raise BadInput(
+            f"{file}: can't be read: {error.strerror}; check the path and its permissions"
+        ) from None
+    if begin != MAGIC:
+        raise BadInput(f"{file}: is not a Rerun recording; name a .rrd file")
+    if file.suffix != ".rrd":
+        raise BadInput(f"{file}: the viewer knows a recording by its name; rename it to end in .rrd")
+
+
+def free_port(bind: str, *ports: int) -> int:
+    """The first of these ports that is free, 0 for any. Raises BadInput where all are taken."""
+    family = socket.AF_INET6 if ":" in bind else socket.AF_INET
+    reason = ""
+    for port in ports:
+        try:
+            with socket.create_server((bind, port), family=family) as server:
+                return int(server.getsockname()[1])
+        except OSError as error:
+            reason = os.strerror(error.errno or 0)
+    raise BadInput(f"can't serve on {bind}, port {ports[0]} ({reason}); choose another --port or --bind")
+
+
+def _bracketed(address: str) -> str:
+    return f"[{address}]" if ":" in address else address
+
+
+def _host(bind: str) -> str:
+    """What a browser writes for an address that is served: this host's name where that is every address."""
+    return socket.gethostname() if ipaddress.ip_address(bind).is_unspecified else _bracketed(bind)

@@ -1,0 +1,355 @@
+"""`zscout drive`: a robot in the operator's hands."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import AsyncExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from zscout.cli import common
+from zscout.cli.requests.arguments import RcName
+from zscout.config.strict import BadInput, quoted
+from zscout.mesh import clock
+from zscout.types import SECOND
+
+if TYPE_CHECKING:
+    from zscout.behaviors.client.client import Client
+    from zscout.behaviors.piloting import Pilot
+    from zscout.behaviors.teleop import Teleop
+    from zscout.services.recorder.picture_stream import PictureStream
+
+REFRESH: Final = 0.2
+"""Seconds between two drawings of the live line."""
+MAX_RATE: Final = 50.0
+HELP: Final = "arrows or wasd drive · space stops · + - speed · g gives back · q ends"
+
+
+@click.command()
+@click.argument("robot", type=RcName("robot"))
+@click.option("--radio", default="radio/*", show_default=True, type=RcName("radio", pattern=True))
+@click.option("--video", default="video/*", show_default=True, type=RcName("video", pattern=True))
+@click.option(
+    "--framegrabber", default="framegrabber/*", show_default=True, type=RcName("framegrabber", pattern=True)
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0.5, MAX_RATE),
+    default=5.0,
+    show_default=True,
+    help="Commands a second: the share of the radio that is asked for.",
+)
+@click.option(
+    "--speed",
+    type=click.FloatRange(0.1, 1.0),
+    default=0.6,
+    show_default=True,
+    help="Of the robot's top speed.",
+)
+@click.option("--stand-by", is_flag=True, help="Take the robot at the first key that drives, not at once.")
+@click.option(
+    "--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="A game pad's left stick as well."
+)
+@click.option("--no-picture", is_flag=True, help="Drive without looking.")
+@click.option("--no-view", is_flag=True, help="Open no viewer; the picture's address is printed.")
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.rrd",
+    help="Keep what was seen.",
+)
+@common.json_option("Print JSON lines: taken, waiting, free, and what came of it.")
+def drive(robot: str, as_json: bool, **options: Any) -> int:
+    """Take ROBOT with radio, video channel and framegrabber, and drive it.
+
+    Asks at the fleet's operator priority, without a question: who holds them is preempted,
+    and goes on when you give back: with g or q, or when this terminal dies. The robot
+    stops whenever you let go of the keys. The picture is shown in the Rerun viewer; its
+    address is printed, for a host without a display.
+
+    Keys: arrows or w a s d drive, space stops, + and - change the speed, g gives the
+    robot back and the next key that drives takes it again, q ends. On a pad the left
+    stick drives, button 0 stops, button 1 gives back.
+
+    \b
+    Examples:
+      zscout drive robot/scout33
+      zscout drive scout33 --stand-by --rate 10
+      zscout drive robot/scout33 --pad /dev/input/js0 --record runs/scout33.rrd
+    """
+    if not sys.stdin.isatty():
+        raise BadInput("zscout drive reads keys: run it at a terminal, its standard input is none")
+    _check_file(options["record"])
+    return common.run(_drive(robot, as_json=as_json, **options))
+
+
+def _check_file(path: Path | None) -> None:
+    """Nobody is preempted for a recording that can't be written. Raises BadInput."""
+    if path is None:
+        return
+    if path.suffix != ".rrd":
+        raise BadInput(f"--record {path}: viewers know a recording by its name; let it end in .rrd")
+    there = path.exists()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()
+    except OSError as error:
+        why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise BadInput(f"--record {path}: can't be written ({why}); give another file") from None
+    if not there:
+        path.unlink()
+
+
+async def _drive(
+    robot: str,
+    *,
+    radio: str,
+    video: str,
+    framegrabber: str,
+    rate: float,
+    speed: float,
+    stand_by: bool,
+    pad: Path | None,
+    no_picture: bool,
+    no_view: bool,
+    record: Path | None,
+    as_json: bool,
+) -> int:
+    from zscout.behaviors.piloting import Pilot
+    from zscout.behaviors.sensor_net.held_robot import RobotNeeds
+    from zscout.behaviors.teleop import Teleop
+
+    fleet = common.the_fleet()
+    async with AsyncExitStack() as stack:
+        client = await stack.enter_async_context(common.connected("drive", fleet))
+        state = await common.state_of(client)
+        if all(rc.rc != robot for rc in state.rcs):
+            there = sorted(rc.rc for rc in state.rcs if rc.rc.startswith("robot/"))
+            raise BadInput(
+                f"there is no {quoted(robot)} on the mesh; there are: {', '.join(there) or 'no robots'}"
+            )
+        pilot, end = Pilot(speed), asyncio.Event()
+        needs = RobotNeeds(robot, radio, video, framegrabber, rate)
+        console = stack.enter_context(_Console(robot, as_json=as_json))
+        teleop = Teleop(
+            client, needs, pilot, priority=fleet.operator_priority, changed=lambda: console.update(teleop)
+        )
+        hands = Hands(teleop, end)
+        stack.enter_context(hands.at_the_terminal())
+        if pad is not None:
+            stack.enter_context(hands.at_the_pad(pad))
+        if not stand_by:
+            teleop.take()
+
+        async def look() -> None:
+            stream = await _stream(stack, robot, record, console, view=not no_view)
+            await show_pictures(client, teleop, stream, console)
+
+        tasks = [asyncio.create_task(teleop.run()), asyncio.create_task(console.keep_drawing(teleop))]
+        if not no_picture:
+            tasks.append(asyncio.create_task(look()))
+        ending = asyncio.create_task(end.wait())
+        try:
+            done, _ = await asyncio.wait([ending, *tasks], return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in [ending, *tasks]:
+                task.cancel()
+            await asyncio.gather(ending, *tasks, return_exceptions=True)
+    console.event("ended", "given back")
+    return 0
+
+
+async def _stream(
+    stack: AsyncExitStack, robot: str, record: Path | None, console: _Console, *, view: bool
+) -> PictureStream:
+    """The picture's stream, and a window onto it where there is a display."""
+    from zscout.cli.fleet.children import child, viewer_binary
+    from zscout.cli.fleet.view import free_port
+
+    # Rerun takes seconds to load on a busy machine, and the operator may be in a hurry.
+    await asyncio.to_thread(importlib.import_module, "zscout.services.recorder.picture_stream")
+    from zscout.services.recorder.picture_stream import PictureStream
+
+    stream = stack.enter_context(PictureStream(robot, free_port("127.0.0.1", 0), record))
+    window = view and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    words = f"picture at {stream.url}" if window else f"see the picture with: rerun {stream.url}"
+    console.event("picture", words, url=stream.url)
+    if window:
+        command = [str(viewer_binary()), "--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen"]
+        await stack.enter_async_context(
+            child("the viewer", [*command, "--connect", stream.url], {"RUST_LOG": "error"})
+        )
+    return stream
+
+
+async def show_pictures(client: Client, teleop: Teleop, stream: PictureStream, console: _Console) -> None:
+    """Passes the newest picture of the held framegrabber on, without end."""
+    zero = clock.now()
+    while True:
+        robot, held = teleop.robot, teleop.held
+        if robot is None or held is None:
+            await asyncio.sleep(REFRESH)
+            continue
+        stream.event(
+            (clock.now() - zero) / SECOND, f"{robot.robot} is yours, seen through {robot.framegrabber}"
+        )
+        with client.mesh.frames(client.mesh.keys.frame(robot.framegrabber)) as frames:
+            while teleop.robot is robot:
+                frame = await frames.next(REFRESH)
+                if frame is not None and frame.head.grant == held.grant:
+                    stream.show((frame.arrived - zero) / SECOND, frame.jpeg)
+                    console.seen(frame.arrived)
+
+
+class Hands:
+    """What keys and pad do."""
+
+    def __init__(self, teleop: Teleop, end: asyncio.Event) -> None:
+        self.teleop, self._end = teleop, end
+
+    @property
+    def pilot(self) -> Pilot:
+        return self.teleop.pilot
+
+    def key(self, key: bytes) -> None:
+        """A key was typed."""
+        from zscout.cli.operator.drive_keys import KEYS
+
+        if key in KEYS:
+            self.pilot.press(clock.now() / SECOND, KEYS[key])
+            self.teleop.take()
+        elif key in (b" ", b"x"):
+            self.pilot.stop()
+        elif key in (b"+", b"="):
+            self.pilot.faster(1)
+        elif key in (b"-", b"_"):
+            self.pilot.faster(-1)
+        elif key == b"g":
+            self.teleop.give_back()
+        elif key in (b"q", b"\x04"):
+            self._end.set()
+        self.teleop.wake()
+
+    def moved(self, forward: float, right: float) -> None:
+        """The pad's stick was moved."""
+        self.pilot.stick(clock.now() / SECOND, forward, right)
+        if not self.pilot.wheels(clock.now() / SECOND).still:
+            self.teleop.take()
+        self.teleop.wake()
+
+    def button(self, number: int) -> None:
+        """A button of the pad was pressed."""
+        if number == 0:
+            self.pilot.stop()
+            self.teleop.wake()
+        elif number == 1:
+            self.teleop.give_back()
+
+    @contextmanager
+    def at_the_terminal(self) -> Iterator[None]:
+        from zscout.cli.operator.drive_keys import typed_keys
+
+        with typed_keys(self.key, self._end.set):
+            yield
+
+    @contextmanager
+    def at_the_pad(self, device: Path) -> Iterator[None]:
+        from zscout.cli.operator.drive_keys import game_pad
+
+        with game_pad(device, self.moved, self.button):
+            yield
+
+
+class _Console:
+    """What the operator sees: a live line, or JSON lines. A context manager."""
+
+    def __init__(self, robot: str, *, as_json: bool) -> None:
+        self._robot, self._as_json = robot, as_json
+        self._pictures: list[int] = []
+        self._live: Any = None
+        self._told: object = None
+
+    def __enter__(self) -> _Console:
+        if not self._as_json and common.at_terminal():
+            from rich.live import Live
+
+            self._live = Live(console=common.console(), auto_refresh=False, transient=True)
+            self._live.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._live is not None:
+            # A terminal that is gone need not be tidied.
+            with suppress(OSError):
+                self._live.stop()
+            self._live = None
+
+    def event(self, event: str, words: str, **more: Any) -> None:
+        if self._as_json:
+            common.print_json({"event": event, "robot": self._robot, **more})
+        elif self._live is not None:
+            with suppress(OSError):
+                self._live.console.print(common.clean(words), soft_wrap=True)
+        else:
+            common.print_line(common.clean(words))
+
+    def update(self, teleop: Teleop) -> None:
+        """The state has changed, or the first command was obeyed."""
+        now = (teleop.state, teleop.why, teleop.takeover)
+        if now == self._told:
+            return
+        before, self._told = self._told, now
+        if teleop.state == "driving" and teleop.takeover is not None:
+            self.event(
+                "driving",
+                f"{self._robot} obeys, {1000 * teleop.takeover:.0f} ms after you took it",
+                takeover=teleop.takeover,
+            )
+        elif teleop.state == "driving":
+            self.event(
+                "taken", f"{self._robot} is yours: {', '.join(teleop.held.rcs if teleop.held else [])}"
+            )
+        elif teleop.state == "waiting":
+            self.event("waiting", f"{self._robot} waits: {teleop.why}", why=teleop.why)
+        elif before is not None:
+            self.event("free", f"{self._robot} is given back")
+
+    def seen(self, at: int) -> None:
+        """A picture came."""
+        self._pictures = [one for one in self._pictures if at - one < SECOND] + [at]
+
+    async def keep_drawing(self, teleop: Teleop) -> None:
+        while True:
+            self._draw(teleop)
+            await asyncio.sleep(REFRESH)
+
+    def _draw(self, teleop: Teleop) -> None:
+        if self._live is None:
+            return
+        from rich.text import Text
+
+        now = clock.now()
+        pictures = sum(now - at < SECOND for at in self._pictures)
+        wheels = teleop.pilot.wheels(now / SECOND)
+        line = Text()
+        colour = {"driving": "bold green", "waiting": "yellow", "free": "dim"}[teleop.state]
+        line.append(f"{self._robot}  {teleop.state}", style=colour)
+        if teleop.why:
+            line.append(f": {common.clean(teleop.why)}")
+        if teleop.robot is not None:
+            line.append(f"  wheels {wheels.left:+.1f} {wheels.right:+.1f}  speed {teleop.pilot.speed:.1f}")
+            line.append(f"  {pictures} pictures/s  {teleop.robot.sent} commands")
+            if teleop.robot.refused:
+                line.append(f", {teleop.robot.refused} refused", style="red")
+        line.append(f"\n{HELP}", style="dim")
+        # Where the terminal is gone, its keys' end says so and ends all.
+        with suppress(OSError):
+            self._live.update(line, refresh=True)

@@ -1,0 +1,277 @@
+"""`zscout watch`: the motion detector alone, on any source that OpenCV opens, to place a camera."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+from click.shell_completion import CompletionItem
+
+from zscout.cli import common
+from zscout.config.strict import BadInput
+from zscout.mesh import clock
+from zscout.types import SECOND
+
+if TYPE_CHECKING:
+    from rich.live import Live
+
+    from zscout.behaviors.perception.events import Event
+    from zscout.cli.operator.watch_source import Source
+    from zscout.services.recorder.watch_recording import WatchRecording
+
+MAX_SECONDS: Final = 1e9
+DRAWN: Final = 0.1
+"""Seconds from one live line to the next."""
+
+
+class SourceName(click.ParamType[str]):
+    """A file, URL or device, completed as a file, and by the cameras that are there."""
+
+    name = "source"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        return str(value)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        cameras = sorted(str(path) for path in Path("/dev").glob("video*"))
+        offered = [
+            CompletionItem(camera) for camera in cameras if incomplete and camera.startswith(incomplete)
+        ]
+        return offered or [CompletionItem(incomplete, type="file")]
+
+
+@click.command()
+@click.option(
+    "--source",
+    metavar="FILE|URL|DEVICE",
+    type=SourceName(),
+    required=True,
+    help="A video file, an http:// or rtsp:// address, /dev/videoN or its number.",
+)
+@common.json_option("Print one JSON object a line for each event; the summary goes to stderr.")
+@click.option(
+    "--record",
+    metavar="FILE",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write pictures, boxes and events as a Rerun recording; look at it with `zscout view FILE`.",
+)
+@click.option(
+    "--limit",
+    metavar="SECONDS",
+    type=click.FloatRange(0, MAX_SECONDS, min_open=True),
+    help="End after so many seconds of the source. Default: at its end, or at Ctrl-C.",
+)
+def watch(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
+    """Tell when something moves: one line for each event, as soon as it is over.
+
+    A file is read whole, as quickly as it goes, by its own time stamps; of a URL or device the newest picture
+    counts, and it is opened again when it fails. An event ends when nothing moved for a second. Its `start`,
+    `end` and `peak` are seconds of the source; `boxes`, [x, y, width, height] in its pixels, are what moved
+    at the peak, when that covered most; `area` is around all that moved; `frames` counts its pictures.
+    The detector adapts to the scene and has nothing to tune; docs/watching.md says what it can do.
+
+    \b
+    Examples:
+      zscout watch --source garden.avi
+      zscout watch --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
+      zscout watch --source /dev/video0 --limit 600 --record garden.rrd
+    """
+    with ExitStack() as stack:
+        ending = stack.enter_context(_Ending())
+        screen = stack.enter_context(_screen())
+        report = _WatchReport(screen, as_json=as_json)
+        from zscout.cli.operator.watch_source import open_source
+
+        opened = open_source(source, report.say)
+        stack.callback(opened.close)
+        if record is not None:
+            report.recording = _recording(stack, opened, record)
+        ending.begun = True
+        _watch(opened, report, ending, limit)
+        stack.pop_all().close()
+    report.summary()
+    if ending.signal is not None:
+        raise common.Interrupted(ending.signal)
+
+
+def _watch(source: Source, report: _WatchReport, ending: _Ending, limit: float | None) -> None:
+    from zscout.behaviors.perception.events import EventTracker
+    from zscout.behaviors.perception.motion import MotionDetector
+
+    detector, tracker = MotionDetector(), EventTracker()
+    for time, picture in source.shots():
+        if ending.signal is not None or (limit is not None and time > limit):
+            break
+        report.at = time
+        if picture is None:
+            ended = tracker.quiet(time)
+        else:
+            seen = detector.see(time, picture)
+            ended = tracker.see(time, seen)
+            report.pictures += 1
+            if report.recording is not None:
+                report.recording.picture(time, picture, seen.boxes, moving=seen.moving)
+        if ended is not None:
+            report.event(ended)
+        report.draw(source, tracker.current)
+    last = tracker.close()
+    if last is not None:
+        report.event(last)
+
+
+class _Ending:
+    """Remembers a signal that ends the watch, until the next picture. A context manager."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        self.begun = False
+        """Whether pictures come, so that there is something to sum up."""
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Ending:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # What a shell or nohup made this process ignore stays ignored.
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._heard)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _heard(self, number: int, _: FrameType | None) -> None:
+        if self.signal is not None or not self.begun:
+            # Before the first picture, and the second time, it does not wait for one.
+            raise common.Interrupted(number)
+        self.signal = number
+
+
+class _WatchReport:
+    """What people and programs read of it."""
+
+    def __init__(self, live: Live | None, *, as_json: bool) -> None:
+        self.recording: WatchRecording | None = None
+        self.at = 0.0
+        """Seconds of the source."""
+        self.pictures = 0
+        self._live = live
+        self._json = as_json
+        self._events = 0
+        self._moving = 0.0
+        self._drawn = clock.now()
+
+    def event(self, event: Event) -> None:
+        self._events += 1
+        self._moving += event.end - event.start
+        if self.recording is not None:
+            self.recording.event(event.start, _words(event))
+        if self._json:
+            self._line(_as_json(event))
+        else:
+            self._line(_words(event), "yellow")
+
+    def say(self, text: str) -> None:
+        """A word about the source, on stderr."""
+        text = common.clean(text)
+        if self.recording is not None:
+            self.recording.event(self.at, text)
+        if self._live is not None and common.at_terminal(sys.stderr):
+            self._live.console.print(text, style="red", soft_wrap=True)
+        else:
+            common.print_line(text, sys.stderr)
+
+    def draw(self, source: Source, event: Event | None) -> None:
+        """The live line, now and then."""
+        now = clock.now()
+        if self._live is None or now - self._drawn < DRAWN * SECOND:
+            return
+        self._drawn = now
+        from rich.text import Text
+
+        of = "" if source.duration is None else f" of {common.span(source.duration)}"
+        line = Text(f"{common.span(self.at)}{of}  {_many(self._events, 'event')}  ", no_wrap=True)
+        if event is None:
+            line.append("still", style="green")
+        else:
+            line.append(f"moving for {common.span(self.at - event.start)}", style="bold yellow")
+        line.append("  Ctrl-C ends", style="dim")
+        self._live.update(line, refresh=True)
+
+    def summary(self) -> None:
+        share = f" ({100 * self._moving / self.at:.0f} %)" if self.at > 0 else ""
+        line = f"{common.span(self.at)} watched, {_many(self.pictures, 'picture')}; "
+        line += f"{_many(self._events, 'event')}, motion for {common.span(self._moving)}{share}"
+        common.print_line(line, sys.stderr if self._json else sys.stdout)
+
+    def _line(self, text: str, style: str = "") -> None:
+        if self._live is not None and not self._live.console.stderr:
+            self._live.console.print(text, style=style, soft_wrap=True)
+        else:
+            common.print_line(text)
+
+
+@contextmanager
+def _screen() -> Iterator[Live | None]:
+    """The live line, where people look: at stdout, or else at stderr."""
+    here = common.at_terminal(sys.stdout)
+    if not here and not common.at_terminal(sys.stderr):
+        yield None
+        return
+    from rich.live import Live
+
+    with Live(
+        console=common.console(stderr=not here),
+        auto_refresh=False,
+        transient=True,
+        redirect_stdout=False,
+        redirect_stderr=False,
+    ) as live:
+        yield live
+
+
+def _recording(stack: ExitStack, source: Source, file: Path) -> WatchRecording:
+    from zscout.services.recorder.timeline import TimelineError
+    from zscout.services.recorder.watch_recording import WatchRecording
+
+    try:
+        return stack.enter_context(WatchRecording(source.name, file))
+    except TimelineError as error:
+        raise BadInput(f"--record: {error}") from None
+
+
+def _as_json(event: Event) -> str:
+    import json
+
+    return json.dumps(
+        {
+            "start": round(event.start, 3),
+            "end": round(event.end, 3),
+            "boxes": [list(box) for box in event.boxes],
+            "peak": round(event.peak, 3),
+            "area": list(event.area),
+            "frames": event.frames,
+            "going_on": event.going_on,
+        }
+    )
+
+
+def _words(event: Event) -> str:
+    largest = event.boxes[0]
+    things = "one thing" if len(event.boxes) == 1 else f"{len(event.boxes)} things"
+    end = "and goes on" if event.going_on else f"for {common.span(event.end - event.start)}"
+    return (
+        f"{event.start:9.2f} to {event.end:.2f} s: motion {end}, {things} at the peak, the largest "
+        f"{largest.width}x{largest.height} at {largest.x},{largest.y}"
+    )
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"

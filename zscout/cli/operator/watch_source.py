@@ -1,0 +1,188 @@
+"""Where `zscout watch` has its pictures from: files, by their own time stamps, and live sources."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zscout.behaviors.perception.motion import MAX_SIDE
+from zscout.config.strict import BadInput, quoted
+from zscout.drivers.capture import FILE_RATE, FILE_RATES, MAX_PIXELS, MISSES, Capture, kind_of, shown
+from zscout.mesh import clock
+from zscout.types import SECOND
+
+OPEN_TIMEOUT: Final = 5.0
+READ_TIMEOUT: Final = 2.0
+"""Seconds of a URL."""
+LOOK: Final = 0.2
+"""Seconds for which a live source is waited for at a time."""
+LEAST_SIDE: Final = 8
+MAX_LEAP: Final = 86_400.0
+"""Seconds from one picture of a file to the next."""
+HEAD: Final = 4096
+TEXT: Final = bytes((*range(7, 14), 27, *range(32, 256)))
+"""Bytes of which a text consists; in the HEAD of a video there are others."""
+UNTRIED: Final = ("not open yet", "open, no picture yet")
+"""A capture's health while it does not know yet."""
+
+
+class Shot(NamedTuple):
+    """A picture at `time`, seconds of the source; without one, none came until then."""
+
+    time: float
+    picture: NDArray[np.uint8] | None
+
+
+class Source(Protocol):
+    """A source that is open."""
+
+    name: str
+    duration: float | None
+    """Seconds; None where nobody knows."""
+
+    def shots(self) -> Iterator[Shot]:
+        """All pictures, to the end of the source. A live one gives an empty shot now and then."""
+        ...
+
+    def close(self) -> None: ...
+
+
+def open_source(source: str, report: Callable[[str], None]) -> Source:
+    """Opens a file, URL or device. `report` is given what becomes of a live one. Raises BadInput."""
+    if not source or "\0" in source:
+        raise BadInput("--source: it is empty; name a file, a URL or a device like /dev/video0")
+    if kind_of(source) == "file":
+        return VideoFile(Path(source))
+    return LiveSource(source, report)
+
+
+class VideoFile:
+    """A video file. Times are the file's own, from its first picture on."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises BadInput."""
+        self.name = str(path)
+        try:
+            mode = path.stat().st_mode
+            head = b""
+            if stat.S_ISREG(mode):
+                with path.open("rb") as file:
+                    head = file.read(HEAD)
+        except (OSError, ValueError) as error:
+            raise BadInput(
+                f"{quoted(self.name)} can't be read ({_reason(error)}); name a video file, a URL or a device"
+            ) from None
+        if not stat.S_ISREG(mode):
+            raise BadInput(f"{quoted(self.name)} is no file; name a video file, a URL or a device")
+        # FFmpeg draws a text as a picture, and follows playlists to wherever they point.
+        if not head or not head.translate(None, TEXT):
+            raise BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
+        # FFmpeg would write of every torn picture to stderr itself (-8: quiet).
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+        if "OPENCV_LOG_LEVEL" not in os.environ:
+            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+        # Absolute: a relative name with a colon in it would be a protocol to FFmpeg.
+        self._video = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
+        self._first = self._read() if self._video.isOpened() else None
+        if self._first is None:
+            self._video.release()
+            raise BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
+        _check(self._first, self.name)
+        rate = self._video.get(cv2.CAP_PROP_FPS)
+        self._period = 1 / (rate if FILE_RATES[0] <= rate <= FILE_RATES[1] else FILE_RATE)
+        count = self._video.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.duration = count * self._period if 1 <= count < 1e9 else None
+
+    def shots(self) -> Iterator[Shot]:
+        picture, zero, last = self._first, self._stamp(), 0.0
+        self._first = None
+        while picture is not None:
+            _check(picture, self.name)
+            yield Shot(last, picture)
+            picture = self._read()
+            at = self._stamp() - zero
+            # A stamp that is missing, goes back or leaps beyond belief is replaced by the usual step.
+            last = at if last < at <= last + MAX_LEAP else last + self._period
+
+    def close(self) -> None:
+        self._video.release()
+
+    def _stamp(self) -> float:
+        return float(self._video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
+
+    def _read(self) -> NDArray[np.uint8] | None:
+        """The next picture; None at the end. One that can't be made out is passed over."""
+        for _ in range(MISSES):
+            good, picture = self._video.read()
+            if good and picture.dtype == np.uint8:
+                return np.asarray(picture, np.uint8)
+        return None
+
+
+class LiveSource:
+    """A URL or device, as framegrabbers read it: the newest picture wins, and a source that fails is
+    opened again. Times are seconds since the first picture."""
+
+    duration: float | None = None
+
+    def __init__(self, source: str, report: Callable[[str], None]) -> None:
+        """Waits for the first picture. Raises BadInput where there is none to be had."""
+        self.name = shown(source)
+        self._report = report
+        self._capture = Capture(source, open_timeout=OPEN_TIMEOUT, read_timeout=READ_TIMEOUT)
+        self._capture.start()
+        try:
+            first = None
+            while first is None:
+                first = self._capture.wait(0, LOOK)
+                health = self._capture.health
+                if first is None and health not in (*UNTRIED, "ok"):
+                    raise BadInput(f"{health}; name a source that gives pictures")
+            _check(first.picture, self.name)
+        except BaseException:
+            self.close()
+            raise
+        self._zero = first.time
+
+    def shots(self) -> Iterator[Shot]:
+        number, missing = 0, None
+        while True:
+            taken = self._capture.wait(number, LOOK)
+            if taken is not None:
+                number = taken.number
+                at = taken.time - self._zero
+                if missing is not None:
+                    self._report(f"{self.name} gives pictures again, after {at - missing:.1f} s")
+                    missing = None
+                _check(taken.picture, self.name)
+                yield Shot(at, taken.picture)
+                continue
+            now = clock.now() / SECOND - self._zero
+            health = self._capture.health
+            if health != "ok" and missing is None:
+                missing = now
+                self._report(f"{health}; opening it again")
+            yield Shot(now, None)
+
+    def close(self) -> None:
+        self._capture.stop()
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+def _check(picture: NDArray[np.uint8], name: str) -> None:
+    height, width = picture.shape[:2]
+    if min(height, width) < LEAST_SIDE or max(height, width) > MAX_SIDE or height * width > MAX_PIXELS:
+        raise BadInput(
+            f"the pictures of {quoted(name)} are {width} by {height} pixels; give it ones of {LEAST_SIDE} to "
+            f"{MAX_SIDE} a side, {MAX_PIXELS // 1_000_000} million at most"
+        )

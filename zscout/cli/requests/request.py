@@ -1,0 +1,264 @@
+"""`zscout request`: waits for devices, and holds them for a time or for a command."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from typing import Any, Final
+
+import click
+
+from zscout.behaviors.client.arc import Held
+from zscout.behaviors.client.client import Client, CommandRefused
+from zscout.behaviors.client.request import OpenArc
+from zscout.cli.common import Failed, clean, connected, fleet_file, run, span
+from zscout.cli.requests.arguments import (
+    Need,
+)
+from zscout.cli.requests.contention import held_text
+from zscout.cli.requests.dry_run import foresee
+from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
+from zscout.cli.requests.run_command import RunningCommand, environment
+from zscout.cli.requests.waiting import Report
+from zscout.mesh import clock
+
+TAKEN_AWAY: Final = 75
+"""EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""
+TIME_OVER: Final = 124
+"""As `timeout` has it: the command was ended because its time was over."""
+MAX_PRIORITY: Final = 1_000_000
+LAST_WORD: Final = 0.5
+"""Seconds in which the RCM's word about a hold whose time is over arrives."""
+
+
+@click.command(cls=CommandAfterDashes)
+@click.argument("needs", nargs=-1, required=True, type=Need(), metavar="NEED...")
+@click.option(
+    "--priority",
+    type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
+    default=0,
+    show_default=True,
+    help="Higher ones preempt lower ones.",
+)
+@click.option("--keep", is_flag=True, help="Go on past the minimum runtime, until something else needs it.")
+@click.option(
+    "--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once."
+)
+@hold_options
+@click.pass_context
+def request(
+    ctx: click.Context, /, needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, **rest: Any
+) -> int:
+    """Wait until all of the devices are granted at once, then hold them.
+
+    A NEED is kind/name, and for a sharable device how it will be used:
+    radio/rf0:command_rate=5,other=1. With a * it is met by any one device whose
+    name matches: 'framegrabber/*' is any framegrabber, 'robot/scout$*' any robot
+    whose name begins so; twice the same is two of them. Quote it for the shell.
+
+    With a COMMAND, they are held while it
+    runs, for the minimum runtime at most (--keep: for longer), and given back
+    as soon as it ends. When its time is over or the grant is taken away, the
+    command's process group gets SIGTERM, and SIGKILL after the grace. Without
+    one, they are held until Ctrl-C or until the minimum runtime is over.
+
+    \b
+    The command finds in its environment:
+      ZSCOUT_ARC, ZSCOUT_ARC_ID  the ARC's name and id
+      ZSCOUT_RCS                 the devices, with spaces between
+      ZSCOUT_BOUND               which of them meets which pattern, as JSON:
+                                 {"framegrabber/*": "framegrabber/fgrab1"}
+      ZSCOUT_GRANT               the grant as JSON, to be sent with each command
+      ZSCOUT_CLIENT              who holds it: <host>/<client>
+      ZSCOUT_REMAINING           seconds until the minimum runtime is over
+      ZSCOUT_FLEET_NAME          the fleet; ZSCOUT_FLEET its file, if there is one
+
+    \b
+    Exit code: the command's own (128 + n: ended by signal n), or
+      75   the grant was taken away       124  its time was over
+      126  it can't be executed           127  there is no such command
+      1    not granted; without a command also: taken away    3  no RCM
+
+    With a COMMAND all lines of zscout go to stderr.
+
+    \b
+    Examples:
+      zscout request robot/scout33 --min-runtime 2m
+      zscout request robot/scout33 radio/rf0:command_rate=5 --keep -- ./survey.py --fast
+      zscout request framegrabber/fgrab1 --timeout 30 --again -- ./record.sh
+      zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- ./stereo.py
+      zscout request robot/scout33 --json | jq .event
+      zscout request robot/scout33 --priority 5 --dry-run
+    """
+    wanted = gather(ctx, needs, name, priority=priority, keep=keep, **rest)
+    return run(foresee(wanted) if dry_run else _request(wanted))
+
+
+async def _request(wanted: HoldOptions) -> int:
+    async with connected("request") as client:
+        return await carry_out(client, wanted)
+
+
+async def carry_out(client: Client, wanted: HoldOptions) -> int:
+    """Waits, holds, runs the command; everything is given back at the end. Returns the exit code.
+
+    Raises Failed, RequestRefused."""
+    with report_for(client, wanted) as report:
+        client.watch(report.news)
+        arc: OpenArc | None = None
+        while True:
+            try:
+                arc = await _wait(client, wanted, report, arc)
+                code = await _use(client, wanted, report, arc)
+            except CommandRefused as refused:
+                # A device did not know of the grant: the client has given it back.
+                if not wanted.again:
+                    raise Failed(f"{wanted.name}: {refused}; try again", _lost_code(wanted)) from None
+                report.event("lost", f"{wanted.name}: {refused}; asking again", {"reason": str(refused)})
+                arc = None
+                continue
+            if code is not None:
+                return code
+
+
+def report_for(client: Client, wanted: HoldOptions) -> Report:
+    stream = sys.stderr if wanted.command else sys.stdout
+    return Report(wanted.name, str(client.mesh.me), as_json=wanted.as_json, stream=stream)
+
+
+async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc | None) -> OpenArc:
+    """Until it is granted. Raises Failed where it is not."""
+    telling = asyncio.ensure_future(report.follow_wait(client))
+    try:
+        async with asyncio.timeout(float(wanted.timeout) if wanted.timeout is not None else None):
+            if arc is None:
+                arc = await client.request(
+                    wanted.name,
+                    wanted.needs,
+                    priority=wanted.priority,
+                    min_runtime=wanted.min_runtime,
+                    keep=wanted.keep,
+                    estimate=True,
+                )
+            grant = await client.granted(arc)
+    except TimeoutError:
+        why = arc.reason if arc is not None else ""
+        if arc is not None:
+            await client.end(arc)
+        line = f"{wanted.name} was not granted within {span(float(wanted.timeout or 0))}, and is cancelled"
+        report.event("ended", "", {"outcome": "timeout", "reason": why})
+        raise Failed(clean(f"{line}: {why}" if why else line)) from None
+    except asyncio.CancelledError:
+        if arc is not None:
+            await client.end(arc)
+        report.event("ended", f"{wanted.name} is cancelled", {"outcome": "cancelled"})
+        raise
+    finally:
+        telling.cancel()
+        await asyncio.gather(telling, return_exceptions=True)
+        report.hide()
+    if grant is None:
+        report.event("ended", "", {"outcome": arc.outcome, "reason": arc.reason})
+        raise Failed(clean(f"{wanted.name} was not granted: {arc.reason or arc.outcome}"))
+    return arc
+
+
+async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
+    """Under the grant. Returns the exit code, or None: it was taken away, and is to be waited for again."""
+    grant = arc.grant
+    if grant is None:  # taken away since the RCs confirmed it
+        return await _taken(client, wanted, report, arc)
+    held = Held(client, arc, grant)
+    rcs = held_text(held.rcs, held.bound)
+    length = "until it is needed elsewhere" if arc.keep else f"for {span(held.remaining)}"
+    left = round(held.remaining, 3)
+    details = {
+        "id": arc.id,
+        "grant": grant,
+        "rcs": held.rcs,
+        "bound": held.bound,
+        "remaining": left,
+        "keep": arc.keep,
+    }
+    report.event("granted", f"{arc.name} holds {rcs} {length}", details)
+    try:
+        code = await (_run(wanted, report, held, client) if wanted.command else _hold(report, held))
+    except BaseException:
+        await client.end(arc)
+        report.event("ended", f"{arc.name} gave back {rcs}", {"outcome": "released"})
+        raise
+    if code is not None:
+        await client.end(arc)
+        report.event("ended", f"{arc.name} gave back {rcs}", {"outcome": "released", "code": code})
+        return code
+    if held.active:
+        # By our clock its time is over; the RCM's own word is on its way.
+        await report.within(LAST_WORD, lambda: not held.active)
+    if held.active or report.ending.outcome == "completed":
+        arc.finish("completed", "its time is over", clock.now())
+        report.event("ended", f"the time of {arc.name} is over", {"outcome": "completed"})
+        return TIME_OVER if wanted.command else 0
+    return await _taken(client, wanted, report, arc)
+
+
+async def _hold(report: Report, held: Held) -> None:
+    """Until the hold is over."""
+    telling = asyncio.ensure_future(report.follow_hold(held.arc))
+    try:
+        await held.over()
+    finally:
+        telling.cancel()
+        await asyncio.gather(telling, return_exceptions=True)
+        report.hide()
+
+
+async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
+    """Runs the command until it ends (its code), or until the hold is over and it has been ended (None)."""
+    env = environment(
+        arc=held.arc.name,
+        arc_id=held.arc.id,
+        rcs=held.rcs,
+        bound=held.bound,
+        grant=held.grant,
+        client=client.mesh.me,
+        remaining=held.remaining,
+        fleet_name=client.fleet.name,
+        fleet_file=fleet_file(),
+    )
+    async with RunningCommand(wanted.command, env, grace=float(wanted.grace)) as command:
+        over = asyncio.ensure_future(held.over())
+        ended = asyncio.ensure_future(command.wait())
+        try:
+            await asyncio.wait({over, ended}, return_when=asyncio.FIRST_COMPLETED)
+            if ended.done():
+                if held.active:
+                    # At once: what it left running is ended afterwards, and may take its time.
+                    await client.end(held.arc)
+                return ended.result()
+            why = "its time is over" if held.active else report.ending.reason or "the grant is gone"
+            report.event("stopping", f"{wanted.command[0]} is stopped: {why}", {"reason": why})
+            await command.end()
+        finally:
+            over.cancel()
+            ended.cancel()
+    return None
+
+
+async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
+    """The grant was taken away. Raises Failed where there is no command and no second try."""
+    ending, again = report.ending, wanted.again and arc.open
+    line = f"{arc.name} lost its grant: {ending.reason or ending.outcome}"
+    details = {"outcome": ending.outcome, "reason": ending.reason, "by": ending.by, "again": again}
+    if again:
+        report.event("taken", f"{line}; waiting again", details)
+        return None
+    report.event("taken", line if wanted.command else "", details)
+    if arc.open:
+        await client.end(arc)
+    if wanted.command:
+        return TAKEN_AWAY
+    raise Failed(clean(f"{line}; ask again, or with a higher priority"))
+
+
+def _lost_code(wanted: HoldOptions) -> int:
+    return TAKEN_AWAY if wanted.command else 1

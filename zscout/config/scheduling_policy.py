@@ -1,0 +1,53 @@
+"""What a fleet may choose about scheduling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias
+
+from zscout.types import SECOND, ClientId, Ns
+
+PATIENCE: Final[Ns] = 142 * SECOND
+"""Default, in ns. Measured: docs/study.md."""
+OPERATOR_PRIORITY: Final = 10
+
+StrategyName: TypeAlias = Literal["priority", "optimal", "adaptive"]
+Preempt: TypeAlias = Literal["always", "after_min_runtime"]
+Promise: TypeAlias = Literal["equals", "all"]
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulingPolicy:
+    """The knobs. The defaults are the paper's rules, and bounded waiting among equals under `adaptive`."""
+
+    preempt: Preempt = "always"
+    """`after_min_runtime`: nobody but an operator takes a hold before its minimum runtime is over."""
+    operator_priority: int = OPERATOR_PRIORITY
+    """ARCs of this priority and above are an operator's: no knob keeps them waiting."""
+    patience: Ns | None = PATIENCE
+    """`adaptive`: time in ns after which an ARC that waits is due (`reservations.py`); None: never."""
+    promise: Promise = "equals"
+    """Whom those who are owed are protected from: equal and lower priority, or all but operators. With `all`,
+    what they are granted at last is theirs for its minimum runtime, too."""
+    max_running_per_host: int | None = None
+    """ARCs that the clients of one host may have running at one time; None: any number."""
+
+    def operator(self, priority: int) -> bool:
+        return priority >= self.operator_priority
+
+    def band(self, priority: int) -> int:
+        """Priorities of one band wait for each other's due."""
+        return priority if self.promise == "equals" or self.operator(priority) else self.operator_priority - 1
+
+    def protected_below(self, *, starving: bool) -> int | None:
+        """Below which priority nobody takes a hold before its minimum runtime is over; None: no such rule."""
+        preemption_protected = self.preempt == "after_min_runtime" or (starving and self.promise == "all")
+        return self.operator_priority if preemption_protected else None
+
+
+DEFAULT: Final = SchedulingPolicy()
+
+
+def owner_of(client: ClientId) -> str:
+    """Whose quota a client counts against: its host's."""
+    return client.partition("/")[0]

@@ -1,0 +1,405 @@
+"""Files that people write, read strictly: TOML in, typed structs out, or one line that says what to mend.
+
+Every error is a `BadInput` of the form `FILE: KEY.PATH: what is wrong; remedy`. Keys are written as in TOML,
+items of a list are counted from 0, and the item's own name follows in brackets where it has one:
+`lab.toml: rc[2].driver (robot/scout33): is the text "fast"; write "exclusive" or "capacity"`.
+
+msgspec converts, but it names no keys of a table (`$.needs[...]`), hints at no unknown key, takes a text for
+a Decimal and makes 1e400 infinite. So the data is checked here first, along the same types.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Iterable, Mapping
+from decimal import Decimal, InvalidOperation
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeVar
+
+import msgspec
+from msgspec import Meta, inspect
+
+from zscout.keyexpr import MAX_NAME, NAME
+
+T = TypeVar("T")
+
+MAX_SECONDS: Final = Decimal(1_000_000_000)
+"""Longest time a file may give, about 31 years; whole ns stay within 63 bits."""
+_MAX_MAGNITUDE: Final = 18
+"""Largest power of ten of any number, and of any whole number; more would make exact sums slow."""
+_MAX_PLACES: Final = 100
+_MAX_SHOWN: Final = 60
+_MAX_DEPTH: Final = 32
+
+_BARE_KEY: Final = re.compile(r"[A-Za-z0-9_-]+")
+_AT: Final = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
+_PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_DEEP_KEY: Final = re.compile(rf"""(?<![\w"'\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MAX_DEPTH}}}""")
+"""A dotted key that is longer than any here. tomllib takes hours over one that fills the file."""
+_NAME_RULE: Final = f'1 to {MAX_NAME} letters A to Z, digits, "_", "." or "-"'
+
+
+class BadInput(Exception):
+    """What a person gave can't be used. One line: what, where, how to mend it; the CLI exits with 2."""
+
+    def __init__(self, line: str) -> None:
+        super().__init__(_one_line(line))
+
+
+class Where(NamedTuple):
+    """A place in a file. `where / "key"` and `where.item(2, "its name")` go deeper."""
+
+    source: str
+    path: tuple[str | int, ...] = ()
+    item_name: str = ""
+
+    def __truediv__(self, key: str) -> Where:
+        return Where(self.source, (*self.path, key), self.item_name)
+
+    def item(self, number: int, name: object = "") -> Where:
+        """An item of a list, counted from 0; `name` is shown beside it if it is a text."""
+        return Where(self.source, (*self.path, number), name if isinstance(name, str) else self.item_name)
+
+    @property
+    def key(self) -> str:
+        """The path in TOML syntax: `arc[0].needs."robot/scout33".command_rate`."""
+        text = ""
+        for part in self.path:
+            if isinstance(part, int):
+                text += f"[{part}]"
+            else:
+                bare = part if _BARE_KEY.fullmatch(part) else quoted(part)
+                text += f".{bare}" if text else bare
+        return text
+
+    def bad(self, what: str, remedy: str) -> BadInput:
+        """The error to raise about this place."""
+        key = self.key
+        if self.item_name and self.path[-1] != "name":
+            key += f" ({_short(self.item_name)})"
+        return BadInput(
+            f"{self.source}: {key}: {what}; {remedy}" if key else f"{self.source}: {what}; {remedy}"
+        )
+
+
+def quoted(text: str) -> str:
+    """A text as an error shows it: in quotes, on one line, cut where it is long."""
+    escaped = _short(text).replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{_one_line(escaped)}"'
+
+
+def read_text(path: Path, *, max_bytes: int) -> str:
+    """The text of a regular UTF-8 file of at most `max_bytes` bytes. Raises BadInput."""
+    where = Where(str(path))
+    try:
+        # O_NONBLOCK: a FIFO without a writer would block here for ever.
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        with open(fd, "rb") as file:  # noqa: PTH123 - a descriptor
+            if not stat.S_ISREG(os.fstat(fd).st_mode):
+                raise where.bad("is not a regular file", "name a file on disk")
+            data = file.read(max_bytes + 1)
+    except FileNotFoundError:
+        raise where.bad("there is no such file", "check the path") from None
+    except IsADirectoryError:
+        raise where.bad("is a directory", "name a file in it") from None
+    except PermissionError:
+        raise where.bad("may not be read by this user", "change its permissions, or the user") from None
+    except OSError as error:
+        raise where.bad(f"can't be read: {error.strerror}", "check the path") from None
+    except ValueError:  # a NUL or a lone surrogate
+        raise where.bad("is not a file name", "check the path") from None
+    if len(data) > max_bytes:
+        raise where.bad(f"has more than {max_bytes:,} bytes", "shorten or split it")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise where.bad(f"line {line} is not UTF-8", "save the file as UTF-8") from None
+
+
+def read_toml(path: Path, type: type[T], *, max_bytes: int = 1_000_000) -> T:  # noqa: A002 - msgspec's word
+    """Reads a TOML file of at most `max_bytes` bytes into a struct type. Raises BadInput."""
+    return parse_toml(read_text(path, max_bytes=max_bytes), str(path), type)
+
+
+def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgspec's word
+    """Reads TOML into a struct type; `source` names the file in errors. Raises BadInput.
+
+    Numbers with a point are read as Decimal, exactly; struct fields may be Decimal, float, int, str, bool,
+    Literal, lists and tables of these, and structs (let them forbid unknown fields)."""
+    where = Where(source)
+    deep = _DEEP_KEY.search(text)
+    if deep:
+        line = text.count("\n", 0, deep.start()) + 1
+        raise where.bad(f"line {line} has a dotted key of more than {_MAX_DEPTH} parts", "shorten it")
+    try:
+        data = tomllib.loads(text, parse_float=_decimal)
+    except tomllib.TOMLDecodeError as error:
+        found = _AT.fullmatch(str(error))
+        what = found[1] if found else str(error)
+        if found and found[2]:
+            place = f"line {found[2]}, column {found[3]}"
+        else:
+            line = text.count("\n") + 1
+            place = f"line {line}, column {len(text) - text.rfind(chr(10))}, the end"
+        raise BadInput(f"{source}: {place}: {what}; mend the TOML there or just before") from None
+    except RecursionError:
+        raise where.bad("is nested too deep", "no key goes deeper than a few tables") from None
+    except ValueError:  # Python's limit of digits, the only one that tomllib does not turn into its own error
+        raise where.bad("a whole number has thousands of digits", "shorten it") from None
+    checked = _checked(inspect.type_info(type), data, where)
+    try:
+        return msgspec.convert(checked, type)
+    except msgspec.ValidationError as error:
+        raise where.bad(str(error), "mend it") from None
+
+
+def check_name(value: str, where: Where) -> str:
+    """Returns the name if it may stand in a mesh key (`[A-Za-z0-9_.-]+`, at most 64). Raises BadInput."""
+    if not NAME.fullmatch(value):
+        raise where.bad(f"{quoted(value)} is not a name", f"write {_NAME_RULE}")
+    return value
+
+
+def check_rc_name(value: str, where: Where) -> str:
+    """Returns the name of an RC if it is `kind/name`, both names by themselves. Raises BadInput."""
+    kind, _, name = value.partition("/")
+    if not (NAME.fullmatch(kind) and NAME.fullmatch(name)):
+        remedy = f'write kind/name, as in "robot/scout33", each of {_NAME_RULE}'
+        raise where.bad(f"{quoted(value)} is not the name of an RC", remedy)
+    return value
+
+
+def check_unique(values: Iterable[str], where: Where, key: str = "") -> None:
+    """Refuses a value that stands twice in a list (of texts, or of tables with `key`). Raises BadInput."""
+    first: dict[str, int] = {}
+    for number, value in enumerate(values):
+        if value in first:
+            here = where.item(number, value)
+            earlier = where.item(first[value]).key
+            raise (here / key if key else where.item(number)).bad(
+                f"{quoted(value)} stands at {earlier} already", "rename or remove one of the two"
+            )
+        first[value] = number
+
+
+def seconds_to_ns(
+    value: Decimal, where: Where, *, low: Decimal = Decimal(0), high: Decimal = MAX_SECONDS
+) -> int:
+    """Seconds as whole nanoseconds, halves to even; refused outside `low`..`high` s. Raises BadInput."""
+    if not (value.is_finite() and low <= value <= high):
+        raise where.bad(f"is {value} s", f"write {low:f} to {high:f} seconds")
+    return round(Fraction(value) * 1_000_000_000)
+
+
+def key(
+    description: str,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    unit: str = "",
+    example: object = None,
+    most: int | None = None,
+    remedy: str = "",
+) -> Meta:
+    """What the reference says of a key, and its bounds, as metadata of a struct's field. `most` is the number
+    of its entries at most; `remedy` is what an error says where a required key is missing."""
+    bounds: dict[str, Any] = {"ge": low, "le": high, "max_length": most}
+    extra = {name: text for name, text in (("unit", unit), ("remedy", remedy)) if text}
+    return Meta(
+        **{name: bound for name, bound in bounds.items() if bound is not None},
+        description=description,
+        examples=None if example is None else [example],
+        extra=extra or None,
+    )
+
+
+def seconds(low: str, high: str, description: str) -> Meta:
+    """The same for a duration: written in seconds, held as whole nanoseconds."""
+    extra = {"unit": "s", "low": Decimal(low), "high": Decimal(high)}
+    return Meta(description=description, extra=extra)
+
+
+def exact(value: Decimal) -> Fraction:
+    """A finite number without any loss, so that 0.1 + 0.2 is 0.3."""
+    return Fraction(value)
+
+
+def amounts(values: Mapping[str, Decimal], where: Where) -> dict[str, Fraction]:
+    """Bandwidth parameters or capacities, exact; a negative one is refused. Raises BadInput."""
+    for name, value in values.items():
+        if value < 0:
+            raise (where / name).bad(f"is {value}", "write 0 or more")
+    return {name: exact(value) for name, value in values.items()}
+
+
+def _decimal(text: str) -> Decimal:
+    try:
+        return Decimal(text)
+    except InvalidOperation:  # an exponent beyond what Decimal holds; refused below, with its key
+        return Decimal("Infinity")
+
+
+def _checked(kind: inspect.Type, value: object, where: Where) -> object:
+    """`value`, as TOML gave it, with durations in ns. Raises BadInput where it is not of this kind."""
+    match kind:
+        case inspect.Metadata(extra={"low": low, "high": high}):
+            _check_number(value, (int, Decimal), "a number", None, None, where)
+            return seconds_to_ns(Decimal(str(value)), where, low=low, high=high)
+        case inspect.Metadata(type=of):
+            return _checked(of, value, where)
+        case inspect.UnionType(types=(inspect.BoolType(), inspect.LiteralType(values=values))):
+            if not isinstance(value, bool) and value not in values:
+                words = ["true", "false", *(quoted(str(one)) for one in values)]
+                raise where.bad(f"is {_shown(value)}", f"write {_either(words)}")
+        case inspect.UnionType(types=(inspect.StructType(), inspect.StructType(), *_)):
+            return _checked_union(kind, _expect(dict, value, where, "a table"), where)
+        case inspect.UnionType(types=kinds):  # else only X | None: absent in TOML, or X
+            return _checked(
+                next(kind for kind in kinds if not isinstance(kind, inspect.NoneType)), value, where
+            )
+        case inspect.StructType():
+            return _checked_struct(kind, _expect(dict, value, where, f"a table, under [{where.key}]"), where)
+        case inspect.DictType(value_type=of):
+            table = _expect(dict, value, where, "a table")
+            _check_count(len(table), kind.max_length, where)
+            return {key: _checked(of, inner, where / key) for key, inner in table.items()}
+        case inspect.ListType(item_type=of) | inspect.VarTupleType(item_type=of):
+            tables = isinstance(of, inspect.StructType | inspect.UnionType)
+            items = _expect(list, value, where, f"tables, each under [[{where.key}]]" if tables else "a list")
+            _check_count(len(items), kind.max_length, where)
+            names = [inner.get("name") if isinstance(inner, dict) else None for inner in items]
+            places = [where.item(number, name) for number, name in enumerate(names)]
+            return [
+                _checked(of, _expect(dict, inner, place, "a table") if tables else inner, place)
+                for inner, place in zip(items, places, strict=True)
+            ]
+        case inspect.LiteralType(values=values):
+            if value not in values:
+                raise where.bad(f"is {_shown(value)}", f"write {_either(quoted(str(one)) for one in values)}")
+        case inspect.IntType(ge=low, le=high):
+            _check_number(value, int, "a whole number", low, high, where)
+        case inspect.FloatType(ge=low, le=high):
+            _check_number(value, (int, Decimal), "a number", low, high, where)
+        case inspect.DecimalType():
+            _check_number(value, (int, Decimal), "a number", None, None, where)
+        case inspect.StrType():
+            _expect(str, value, where, "a text in quotes")
+        case inspect.BoolType():
+            _expect(bool, value, where, "true or false")
+        case _:
+            raise TypeError(f"{kind} at {where.key}: strict knows no such type")
+    return value
+
+
+def _checked_union(kind: inspect.UnionType, table: Mapping[str, object], where: Where) -> object:
+    """Of structs that are told apart by a tag."""
+    structs = {str(one.tag): one for one in kind.types if isinstance(one, inspect.StructType)}
+    tag_field = str(next(iter(structs.values())).tag_field)
+    if tag_field not in table:
+        raise (where / tag_field).bad("is missing", "add it")
+    tag = table[tag_field]
+    if not isinstance(tag, str) or tag not in structs:
+        known = _either(map(quoted, sorted(structs)))
+        raise (where / tag_field).bad(f"is {_shown(tag)}", f"write {known}")
+    for key in table:
+        others = [quoted(name) for name, one in structs.items() if key in _names(one)]
+        if others and quoted(tag) not in others:
+            raise (where / key).bad(
+                f"the {tag_field} {quoted(tag)} has none",
+                f"remove it, or write {tag_field} = {_either(others)}",
+            )
+    return _checked_struct(structs[tag], table, where)
+
+
+def _names(kind: inspect.StructType) -> list[str]:
+    return [field.encode_name for field in kind.fields]
+
+
+def _checked_struct(kind: inspect.StructType, table: Mapping[str, object], where: Where) -> dict[str, object]:
+    fields = {field.encode_name: field for field in kind.fields}
+    tags = {kind.tag_field: kind.tag} if kind.tag_field else {}
+    for key in table:
+        if key not in fields and key not in tags:
+            near = difflib.get_close_matches(key[:MAX_NAME], fields, n=3)
+            known = sorted((*fields, *map(str, tags)))
+            hint = f"did you mean {_either(near)}?" if near else f"known here: {', '.join(known)}"
+            raise (where / key).bad("unknown key", hint)
+    found: dict[str, object] = {str(key): tag for key, tag in tags.items()}
+    for name, field in fields.items():
+        if name in table:
+            found[name] = _checked(field.type, table[name], where / name)
+        elif field.required:
+            extra = field.type.extra if isinstance(field.type, inspect.Metadata) else None
+            raise (where / name).bad("is missing", (extra or {}).get("remedy", "add it"))
+    return found
+
+
+def _expect(types: type | tuple[type, ...], value: object, where: Where, wanted: str) -> Any:
+    # bool is an int to Python, and is none to whoever writes a file.
+    if not isinstance(value, types) or (isinstance(value, bool) and types is not bool):
+        raise where.bad(f"is {_shown(value)}", f"write {wanted}")
+    return value
+
+
+def _check_count(count: int, most: int | None, where: Where) -> None:
+    if most is not None and count > most:
+        raise where.bad(f"has {count:,} entries", f"at most {most:,} are allowed")
+
+
+def _check_number(
+    value: object,
+    types: type | tuple[type, ...],
+    wanted: str,
+    low: float | None,
+    high: float | None,
+    where: Where,
+) -> None:
+    """Beyond the type and the bounds, refuses NaN, infinities and what is unreasonably long when exact."""
+    if low is not None and high is not None:
+        wanted += f" from {low} to {high}"
+    number = Decimal(_expect(types, value, where, wanted))
+    if not number.is_finite():
+        raise where.bad("is not a finite number", f"write {wanted}")
+    if (low is not None and number < Decimal(str(low))) or (high is not None and number > Decimal(str(high))):
+        raise where.bad(f"is {_shown(value)}", f"write {wanted}")
+    exponent = number.as_tuple().exponent
+    if number.adjusted() >= _MAX_MAGNITUDE:
+        raise where.bad("is too large", f"write a number below 1e{_MAX_MAGNITUDE}")
+    if isinstance(exponent, int) and exponent < -_MAX_PLACES:
+        raise where.bad(f"has more than {_MAX_PLACES} decimal places", "round it")
+
+
+def _shown(value: object) -> str:
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return f"the text {quoted(value)}"
+        case int() | Decimal():
+            return _short(str(value))
+        case dict():
+            return "a table"
+        case list():
+            return "a list"
+        case _:
+            return "a date or a time"
+
+
+def _either(words: Iterable[str]) -> str:
+    *most, last = words
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
+
+
+def _one_line(text: str) -> str:
+    """Control characters, line ends and stray bytes escaped: a hostile file can't draw on the terminal."""
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)

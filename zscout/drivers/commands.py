@@ -1,0 +1,103 @@
+"""Commands of radios and robots, read from a command's `do` and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, TypeAlias
+
+import msgspec
+
+from zscout.drivers.packets import TICKS
+from zscout.keyexpr import BadName, check_rc
+from zscout.mesh import Refused
+from zscout.types import MAX_CHANNEL, MAX_ROBOT
+
+MIN_LASTS: Final = 1 / TICKS
+MAX_LASTS: Final = 5.0
+"""Seconds that the wheels may turn without another command."""
+
+RobotId: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=MAX_ROBOT)]
+VideoChannel: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=MAX_CHANNEL)]
+WheelSpeed: TypeAlias = Annotated[float, msgspec.Meta(ge=-1, le=1)]
+DriveDuration: TypeAlias = Annotated[float, msgspec.Meta(ge=MIN_LASTS, le=MAX_LASTS)]
+
+
+class DeviceCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="name"):
+    """Base of all commands; `name` is the kind."""
+
+
+class RadioDrive(DeviceCommand, frozen=True, tag="drive"):
+    """Turns a robot's wheels, each -1 to 1 of top speed, for `lasts` seconds at most."""
+
+    robot: RobotId
+    left: WheelSpeed
+    right: WheelSpeed
+    lasts: DriveDuration
+
+
+class RadioCamera(DeviceCommand, frozen=True, tag="camera"):
+    """A robot's transmitter on `channel`; 0 switches it off."""
+
+    robot: RobotId
+    channel: VideoChannel
+
+
+class RadioStop(DeviceCommand, frozen=True, tag="stop"):
+    """A robot's wheels stop. `rc` is the robot RC that commands it, where no grant does."""
+
+    robot: RobotId
+    rc: str | None = None
+
+
+class RadioHalt(DeviceCommand, frozen=True, tag="halt"):
+    """A robot's wheels stop and its transmitter goes off. `rc` as above."""
+
+    robot: RobotId
+    rc: str | None = None
+
+
+class RobotDrive(DeviceCommand, frozen=True, tag="drive"):
+    left: WheelSpeed
+    right: WheelSpeed
+    lasts: DriveDuration
+
+
+class RobotStop(DeviceCommand, frozen=True, tag="stop"):
+    pass
+
+
+class RobotCamera(DeviceCommand, frozen=True, tag="camera"):
+    on: bool
+
+
+RadioCommand: TypeAlias = RadioDrive | RadioCamera | RadioStop | RadioHalt
+RobotCommand: TypeAlias = RobotDrive | RobotStop | RobotCamera
+_NAMES: Final = ("drive", "camera", "stop", "halt")
+
+
+def radio_command(do: Mapping[str, Any]) -> RadioCommand:
+    """The command of a radio. Raises Refused."""
+    order: RadioCommand = _read(do, RadioCommand, _NAMES)
+    if isinstance(order, RadioStop | RadioHalt) and order.rc is not None:
+        try:
+            check_rc(order.rc)
+        except BadName as error:
+            raise Refused("bad_command", str(error)) from None
+    return order
+
+
+def robot_command(do: Mapping[str, Any]) -> RobotCommand:
+    """The command of a robot. Raises Refused."""
+    order: RobotCommand = _read(do, RobotCommand, _NAMES[:3])
+    return order
+
+
+def _read(do: Mapping[str, Any], kind: Any, names: tuple[str, ...]) -> Any:
+    name = do.get("name")
+    if name not in names:
+        known = ", ".join(names)
+        raise Refused("unknown_command", f"this device does not know {str(name)[:64]!r}; it knows {known}")
+    try:
+        return msgspec.convert(do, kind)
+    except msgspec.ValidationError as error:
+        raise Refused("bad_command", f"{name}: {str(error)[:200]}") from None

@@ -1,0 +1,254 @@
+"""Who holds an RC, as the RC itself knows it: *the resource is its own arbiter*. Pure; time is passed in.
+
+The rules, all of them:
+
+- What an RCM publishes is ordered by (term, seq). Older than the newest received or promised: ignored. So
+  is a term absurdly far above it: it would silence every RCM to come.
+- A publication that touches this RC lists all its holders from then on.
+- A gap, or a new term, means that something was missed: the RC reads `rcm/state` and presents its hold. A
+  snapshot may add a hold that was missed; it ends nothing.
+- A command is obeyed only under exactly a grant that is held now, from the client that holds it.
+- A hold ends here by itself when its time is over, or when nothing of an RCM was received for the hold lease.
+- A promise given to a term is kept: no lower one is obeyed again.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import msgspec
+
+from zscout.messages import EndedHold, Grants, Holder, RcmState, absurd
+from zscout.types import (
+    NO_TERM,
+    SECOND,
+    Grant,
+    Ns,
+    Term,
+)
+
+REMEMBERED = 64
+"""Grants that ended lately, kept to say why a command under one of them is refused."""
+MAX_HOLDERS = 1_024
+
+
+@dataclass(slots=True)
+class HoldEntry:
+    """A holder, and when its minimum runtime is over on this host's clock."""
+
+    holder: Holder
+    end: Ns
+
+
+@dataclass(slots=True)
+class HoldChange:
+    """What an input changed: holders that began or stopped, and what the RC is to do about it."""
+
+    began: list[Holder] = field(default_factory=list)
+    stopped: list[Holder] = field(default_factory=list)
+    ended: list[EndedHold] = field(default_factory=list)
+    """Of the stopped, those whose hold ended here by itself."""
+    stayed: bool = False
+    """Others hold the RC before and after."""
+    outdated: bool = False
+    """The speaker is behind: publish this RC's state, so that it sees the newer term."""
+    reread: bool = False
+    """Something was missed: read `rcm/state`."""
+    present: bool = False
+    """This RC holds what a snapshot does not know: publish its state."""
+
+    def __bool__(self) -> bool:
+        return bool(self.began or self.stopped)
+
+    @property
+    def handed_over(self) -> bool:
+        """Whether a holder goes on in another client: the same ARC has the same place."""
+        before = {holder.place: holder.client for holder in self.stopped}
+        return any(before.get(holder.place, holder.client) != holder.client for holder in self.began)
+
+    @property
+    def ends(self) -> list[Holder]:
+        """Of the stopped, those that do not go on in another client."""
+        after = {holder.place: holder.client for holder in self.began}
+        return [holder for holder in self.stopped if after.get(holder.place, holder.client) == holder.client]
+
+    @property
+    def interrupts(self) -> bool:
+        """Whether the device serves nobody between what was before and what is after."""
+        return not self.stayed and not self.handed_over
+
+
+@dataclass(frozen=True, slots=True)
+class CommandRefusal:
+    """Why a command is not obeyed. Codes are part of the protocol."""
+
+    code: str
+    message: str
+
+
+class HoldTable:
+    """The holds of one RC."""
+
+    def __init__(self, rc: str, *, hold_lease: Ns) -> None:
+        self.rc = rc
+        self.hold_lease = hold_lease
+        self.term: Term = NO_TERM
+        """The newest term heard or promised."""
+        self.seq = 0
+        self.last_contact: Ns = 0
+        """When an RCM that is obeyed last published, as received here."""
+        self.held: dict[Grant, HoldEntry] = {}
+        self._ended: OrderedDict[Grant, str] = OrderedDict()
+        self._awaited: set[Grant] = set()
+        """Grants that a snapshot names while another hold stands: their publication is still to come."""
+
+    # Publications and snapshots
+
+    def apply_grants(self, grants: Grants, now: Ns, *, sharable: bool = True) -> HoldChange:
+        """Takes a publication. Of several holders of an exclusive RC only the newest grant is obeyed."""
+        if (grants.term, grants.seq) < (self.term, self.seq):
+            return HoldChange(outdated=grants.term < self.term)
+        if absurd(grants.term, self.term):
+            return HoldChange()
+        change = HoldChange(reread=grants.term != self.term or grants.prev > self.seq)
+        self.term, self.seq, self.last_contact = grants.term, grants.seq, now
+        holders = grants.rcs.get(self.rc)
+        if holders is not None:
+            if len(holders) > 1 and not sharable:
+                holders = [max(holders, key=lambda holder: holder.grant)]
+                change.present = True
+            reasons = {revoked.grant: f"{revoked.outcome}: {revoked.reason}" for revoked in grants.revoked}
+            self._replace(holders[:MAX_HOLDERS], reasons, change, now)
+        return change
+
+    def apply_snapshot(self, state: RcmState, now: Ns, *, sharable: bool) -> HoldChange:
+        """Takes a snapshot: what was missed is added, what the snapshot does not know is presented."""
+        if (state.term, state.seq) < (self.term, self.seq):
+            return HoldChange(outdated=state.term < self.term)
+        if absurd(state.term, self.term):
+            return HoldChange()
+        self.term, self.seq, self.last_contact = state.term, state.seq, now
+        change = HoldChange()
+        known = {view.grant for view in state.holds if self.rc in view.needs}
+        change.present = any(grant not in known for grant in self.held)
+        self._awaited.clear()
+        for view in state.holds:
+            if self.rc not in view.needs or view.grant in self.held or view.grant in self._ended:
+                continue
+            if self.held and not sharable:
+                change.present = True
+                self._awaited.add(view.grant)
+                continue
+            holder = Holder(
+                id=view.id,
+                arc=view.arc,
+                client=view.client,
+                grant=view.grant,
+                place=view.place,
+                rcs=sorted(view.needs),
+                min_runtime=view.min_runtime,
+                remaining=view.remaining,
+                priority=view.priority,
+                keep=view.keep,
+                params=view.needs[self.rc],
+                bound=view.bound,
+            )
+            self._begin(holder, change, now)
+        return change
+
+    def promise(self, term: Term) -> bool:
+        """Obeys no lower term again. False: a higher one is known, or the jump is absurd."""
+        if term < self.term or absurd(term, self.term):
+            return False
+        if term != self.term:
+            self.term, self.seq = term, 0
+        return True
+
+    # Time
+
+    def expire(self, now: Ns, *, lease: bool = True) -> HoldChange:
+        """Ends what is over. Holds that may be kept end only with the lease."""
+        change = HoldChange()
+        silent = lease and self.held and now - self.last_contact >= self.hold_lease
+        for grant, held in list(self.held.items()):
+            if silent:
+                self._stop(grant, "lease: no RCM was heard for too long", change, ended="lease")
+            elif now >= held.end and not held.holder.keep:
+                self._stop(grant, "its time is over", change, ended="time")
+        return change
+
+    def next_expiry(self) -> Ns | None:
+        """When `expire` should be called next."""
+        if not self.held:
+            return None
+        ends = [held.end for held in self.held.values() if not held.holder.keep]
+        return min([self.last_contact + self.hold_lease, *ends])
+
+    def fail(self, why: str) -> HoldChange:
+        """The device can't carry its holders any longer."""
+        change = HoldChange()
+        for grant in list(self.held):
+            self._stop(grant, why, change, ended="failed")
+        return change
+
+    # Commands
+
+    def check(self, grant: Grant, client: str, now: Ns) -> CommandRefusal | None:
+        """Whether a command of `client` under `grant` is obeyed at this moment."""
+        held = self.held.get(grant)
+        if held is not None:
+            if held.holder.client != client:
+                return CommandRefusal(
+                    "wrong_client", f"{self.rc} is held by {held.holder.client}, not by {client}"
+                )
+            if now >= held.end and not held.holder.keep:
+                return CommandRefusal("ended", f"the hold of {self.rc} is over: its time is up")
+            return None
+        if grant in self._ended:
+            return CommandRefusal("ended", f"the hold of {self.rc} is over: {self._ended[grant]}")
+        newer = (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term)
+        if newer or grant in self._awaited:
+            return CommandRefusal("not_yet", f"{self.rc} has not heard of this grant")
+        if not self.held:
+            return CommandRefusal("free", f"{self.rc} is held by nobody; ask the RCM for it")
+        holders = ", ".join(sorted(held.holder.arc for held in self.held.values()))
+        return CommandRefusal("not_holder", f"{self.rc} is held by {holders}")
+
+    def holders(self, now: Ns) -> list[Holder]:
+        """The holders, with the time that each has left now."""
+        return [
+            msgspec.structs.replace(held.holder, remaining=(held.end - now) / SECOND)
+            for held in self.held.values()
+        ]
+
+    # Changes
+
+    def _replace(
+        self, holders: Iterable[Holder], reasons: dict[Grant, str], change: HoldChange, now: Ns
+    ) -> None:
+        wanted = {holder.grant: holder for holder in holders}
+        self._awaited.clear()
+        for grant in [grant for grant in self.held if grant not in wanted]:
+            self._stop(grant, reasons.get(grant, "the RCM gave it to another"), change)
+        for grant, holder in wanted.items():
+            if grant not in self.held and grant not in self._ended:
+                self._begin(holder, change, now)
+        if any(grant in self._ended for grant in wanted):
+            change.present = True
+
+    def _begin(self, holder: Holder, change: HoldChange, now: Ns) -> None:
+        self.held[holder.grant] = HoldEntry(holder, now + round(holder.remaining * SECOND))
+        change.began.append(holder)
+        change.stayed = len(self.held) > len(change.began)
+
+    def _stop(self, grant: Grant, why: str, change: HoldChange, ended: str | None = None) -> None:
+        holder = self.held.pop(grant).holder
+        change.stopped.append(holder)
+        change.stayed = len(self.held) > len(change.began)
+        if ended is not None:
+            change.ended.append(EndedHold(id=holder.id, grant=grant, why=ended))
+        self._ended[grant] = why
+        if len(self._ended) > REMEMBERED:
+            self._ended.popitem(last=False)

@@ -1,0 +1,374 @@
+"""A resource controller (RC) on the mesh: the part that every driver shares.
+
+A driver (`driver.py`) controls its device; `ResourceController` owns the keys, checks every command against
+the hold that stands when it is carried out, votes, and puts the device into its safe state when its holder is
+gone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from zscout.drivers.driver import Driver
+from zscout.drivers.holds import HoldChange, HoldTable
+from zscout.drivers.rc_directory import RcDirectory
+from zscout.drivers.work_queue import CommandQuery, WorkQueue
+from zscout.keyexpr import Role, Token, new_instance
+from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
+from zscout.mesh.stall import StallWatch
+from zscout.messages import (
+    Ballot,
+    Command,
+    Done,
+    EndedHold,
+    Grants,
+    Proposal,
+    RcAsk,
+    RcmState,
+    RcState,
+    StateAsk,
+    absurd,
+)
+from zscout.types import SECOND, Ns
+
+log = logging.getLogger(__name__)
+
+MIN_DELAY = 0.02
+"""Seconds until a hold that is over is looked at again."""
+MAX_TTL = 60.0
+REREAD_TIMEOUT = 0.5
+"""Seconds that one query for `rcm/state` waits for an answer."""
+REREADS = 4
+"""Queries in a row when publications overtake the answers."""
+COMMAND_QUEUE = 64
+FIGURES_PERIOD = 1.0
+"""Seconds between two publications of changed figures."""
+
+
+class ResourceController:
+    """One RC: its keys, its holds and its driver. Where it fails, not its driver, it leaves the mesh, makes
+    its device safe and calls `on_failure`. `hold_lease` is in seconds."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        name: str,
+        driver: Driver,
+        *,
+        hold_lease: float,
+        stall: StallWatch,
+        on_failure: Callable[[Exception], object] = lambda _error: None,
+    ) -> None:
+        self.mesh = mesh
+        self.name = name
+        self.driver = driver
+        self.holds = HoldTable(name, hold_lease=round(hold_lease * SECOND))
+        self.instance = new_instance()
+        self.rules = 0
+        self.health = "ok"
+        self.queue = WorkQueue()
+        self.directory = RcDirectory(mesh) if driver.relays else None
+        """Which host offers which RC; only of a driver that relays."""
+        self.stall = stall
+        self._on_failure = on_failure
+        self.supervisor = Supervisor(name, self._failed)
+        self._leaders: set[Token] = set()
+        self._declared: list[Declaration] = []
+        self._warm_at: Ns = 0
+        self._reading: asyncio.Task[None] | None = None
+        self._missed = False
+        """Something was missed that has not been read since."""
+        self._timer: asyncio.TimerHandle | None = None
+        self._stopping: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Starts empty, and obeys nothing before it has subscribed and then read `rcm/state`."""
+        keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
+        self._state = mesh.publisher(keys.rc_state(self.name), RcState)
+        self._declared.append(mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)))
+        self._declared.append(mesh.subscribe(keys.grants, Grants, guard(self._on_grants)))
+        await asyncio.wait({self._read_state()})
+        if self.directory is not None:
+            self._declared.append(self.directory.watch())
+        await self.driver.open(self)
+        self.supervisor.spawn(self._worker())
+        self.supervisor.spawn(self._publish_figures())
+        self._declared.append(mesh.serve(keys.rc_state(self.name), RcAsk, self._on_state_query))
+        if self.driver.sharable:
+            self._declared.append(mesh.serve(keys.vote(self.name), Proposal, self._on_proposal))
+        command = keys.command_any(self.name)
+        self._declared.append(mesh.serve(command, Command, self._on_command, depth=COMMAND_QUEUE))
+        token = Token(mesh.me.host, Role.RC, self.name, self.instance)
+        self._declared.append(mesh.alive(token))
+
+    async def stop(self) -> None:
+        """Leaves the mesh and puts the device into its safe state; once, however often it is called."""
+        if self._stopping is None:
+            self._stopping = asyncio.get_running_loop().create_task(self._stop())
+        await asyncio.shield(self._stopping)
+
+    async def _stop(self) -> None:
+        for declared in reversed(self._declared):
+            declared.close()
+        await self.supervisor.close()
+        await self._guard(self.driver.safe())
+        await self._guard(self.driver.close())
+        self._state.close()
+
+    def _failed(self, error: Exception) -> None:
+        self._stopping = asyncio.get_running_loop().create_task(self._stop())
+        self._on_failure(error)
+        self.fail(f"its resource controller failed: {error}")  # which may fail as well
+
+    def rules_changed(self) -> None:
+        """The driver votes by other rules from now on: earlier votes are void."""
+        self.rules += 1
+        self.publish()
+
+    def fail(self, why: str) -> None:
+        """The device can't carry its holders any longer: their holds end, the RC counts as lost."""
+        self.health = why
+        self._apply(self.holds.fail(why))
+        self.publish()
+
+    def recover(self) -> None:
+        """The device works again."""
+        self.health = "ok"
+        self.publish()
+
+    def publish(self, ended: list[EndedHold] | None = None) -> None:
+        self._state.put(self._rc_state(ended or []))
+
+    # What the RCM sends
+
+    def _on_leader(self, token: Token, alive: bool) -> None:
+        if alive:
+            self._leaders.add(token)
+        else:
+            self._leaders.discard(token)
+
+    def _on_grants(self, _key: str, grants: Grants) -> None:
+        self._apply(self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable))
+        if self._missed:
+            self._read_state()
+
+    def _on_state_query(self, query: IncomingQuery[RcAsk]) -> None:
+        promise = query.message.promise
+        if promise is not None and not self.holds.promise(promise):
+            raise Refused("old_term", f"{self.name} obeys term {self.holds.term.counter}", self.holds.term)
+        query.answer(self._rc_state([]))
+
+    def _rc_state(self, ended: list[EndedHold]) -> RcState:
+        return RcState(
+            rc=self.name,
+            host=self.mesh.me.host,
+            instance=self.instance,
+            sharable=self.driver.sharable,
+            term=self.holds.term,
+            seq=self.holds.seq,
+            holders=self.holds.holders(self.mesh.now()),
+            ended=ended,
+            health=self.health,
+            rules=self.rules,
+            leader=self._sees_leader(),
+            capacity=self.driver.capacity(),
+            figures=self.driver.figures(),
+        )
+
+    def _sees_leader(self) -> bool:
+        """A leader counts while it publishes: its token lives on when its program hangs."""
+        # Half a hold lease is longer than a heartbeat, and leaves a successor time before holds end.
+        silence = self.mesh.now() - self.holds.last_contact
+        return bool(self._leaders) and silence < self.holds.hold_lease // 2
+
+    def _on_proposal(self, query: IncomingQuery[Proposal]) -> None:
+        proposal = query.message
+        try:
+            reason = self.driver.vote(proposal.holders)
+        except ValueError as error:
+            raise Refused("bad_request", str(error)) from None
+        query.answer(Ballot(proposal=proposal.proposal, accept=not reason, reason=reason))
+
+    # Commands
+
+    def _on_command(self, query: CommandQuery) -> None:
+        self.mesh.keys.sender_of(query.key)  # a sender without a valid name is refused here
+        # What stops a robot is let in where commands are not.
+        room = COMMAND_QUEUE if query.message.grant is not None else 2 * COMMAND_QUEUE
+        if self.queue.commands >= room:
+            raise Refused("busy", f"{self.name} has {COMMAND_QUEUE} commands waiting; ask again")
+        if not 0 < query.message.ttl <= MAX_TTL:
+            raise Refused("bad_command", f"ttl must lie between 0 and {MAX_TTL:g} seconds")
+        self.queue.put_command(query)
+
+    async def _worker(self) -> None:
+        """Carries out changes of holders and commands, one at a time."""
+        while True:
+            work = await self.queue.get()
+            if isinstance(work, HoldChange):
+                await self._carry_out_change(work)
+            elif self._is_early(work):
+                self._set_aside(work)
+            else:
+                await self._answer(work, self._carry_out(work))
+
+    async def _carry_out(self, query: CommandQuery) -> Any:
+        """What is answered, or a Future of it."""
+        command = query.message
+        sender = self.mesh.keys.sender_of(query.key)
+        if self._is_stale(query):
+            waited = self._waited(query) / SECOND
+            raise Refused(
+                "stale", f"the command waited {waited:.2f} s, longer than its ttl {command.ttl:g} s"
+            )
+        if command.grant is None:
+            return await self.driver.command_without_grant(sender, command.do)
+        refused = self._refusal(query)
+        if refused is not None:
+            raise refused
+        warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
+        if command.do.get("name") == "confirm":
+            return Done(warming=warming)
+        if warming and not self.driver.usable_cold(command.do):
+            raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
+        return await self.driver.command(self.holds.held[command.grant].holder, command.do)
+
+    def _refusal(self, query: CommandQuery) -> Refused | None:
+        """Why a command is not obeyed under its grant; None: it is, or has none."""
+        grant, sender = query.message.grant, self.mesh.keys.sender_of(query.key)
+        if grant is None:
+            return None
+        client, held = str(sender), self.holds.held.get(grant)
+        if (
+            held is not None
+            and self.directory is not None
+            and self.directory.is_node_of_gang(sender, held.holder, self.name)
+        ):
+            client = held.holder.client
+        refusal = self.holds.check(grant, client, self.mesh.now())
+        return None if refusal is None else Refused(refusal.code, refusal.message, self.holds.term)
+
+    def _waited(self, query: CommandQuery) -> Ns:
+        """How long a command may have waited: in our queue, and before it in the network through a stall."""
+        return self.mesh.now() - query.arrived + self.stall.waited_through(query.arrived)
+
+    def _is_stale(self, query: CommandQuery) -> bool:
+        return self._waited(query) > query.message.ttl * SECOND
+
+    async def _answer(self, query: CommandQuery, work: Awaitable[Any]) -> None:
+        try:
+            result = await work
+            if isinstance(result, asyncio.Future):
+                self.supervisor.spawn(self._answer(query, result))
+            else:
+                query.answer(result if isinstance(result, Done) else Done(result=result))
+        except Refused as refused:
+            query.refuse(refused.problem)
+        except Exception:
+            log.exception("%s: a command failed", self.name)
+            query.refuse(Refused("failed", f"{self.name} could not do it; see the log of its node").problem)
+
+    # Commands under a grant that this RC does not know yet
+
+    def _is_early(self, query: CommandQuery) -> bool:
+        refused = self._refusal(query)
+        return refused is not None and refused.problem.code == "not_yet" and not self._is_stale(query)
+
+    def _set_aside(self, query: CommandQuery) -> None:
+        """Keeps a command until `rcm/state` has been read. Nothing else waits for that."""
+        if self.queue.set_aside(query, self.mesh.keys.sender_of(query.key).host):
+            self._read_state()
+        else:
+            query.refuse(Refused("busy", f"too many commands to {self.name} are early; ask again").problem)
+
+    def _decide_early(self) -> None:
+        """`rcm/state` has been read: what is early still is refused."""
+        self.queue.resume(lambda query: not self._is_early(query))
+        for query in self.queue.drop_early():
+            if refused := self._refusal(query):
+                query.refuse(refused.problem)
+
+    # Holds
+
+    async def _carry_out_change(self, change: HoldChange) -> None:
+        for holder in change.ends:
+            await self._guard(self.driver.end(holder))
+        # A device that still serves others, or goes on in another client, stays as it is.
+        if change.stopped and change.interrupts:
+            await self._guard(self.driver.safe())
+        for holder in change.began:
+            await self._guard(self.driver.begin(holder))
+
+    async def _guard(self, action: Awaitable[None]) -> None:
+        try:
+            await action
+        except Exception as error:
+            log.exception("%s: its driver failed", self.name)
+            self.fail(f"its driver failed: {error}")
+
+    def _apply(self, change: HoldChange) -> None:
+        if change:
+            if change.began and change.interrupts:
+                self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
+            self.queue.put_change(change)
+            self.queue.resume(lambda query: query.message.grant in self.holds.held)
+        if change.outdated or change.present or change.ended:
+            self.publish(change.ended)
+        self._missed |= change.reread
+        self._set_timer()
+
+    def _read_state(self) -> asyncio.Task[None]:
+        """Reads `rcm/state`; while that is under way it is the same reading for all who need one."""
+        if self._reading is None or self._reading.done():
+            self._reading = self.supervisor.spawn(self._read())
+        return self._reading
+
+    async def _read(self) -> None:
+        for _ in range(REREADS):
+            query = StateAsk(holds_only=True)
+            replies = await self.mesh.ask(
+                self.mesh.keys.rcm_state, query, RcmState, timeout=REREAD_TIMEOUT, enough=self._is_current
+            )
+            states = [reply.message for reply in replies if reply.message is not None]
+            # One absurd answer must not hide the true one.
+            states = [state for state in states if not absurd(state.term, self.holds.term)]
+            if not states:
+                break
+            newest = max(states, key=lambda state: (state.term, state.seq))
+            overtaken = (newest.term, newest.seq) < (self.holds.term, self.holds.seq)
+            self._apply(self.holds.apply_snapshot(newest, self.mesh.now(), sharable=self.driver.sharable))
+            # What was published while the answer was on its way may have hidden the very gap it was for.
+            if not overtaken:
+                self._missed = False
+                break
+        self._decide_early()
+
+    def _is_current(self, reply: Reply[RcmState]) -> bool:
+        """Whether no other answer is needed: this one is of an RCM that is obeyed already."""
+        state, holds = reply.message, self.holds
+        return state is not None and state.term == holds.term and state.seq >= holds.seq
+
+    def _set_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        at, now = self.holds.next_expiry(), self.mesh.now()
+        if at is not None:
+            delay = (at - now) / SECOND if at > now else MIN_DELAY
+            self._timer = self.supervisor.call_later(delay, self._expire)
+
+    def _expire(self) -> None:
+        # After a stall of our own, what the RCM published meanwhile may wait in the inbox: it goes first.
+        self._apply(self.holds.expire(self.mesh.now(), lease=not self.stall.fresh()))
+
+    async def _publish_figures(self) -> None:
+        published = self.driver.figures()
+        while True:
+            await asyncio.sleep(FIGURES_PERIOD)
+            figures = self.driver.figures()
+            if figures != published:
+                published = figures
+                self.publish()

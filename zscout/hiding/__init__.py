@@ -1,1 +1,0 @@
-"""A Scout's mind: pictures in, wheel commands out. Pure: no clock, no thread, no I/O."""

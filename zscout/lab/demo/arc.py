@@ -1,0 +1,117 @@
+"""One behavior of `zscout demo table1`, as a process of its own: it requests its ARC at a signal.
+
+Standard input: an `ArcSpec` as one line of JSON; then an empty line is the signal. Standard output:
+`ArcReport`s, one line of JSON each. It ends when it had its time, or when standard input closes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from decimal import Decimal
+from typing import Literal, TypeAlias
+
+import msgspec
+
+from zscout.mesh import clock
+
+Milestone: TypeAlias = Literal["ready", "asked", "answered", "entered", "left", "done"]
+
+
+class ArcSpec(msgspec.Struct, frozen=True):
+    """What to request, and as whom."""
+
+    host: str
+    arc: str
+    needs: tuple[str, ...]
+    priority: int
+    min_runtime: Decimal
+    """Seconds."""
+
+
+class ArcReport(msgspec.Struct, frozen=True):
+    """What happened, and when (ns on the host's clock). `entered` and `left` are the ARC's body."""
+
+    arc: str
+    what: Milestone
+    at: int
+    detail: str = ""
+
+
+async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
+    """Waits for all it needs to be there, reports that, and requests it at the signal."""
+    # Imported late: the demo itself needs only the types above.
+    from zscout.behaviors.client.arc import holds
+    from zscout.behaviors.client.client import Client
+    from zscout.behaviors.client.request import OpenArc
+    from zscout.keyexpr import Role, Token
+
+    def report(what: Milestone, detail: str = "") -> None:
+        sys.stdout.write(msgspec.json.encode(ArcReport(spec.arc, what, clock.now(), detail)).decode() + "\n")
+        sys.stdout.flush()
+
+    async with await Client.connect(spec.arc, host=spec.host) as client:
+        missing, complete = {Role.RCM, *spec.needs}, asyncio.Event()
+
+        def seen(token: Token, alive: bool) -> None:
+            if alive:
+                missing.discard(token.name if token.role == Role.RC else token.role)
+            if not missing:
+                complete.set()
+
+        watch = client.mesh.watch(client.mesh.keys.alive_any(), seen)
+        await complete.wait()
+        watch.close()
+        report("ready")
+        await signal.wait()
+        report("asked")
+        answered = False
+
+        def on_state(arc: OpenArc) -> None:
+            nonlocal answered
+            if not answered and arc.state in ("queued", "running"):
+                answered = True
+                report("answered", arc.reason)
+
+        client.watch(on_state)
+        needs: dict[str, dict[str, Decimal]] = {rc: {} for rc in spec.needs}
+        asking = holds(client, spec.arc, needs, priority=spec.priority, min_runtime=spec.min_runtime)
+        async for attempt in asking:
+            async with attempt:
+                report("entered")
+                try:
+                    await asyncio.Event().wait()
+                finally:
+                    report("left")
+        report("done")
+
+
+async def _main(spec: ArcSpec) -> None:
+    loop, signal = asyncio.get_running_loop(), asyncio.Event()
+    task = asyncio.ensure_future(behave(spec, signal))
+
+    def read() -> None:
+        if os.read(0, 4096):
+            signal.set()
+        else:
+            loop.remove_reader(0)
+            task.cancel()
+
+    loop.add_reader(0, read)
+    try:
+        await task
+    except asyncio.CancelledError:
+        sys.exit(1)
+
+
+def read_line() -> bytes:
+    """The first line of standard input, and not a byte more."""
+    line = b""
+    while not line.endswith(b"\n") and len(line) < 65_536 and (byte := os.read(0, 1)):
+        line += byte
+    return line
+
+
+if __name__ == "__main__":
+    asyncio.run(_main(msgspec.json.decode(read_line(), type=ArcSpec)))

@@ -1,0 +1,222 @@
+"""Simulated machines under the balancer's own core: what the study of placement and its tests run.
+
+Machines share their processors evenly among all that want one, report once a second, each at its own moment,
+and show a one-minute load average as the kernel reckons it. A machine whose memory is too small for what runs
+on it slows all of it down. Time goes in steps of a tenth of a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from random import Random
+from typing import Final
+
+from zscout.placement.balancer import LOAD_TIME, Balancer
+from zscout.placement.metrics import THRASHING
+from zscout.placement.model import (
+    REPORT_EVERY,
+    ComponentUsage,
+    HostReport,
+    RankQuery,
+)
+from zscout.types import (
+    SECOND,
+    ComponentId,
+    HostName,
+    Kind,
+    Metric,
+    Ns,
+    Policy,
+)
+
+STEP: Final[Ns] = SECOND // 10
+GAIN: Final = 1 - math.exp(-STEP / LOAD_TIME)
+"""Of what wants a processor, how much one step brings into the load average."""
+START_TIME: Final[Ns] = SECOND // 2
+"""From the word to start a component until it wants a processor, in ns."""
+LONGEST: Final[Ns] = 24 * 3600 * SECOND
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """A host: `memory` in bytes; `others` is load from elsewhere, in cores; `blocked` are processes that wait
+    for a disk: they count in the load average, as on Linux, and take no processor."""
+
+    name: HostName
+    cores: float = 1.0
+    speed: float = 1.0
+    memory: int = 4_000_000_000
+    others: float = 0.0
+    blocked: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedJob:
+    """A component that is started at `at` ns and takes `memory` bytes. It reads `cache` bytes of files over
+    and over; they are no memory of its own, and it is slow where there is no room to keep them.
+
+    It keeps a pace and wants `cpu` cores of speed 1.0, so less of a faster one; or, if `greedy`, it computes
+    all the time in `cpu` threads, and gets more done on a faster one. It ends when it has had `work`
+    core-seconds at speed 1.0; None: never."""
+
+    component: ComponentId
+    kind: Kind
+    at: Ns
+    cpu: float
+    memory: int = 64_000_000
+    work: float | None = None
+    greedy: bool = False
+    cache: int = 0
+
+    def wants(self, speed: float) -> float:
+        """Cores that it wants of a machine of this speed."""
+        return self.cpu if self.greedy else self.cpu / speed
+
+
+@dataclass(slots=True)
+class PlacementOutcome:
+    """Where each component ran, when it ended, and each machine's load average, once a second."""
+
+    placed: dict[ComponentId, HostName] = field(default_factory=dict)
+    placed_at: dict[ComponentId, Ns] = field(default_factory=dict)
+    ends: dict[ComponentId, Ns] = field(default_factory=dict)
+    curves: dict[HostName, list[tuple[Ns, float]]] = field(default_factory=dict)
+    metrics: list[Metric] = field(default_factory=list)
+    """The metric that each placement used, in order."""
+
+    def spread(self) -> int:
+        """Difference between the hosts that were given most and fewest components."""
+        counts = self.counts()
+        return max(counts) - min(counts)
+
+    def counts(self) -> list[int]:
+        """Components that each host was given, in the order of `curves`."""
+        return [list(self.placed.values()).count(host) for host in self.curves]
+
+    def apart(self) -> float:
+        """How far the load curves are apart: highest less lowest load average, its mean over the run."""
+        moments = list(zip(*(curve for curve in self.curves.values()), strict=True))
+        gaps = [max(load for _, load in now) - min(load for _, load in now) for now in moments]
+        return sum(gaps) / len(gaps) if gaps else 0.0
+
+
+@dataclass(slots=True)
+class _Running:
+    job: SimulatedJob
+    begins: Ns
+    done: float = 0.0
+
+
+@dataclass(slots=True)
+class _Host:
+    machine: Machine
+    phase: Ns
+    """When in each second it reports."""
+    running: list[_Running] = field(default_factory=list)
+    load: float = 0.0
+    number: int = 0
+
+    def step(self, now: Ns) -> list[_Running]:
+        """One step of time; returns who has ended in it."""
+        speed = self.machine.speed
+        share, wanting = self.share(now)
+        self.load += (wanting + self.machine.blocked - self.load) * GAIN
+        ended = []
+        for one in self.running:
+            if one.begins <= now:
+                one.done += one.job.wants(speed) * speed * share * STEP / SECOND
+                if one.job.work is not None and one.done >= one.job.work:
+                    ended.append(one)
+        for one in ended:
+            self.running.remove(one)
+        return ended
+
+    def share(self, now: Ns) -> tuple[float, float]:
+        """What part of what it wants each component gets, and how many cores all want."""
+        active = [one.job for one in self.running if one.begins <= now]
+        wanting = self.machine.others + sum(job.wants(self.machine.speed) for job in active)
+        memory = sum(job.memory + job.cache for job in active)
+        fits = 1.0 if memory <= self.machine.memory else max(THRASHING, (self.machine.memory / memory) ** 2)
+        return min(1.0, self.machine.cores / wanting if wanting else 1.0) * fits, wanting
+
+    def report(self, now: Ns) -> HostReport:
+        machine = self.machine
+        share, wanting = self.share(now)
+        self.number += 1
+        active = [one.job for one in self.running if one.begins <= now]
+        return HostReport(
+            host=machine.name,
+            number=self.number,
+            cores=machine.cores,
+            load_average=(self.load, self.load, self.load),
+            cpu=min(1.0, wanting / machine.cores),
+            memory_available=max(0, machine.memory - sum(job.memory for job in active)),
+            memory_total=machine.memory,
+            speed=machine.speed,
+            uses=tuple(
+                ComponentUsage(
+                    job.component, job.kind, 1, job.wants(machine.speed) * share, job.memory, share
+                )
+                for job in active
+            ),
+        )
+
+
+def simulate(
+    machines: Sequence[Machine],
+    jobs: Sequence[SimulatedJob],
+    *,
+    metric: Metric = "composite",
+    policy: Policy = "pending",
+    seed: int = 0,
+    until: Ns | None = None,
+    balancer: Balancer | None = None,
+) -> PlacementOutcome:
+    """Starts the jobs at their times, each on the host that the balancer ranks first, and lets all run until
+    `until`, or until the last has ended. `balancer`: one that has learnt before; it has no reports yet.
+
+    Raises ValueError if it would never end, or has not ended after a day."""
+    if until is None and any(job.work is None for job in jobs):
+        raise ValueError("a job without an end needs `until`")
+    rng = Random(seed)  # noqa: S311 - a simulation
+    balancer = balancer or Balancer(rng)
+    hosts = {
+        one.name: _Host(one, rng.randrange(REPORT_EVERY // STEP) * STEP, load=one.others + one.blocked)
+        for one in machines
+    }
+    outcome = PlacementOutcome(curves={name: [] for name in hosts})
+    for host in hosts.values():
+        balancer.reported(0, host.report(0))
+    waiting = sorted(jobs, key=lambda job: job.at, reverse=True)
+    now: Ns = 0
+    while until is None or now < until:
+        if now > LONGEST:
+            raise ValueError("the jobs have not ended after a day")
+        for host in hosts.values():
+            if now % REPORT_EVERY == host.phase:
+                balancer.reported(now, host.report(now))
+            if now % SECOND == 0:
+                outcome.curves[host.machine.name].append((now, host.load))
+        due: dict[ComponentId, SimulatedJob] = {}
+        while waiting and waiting[-1].at <= now:
+            job = waiting.pop()
+            due[job.component] = job
+        for component in balancer.heaviest_first((job.component, job.kind) for job in due.values()):
+            job = due[component]
+            ranking = balancer.rank(now, RankQuery(job.kind, metric, policy))
+            chosen = ranking.hosts[0].host
+            balancer.placed(now, component, job.kind, chosen)
+            hosts[chosen].running.append(_Running(job, now + START_TIME))
+            outcome.placed[component] = chosen
+            outcome.placed_at[component] = now
+            outcome.metrics.append(ranking.metric)
+        for host in hosts.values():
+            for ended in host.step(now):
+                outcome.ends[ended.job.component] = now + STEP
+                balancer.gone(ended.job.component)
+        now += STEP
+        if until is None and not waiting and not any(host.running for host in hosts.values()):
+            break
+    return outcome

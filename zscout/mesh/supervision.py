@@ -1,0 +1,161 @@
+"""Supervised work of one service: its tasks, timers and handlers live and fail together."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from typing import Any, ParamSpec, TypeVar
+from weakref import WeakSet
+
+from zscout.keyexpr import BadName
+from zscout.mesh.exchange import Refused
+
+log = logging.getLogger(__name__)
+
+CLOSE_TIMEOUT = 5.0
+"""Seconds that `close` waits for cancelled tasks."""
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Supervisor:
+    """Owns the tasks, timers and guarded handlers of one service.
+
+    The first of them that raises is logged with its traceback, `on_failure(error)` is called, once, and all
+    others are cancelled. Failures after that, of tasks that are being cancelled, are logged only. A
+    supervisor that failed or was cancelled runs nothing any more: a service that starts again takes a new
+    one.
+    """
+
+    def __init__(self, name: str, on_failure: Callable[[Exception], object]) -> None:
+        self.name = name
+        self.error: Exception | None = None
+        """What it failed with."""
+        self._on_failure = on_failure
+        self._cancelled = False
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._timers: WeakSet[asyncio.TimerHandle] = WeakSet()
+
+    @property
+    def active(self) -> bool:
+        return not self._cancelled
+
+    def spawn(self, coro: Coroutine[Any, Any, T], name: str | None = None) -> asyncio.Task[T]:
+        """Runs `coro` as a task, cancelled before it starts if the supervisor is no longer active."""
+        task = asyncio.get_running_loop().create_task(
+            coro, name=f"{self.name}: {name or getattr(coro, '__name__', 'task')}"
+        )
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+        if self._cancelled:
+            task.cancel()
+        return task
+
+    def call_later(self, delay: float, f: Callable[..., object], *args: Any) -> asyncio.TimerHandle:
+        """Calls `f(*args)` in `delay` seconds."""
+        handle = asyncio.get_running_loop().call_later(delay, self._call, f, *args)
+        if self._cancelled:
+            handle.cancel()
+        self._timers.add(handle)
+        return handle
+
+    def guard(self, f: Callable[P, object]) -> Callable[P, None]:
+        """`f` as a handler for the mesh: it is not called once the supervisor is no longer active, and what
+        it raises is a failure of the service, except for Refused and BadName, which are answers.
+
+        The handler then raises Refused: where it handled a query, that is answered with code `internal`."""
+
+        @functools.wraps(f)
+        def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
+            if self._cancelled:
+                return
+            try:
+                f(*args, **kwargs)
+            except (Refused, BadName):
+                raise
+            except Exception as error:
+                self.fail(error)
+                raise Refused("internal", "the request failed here; see this node's log") from error
+
+        return guarded
+
+    def fail(self, error: Exception) -> None:
+        """Takes `error` for a failure of the service, as though one of its tasks had raised it."""
+        if error is self.error:  # raised on by a task that awaited the one that failed
+            return
+        log.error("%s failed", self.name, exc_info=error)
+        if self._cancelled:
+            return
+        self.error, self._cancelled = error, True
+        try:
+            self._on_failure(error)
+        except Exception:
+            log.exception("%s could not handle its failure", self.name)
+        finally:
+            self.cancel()
+
+    def cancel(self) -> None:
+        """Cancels all tasks and timers, without waiting for them."""
+        self._cancelled = True
+        for handle in tuple(self._timers):
+            handle.cancel()
+        current = _current_task()
+        for task in tuple(self._tasks):
+            if task is not current:
+                task.cancel()
+
+    async def close(self) -> None:
+        """Cancels all, and returns when all tasks have ended, but for the one that calls; after CLOSE_TIMEOUT
+        those that still run are logged."""
+        self.cancel()
+        tasks = self._tasks - {_current_task()}
+        if tasks:
+            _, stuck = await asyncio.wait(tasks, timeout=CLOSE_TIMEOUT)
+            for task in stuck:
+                log.error("%s did not end within %g s of its cancellation", task.get_name(), CLOSE_TIMEOUT)
+
+    def _call(self, f: Callable[..., object], *args: Any) -> None:
+        try:
+            f(*args)
+        except Exception as error:  # noqa: BLE001 - it is logged there
+            self.fail(error)
+
+    def _done(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and isinstance(error := task.exception(), Exception):
+            self.fail(error)
+
+
+@asynccontextmanager
+async def supervised(name: str) -> AsyncIterator[Supervisor]:
+    """A supervisor for the body of an `async with`, closed at its end: when something that it runs fails, the
+    body is cancelled, and that error raised."""
+    body = asyncio.current_task()
+    failures: list[Exception] = []
+
+    def fail(error: Exception) -> None:
+        failures.append(error)
+        if body is not None:
+            body.cancel()
+
+    supervisor = Supervisor(name, fail)
+    try:
+        yield supervisor
+    except asyncio.CancelledError:
+        # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
+        if failures and body is not None and body.uncancel() == 0:
+            raise failures[0] from None
+        raise
+    finally:
+        await supervisor.close()
+
+
+def _current_task() -> asyncio.Task[Any] | None:
+    try:
+        return asyncio.current_task()
+    except RuntimeError:  # the loop has stopped
+        return None

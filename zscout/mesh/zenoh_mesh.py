@@ -1,0 +1,267 @@
+"""The mesh over Zenoh."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any, Self
+
+import zenoh
+from zenoh.handlers import Callback, RingChannel
+
+from zscout import messages
+from zscout.config.fleet import MeshConfig
+from zscout.keyexpr import Keys, Sender
+from zscout.mesh import clock
+from zscout.mesh.protocol import MeshError
+from zscout.mesh.session import SessionMesh
+from zscout.mesh.settings import zenoh_config
+from zscout.mesh.transport import (
+    Collector,
+    OnSample,
+    Quality,
+    Transport,
+    TransportPublisher,
+    TransportQuery,
+    Undeclare,
+)
+from zscout.types import Ns
+
+log = logging.getLogger(__name__)
+
+CLOSE_TIMEOUT = 3.0
+"""Seconds that closing a session may take."""
+CONTROL: Any = {
+    "congestion_control": zenoh.CongestionControl.BLOCK,
+    "priority": zenoh.Priority.INTERACTIVE_HIGH,
+    "express": True,
+}
+QUALITIES: dict[Quality, dict[str, Any]] = {
+    Quality.CONTROL: CONTROL,
+    Quality.DATA: {
+        "congestion_control": zenoh.CongestionControl.DROP,
+        "priority": zenoh.Priority.DATA_LOW,
+        "express": False,
+    },
+    Quality.FRAME: {
+        "congestion_control": zenoh.CongestionControl.DROP,
+        "priority": zenoh.Priority.DATA,
+        "express": True,
+    },
+}
+_ENCODINGS: dict[type, zenoh.Encoding] = {}
+
+
+class ZenohMesh(SessionMesh):
+    """The mesh over a Zenoh session of this process."""
+
+    @classmethod
+    async def open(cls, fleet: str, me: Sender, config: MeshConfig | None = None) -> Self:
+        """Joins the mesh of `fleet`. Raises MeshError where an address can't be had."""
+        keys = Keys(fleet)
+        settings = zenoh_config(config or MeshConfig())
+        try:
+            session = await asyncio.to_thread(zenoh.open, settings)
+        except zenoh.ZError as error:
+            raise MeshError(
+                f"the mesh can't be joined: {error}; check listen and connect under [mesh]"
+            ) from None
+        return cls(ZenohTransport(session), keys, me, asyncio.get_running_loop())
+
+    def now(self) -> Ns:
+        return clock.now()
+
+
+class ZenohTransport(Transport):
+    # Every callback is direct: it runs on a thread of Zenoh's, where a plain function would get a thread of
+    # its own per declaration and per query.
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+
+    def links(self) -> int:
+        return len(self._session.info.links())
+
+    async def close(self) -> None:
+        # In a daemon thread: one of asyncio's own would be joined when the loop ends, however long it takes.
+        loop = asyncio.get_running_loop()
+        closed = asyncio.Event()
+
+        def close() -> None:
+            try:
+                self._session.close()  # type: ignore[no-untyped-call]
+            except zenoh.ZError as error:
+                log.warning("the mesh session did not close cleanly: %s", error)
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(closed.set)
+
+        threading.Thread(target=close, name="closes the mesh", daemon=True).start()
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                await closed.wait()
+        except TimeoutError:
+            log.warning("the mesh session did not close within %g s", CLOSE_TIMEOUT)
+
+    def get(self, key: str, payload: bytes | None, kind: type | None, timeout: float, to: Collector) -> None:
+        try:
+            self._session.get(
+                key,
+                _collecting(to),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout,
+                payload=payload,
+                encoding=None if kind is None else _encoding(kind),
+                **CONTROL,
+            )
+        except zenoh.ZError as error:
+            raise MeshError(f"{key} can't be asked: {error}") from None
+
+    def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
+        def on_zenoh_query(query: zenoh.Query) -> None:
+            on_query(ZenohQuery(query))
+
+        return _undeclare(self._session.declare_queryable(key, _direct(on_zenoh_query)))
+
+    def publisher(self, key: str, kind: type | None, quality: Quality) -> TransportPublisher:
+        return ZenohPublisher(
+            self._session.declare_publisher(key, encoding=_encoding(kind), **QUALITIES[quality])
+        )
+
+    def put(self, key: str, payload: bytes, kind: type) -> None:
+        try:
+            self._session.put(key, payload, encoding=_encoding(kind), **CONTROL)
+        except zenoh.ZError as error:
+            log.warning("a publication on %s was not sent: %s", key, error)
+
+    def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
+        def on_zenoh_sample(sample: zenoh.Sample) -> None:
+            attachment = sample.attachment
+            on_sample(
+                str(sample.key_expr),
+                sample.payload.to_bytes(),
+                None if attachment is None else attachment.to_bytes(),
+            )
+
+        return _undeclare(self._session.declare_subscriber(key, _direct(on_zenoh_sample)))
+
+    def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
+        subscriber = self._session.declare_subscriber(key, RingChannel(depth))
+
+        def take() -> tuple[str, bytes] | None:
+            sample = subscriber.try_recv()
+            return None if sample is None else (str(sample.key_expr), sample.payload.to_bytes())
+
+        return take, _undeclare(subscriber)
+
+    def token(self, key: str) -> Undeclare:
+        return _undeclare(self._session.liveliness().declare_token(key))
+
+    def token_subscriber(self, key: str, on_token: Callable[[str, bool], None]) -> Undeclare:
+        def on_zenoh_sample(sample: zenoh.Sample) -> None:
+            on_token(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        return _undeclare(
+            self._session.liveliness().declare_subscriber(key, _direct(on_zenoh_sample), history=True)
+        )
+
+    def tokens(self, key: str, timeout: float, to: Collector) -> None:
+        self._session.liveliness().get(key, _collecting(to), timeout=timeout)
+
+
+class ZenohQuery(TransportQuery):
+    __slots__ = ("_query",)
+
+    def __init__(self, query: zenoh.Query) -> None:
+        self._query = query
+
+    @property
+    def key(self) -> str:
+        return str(self._query.key_expr)
+
+    @property
+    def payload(self) -> bytes | None:
+        payload = self._query.payload
+        return None if payload is None else payload.to_bytes()
+
+    def reply(self, key: str, payload: bytes, kind: type) -> None:
+        try:
+            self._query.reply(key, payload, encoding=_encoding(kind))
+        except zenoh.ZError as error:
+            log.debug("a reply on %s was not sent: %s", key, error)
+        self.drop()
+
+    def reply_error(self, payload: bytes, kind: type) -> None:
+        try:
+            self._query.reply_err(payload, encoding=_encoding(kind))
+        except zenoh.ZError as error:
+            log.debug("an error reply was not sent: %s", error)
+        self.drop()
+
+    def drop(self) -> None:
+        self._query.drop()  # type: ignore[no-untyped-call]
+
+
+class ZenohPublisher(TransportPublisher):
+    def __init__(self, publisher: zenoh.Publisher) -> None:
+        self._publisher = publisher
+        self._listener: object = None
+
+    def undeclare(self) -> None:
+        _undeclare(self._publisher)()
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        try:
+            self._publisher.put(payload, attachment=attachment)
+        except zenoh.ZError as error:
+            log.warning("a publication on %s was not sent: %s", self._publisher.key_expr, error)
+
+    def match(self, on_matching: Callable[[bool], None]) -> bool:
+        def on_zenoh_matching(status: zenoh.MatchingStatus) -> None:
+            on_matching(bool(status.matching))
+
+        self._listener = self._publisher.declare_matching_listener(_direct(on_zenoh_matching))
+        # The package's own types call it a bool; the object it gives is true in either case.
+        status: Any = self._publisher.matching_status
+        return bool(status.matching)
+
+
+def _encoding(kind: type | None) -> zenoh.Encoding:
+    if kind is None:
+        return zenoh.Encoding.IMAGE_JPEG
+    encoding = _ENCODINGS.get(kind)
+    if encoding is None:
+        encoding = _ENCODINGS[kind] = zenoh.Encoding.APPLICATION_JSON.with_schema(messages.schema(kind))
+    return encoding
+
+
+def _collecting(to: Collector) -> Callback[zenoh.Reply]:
+    def on_reply(reply: zenoh.Reply) -> None:
+        sample = reply.ok
+        if sample is not None:
+            to.on_reply(str(sample.key_expr), sample.payload.to_bytes(), True)
+        elif reply.err is not None:
+            to.on_reply("", reply.err.payload.to_bytes(), False)
+
+    return Callback(on_reply, to.on_final, indirect=False)
+
+
+def _direct(callback: Callable[[Any], None]) -> Callback[Any]:
+    return Callback(callback, _nothing, indirect=False)
+
+
+def _nothing() -> None:
+    """Zenoh calls this when a declaration ends."""
+
+
+def _undeclare(declared: Any) -> Undeclare:
+    def undeclare() -> None:
+        try:
+            declared.undeclare()
+        except zenoh.ZError as error:
+            log.debug("undeclaring failed: %s", error)
+
+    return undeclare

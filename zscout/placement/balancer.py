@@ -1,0 +1,340 @@
+"""The pure core of the load balancer: reports and placements in, rankings out.
+
+A host is eligible if it has reported lately, is not cordoned, and meets the requirements. What was placed and
+is not in the reports yet is *pending*: policies `pending` and `two_choices` add it to the host's load, so
+that components that start together spread; the other policies use the reports only.
+
+- `least_loaded`: the best score (the paper; all on one host when all start at once: its Figure 3a).
+- `randomized`: the best after a little noise on each load (the cure that the paper proposes).
+  It changes the metrics that depend on load: `load_average` and `composite`.
+- `two_choices`: the better of two hosts drawn at random (Mitzenmacher, IEEE TPDS 12(10), 2001), first. Of two
+  that can't be told apart, the one that was chosen longer ago.
+- `pending`: the best score.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from bisect import insort
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from random import Random
+from typing import Final, TypeAlias
+
+from zscout.placement.metrics import SCORES, WORDS, Outlook
+from zscout.placement.model import (
+    DEFAULT_PROFILE,
+    STALE,
+    ComponentUsage,
+    HostReport,
+    Profile,
+    Ranking,
+    RankQuery,
+    ScoredHost,
+)
+from zscout.placement.profiles import MetricLearner, Observation, learn_profile
+from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns
+
+LOAD_TIME: Final = 60 * SECOND
+"""Time constant of the one-minute load average, in ns."""
+NOISE: Final = 0.25
+"""Greatest noise of policy `randomized`, in load a core."""
+COUNTING: Final = frozenset({"two_choices", "pending"})
+"""Policies that count what was placed and is not in the reports yet."""
+CLOSE: Final = 0.05
+"""Scores that differ by less, or by less of the greater, are equal to policy `two_choices`."""
+SETTLED: Final = 3 * SECOND
+"""A component's figures count for its kind's profile and for `auto` once it has run as long, in ns."""
+SHOWN: Final = 8 * LOAD_TIME
+"""A component that has run as long is in the load average but for a thousandth of it."""
+MAX_HOSTS: Final = 10_000
+MAX_KINDS: Final = 10_000
+MAX_PLACED: Final = 100_000
+
+_Found: TypeAlias = tuple[float, HostName]
+"""A host's score, negated: so the best comes first, and of equals the first by name."""
+
+
+@dataclass(slots=True)
+class _Placed:
+    """A component that this balancer's placer started, or that was found in a report (`adopted`)."""
+
+    kind: Kind
+    host: HostName
+    at: Ns
+    scores: Mapping[Metric, float]
+    seen: bool = False
+    learnt: bool = False
+    adopted: bool = False
+
+
+class Balancer:
+    """Everything that is known of hosts, kinds and placements. `rng` is for noise and lots."""
+
+    def __init__(self, rng: Random) -> None:
+        self._rng = rng
+        self.reports: dict[HostName, tuple[Ns, HostReport]] = {}
+        """The oldest first."""
+        self._outlooks: dict[HostName, Outlook] = {}
+        """From the reports alone."""
+        self.profiles: dict[Kind, Profile] = {}
+        self.cordoned: set[HostName] = set()
+        self.learner = MetricLearner()
+        self._placed: dict[ComponentId, _Placed] = {}
+        self._there: dict[HostName, set[ComponentId]] = {}
+        """The same by host, for hosts are lost many at once."""
+        self._pending: dict[HostName, dict[ComponentId, _Placed]] = {}
+        self._chosen: dict[HostName, int] = {}
+        self._choices = 0
+
+    def reported(self, now: Ns, report: HostReport) -> None:
+        """A load report came. One with an older number than the last is dropped."""
+        last = self.reports.get(report.host)
+        if last is not None and report.number <= last[1].number and now - last[0] < STALE:
+            return
+        if last is None and not self._room(now):
+            return
+        self.reports.pop(report.host, None)
+        self.reports[report.host] = (now, report)
+        self._outlooks[report.host] = Outlook(report, report.load_average[0], report.memory_available)
+        for use in report.uses:
+            self._add_sample(now, report, use)
+
+    def lost(self, host: HostName) -> None:
+        """A host is gone, and what ran there."""
+        self.reports.pop(host, None)
+        self._outlooks.pop(host, None)
+        self._pending.pop(host, None)
+        self._chosen.pop(host, None)
+        for component in self._there.pop(host, ()):
+            del self._placed[component]
+
+    def placed(self, now: Ns, component: ComponentId, kind: Kind, host: HostName) -> None:
+        """A component is being started on a host; it leaves the host that it was on."""
+        self.gone(component)
+        if len(self._placed) >= MAX_PLACED:
+            return
+        scores: dict[Metric, float] = {}
+        if host in self.reports:
+            outlook = self.outlook(now, host, pending=True)
+            scores = {metric: score([outlook], self.profile(kind))[0] for metric, score in SCORES.items()}
+            self._choices += 1
+            self._chosen[host] = self._choices
+        self._placed[component] = one = _Placed(kind, host, now, scores)
+        self._there.setdefault(host, set()).add(component)
+        self._pending.setdefault(host, {})[component] = one
+
+    def gone(self, component: ComponentId) -> None:
+        """A component ended, or did not start."""
+        one = self._placed.pop(component, None)
+        if one is not None:
+            there = self._there[one.host]
+            there.discard(component)
+            if not there:
+                del self._there[one.host]
+            self._let_go(component, one.host)
+
+    def _let_go(self, component: ComponentId, host: HostName) -> None:
+        waiting = self._pending.get(host, {})
+        waiting.pop(component, None)
+        if not waiting:
+            self._pending.pop(host, None)
+
+    def _room(self, now: Ns) -> bool:
+        """Room for a host more: where there is none, silent ones make it."""
+        if len(self.reports) >= MAX_HOSTS:
+            for host in [host for host in self.reports if self._silent(now, host)]:
+                self.lost(host)
+        return len(self.reports) < MAX_HOSTS
+
+    def _add_sample(self, now: Ns, report: HostReport, use: ComponentUsage) -> None:
+        one = self._placed.get(use.component)
+        if one is None and len(self._placed) < MAX_PLACED:
+            # Of a balancer before this one: its profile is learnt, and the load average shows it already.
+            one = _Placed(use.kind, report.host, now, {}, adopted=True)
+            self._placed[use.component] = one
+            self._there.setdefault(report.host, set()).add(use.component)
+        if one is None or one.host != report.host:
+            return
+        one.seen = True
+        if now - one.at >= SHOWN:
+            self._let_go(use.component, one.host)
+        if now - one.at < SETTLED:
+            return
+        if len(self.profiles) < MAX_KINDS or one.kind in self.profiles:
+            self.profiles[one.kind] = learn_profile(self.profiles.get(one.kind), use, report.speed)
+        if not one.learnt and use.served is not None and one.scores:
+            one.learnt = True
+            self.learner.add(Observation(one.scores, use.served * report.speed))
+
+    # Queries
+
+    def profile(self, kind: Kind) -> Profile:
+        return self.profiles.get(kind, DEFAULT_PROFILE)
+
+    def heaviest_first(self, components: Iterable[tuple[ComponentId, Kind]]) -> list[ComponentId]:
+        """The order in which to place components together: the heavy ones while there is most room."""
+
+        def weight(one: tuple[ComponentId, Kind]) -> tuple[float, int, ComponentId]:
+            profile = self.profile(one[1])
+            return -profile.cpu, -profile.memory, one[0]
+
+        return [component for component, _ in sorted(components, key=weight)]
+
+    def outlook(self, now: Ns, host: HostName, *, pending: bool) -> Outlook:
+        """A host as reported, with what is pending there if `pending`. Raises KeyError."""
+        outlook = self._outlooks[host]
+        if pending and host in self._pending:
+            report, load, memory = outlook.report, outlook.load, outlook.memory
+            for one in self._pending[host].values():
+                profile = self.profile(one.kind)
+                # The load average shows a component the better the longer it runs.
+                load += profile.wants(report.speed) * math.exp(-(now - one.at) / LOAD_TIME)
+                memory -= 0 if one.seen else profile.memory
+            return Outlook(report, load, memory)
+        return outlook
+
+    def rank(self, now: Ns, query: RankQuery, at_most: int | None = None) -> Ranking:
+        """Hosts best first, by the metric and policy of the query; `at_most` are listed."""
+        metric, why = query.metric, "as asked"
+        if metric == "auto":
+            metric, why = self.learner.choose(self._rng)
+        fit, left_out = self._fit(now, query)
+        if query.policy == "randomized":
+            fit = {host: self._noisy(outlook) for host, outlook in sorted(fit.items())}
+        profile = self.profile(query.kind)
+        scores = SCORES[metric](list(fit.values()), profile)
+        found = [(-score, host) for score, host in zip(scores, fit, strict=True)]
+        named = len(found) if at_most is None else at_most
+        if query.policy == "two_choices":
+            best_first = self._two_choices(found)[:named]
+        else:
+            best_first = heapq.nsmallest(named, found)
+        words = WORDS[metric]
+        return Ranking(
+            tuple(ScoredHost(host, -value, words(fit[host], profile)) for value, host in best_first),
+            metric,
+            why,
+            left_out,
+            more=len(found) - len(best_first),
+        )
+
+    def _noisy(self, outlook: Outlook) -> Outlook:
+        noise = self._rng.random() * NOISE * outlook.report.cores
+        return replace(outlook, load=outlook.load + noise)
+
+    def _two_choices(self, found: list[_Found]) -> list[_Found]:
+        """The better of two that are drawn, then the other, then the rest."""
+        best_first = sorted(found)
+        if len(best_first) > 1:
+            drawn = self._rng.sample(best_first, 2)
+            first = self._better(*drawn)
+            best_first.sort(key=lambda one: (one is not first, one not in drawn))
+        return best_first
+
+    def _better(self, one: _Found, other: _Found) -> _Found:
+        if math.isclose(one[0], other[0], rel_tol=CLOSE, abs_tol=CLOSE):
+            return min(one, other, key=lambda found: self._chosen.get(found[1], 0))
+        return min(one, other)
+
+    def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
+        """Eligible hosts, and why the others are not."""
+        needs, pending = query.requirements, query.policy in COUNTING
+        doubtful: Iterable[HostName]
+        if query.hosts is not None or self.cordoned or needs.labels or needs.memory:
+            fit: dict[HostName, Outlook] = {}
+            doubtful = self.reports if query.hosts is None else query.hosts
+        else:
+            # Of thousands, only those are examined that may differ from their reports.
+            fit = self._outlooks.copy()
+            doubtful = [*self._overdue(now), *(self._pending.keys() & fit.keys() if pending else ())]
+        left_out: dict[HostName, str] = {}
+        for host in doubtful:
+            reason = self._unfit(now, host, query)
+            if reason:
+                left_out[host] = reason
+                fit.pop(host, None)
+            else:
+                fit[host] = self.outlook(now, host, pending=pending)
+        return fit, dict(sorted(left_out.items()))
+
+    def _overdue(self, now: Ns) -> Iterator[HostName]:
+        """Hosts whose last report is too old."""
+        for host, (at, _) in self.reports.items():
+            if now - at <= STALE:
+                return
+            yield host
+
+    def _unfit(self, now: Ns, host: HostName, query: RankQuery) -> str:
+        """Why a host is not eligible; empty if it is."""
+        cordoned = "it is cordoned" if host in self.cordoned else ""
+        return self._silent(now, host) or cordoned or self._lacks(now, host, query)
+
+    def _silent(self, now: Ns, host: HostName) -> str:
+        last = self.reports.get(host)
+        if last is None:
+            return "no report of it"
+        age = now - last[0]
+        return f"its last report is {age / SECOND:.1f} s old" if age > STALE else ""
+
+    def _lacks(self, now: Ns, host: HostName, query: RankQuery) -> str:
+        _, report = self.reports[host]
+        missing = sorted(query.requirements.labels - report.labels)
+        if missing:
+            return f"it has no label {', '.join(missing)}"
+        required = query.requirements.memory
+        if required:
+            available = max(0, self.outlook(now, host, pending=query.policy in COUNTING).memory)
+            if available < required:
+                return f"{available:,} bytes available, {required:,} required"
+        return ""
+
+
+@dataclass(slots=True)
+class _Cached:
+    query: RankQuery
+    ranking: Ranking
+    changed: set[HostName]
+
+
+class RankingCache:
+    """Rankings of one instant. To rank a thousand hosts takes milliseconds, and of many components that are
+    placed in one instant each changes one host: only that one is ranked anew."""
+
+    def __init__(self, balancer: Balancer) -> None:
+        self._balancer = balancer
+        self._now: Ns = 0
+        self._cached: dict[RankQuery, _Cached] = {}
+
+    def begin(self, now: Ns) -> None:
+        """Another instant, or hosts were cordoned: nothing is cached."""
+        self._now, self._cached = now, {}
+
+    def invalidate(self, host: HostName) -> None:
+        """A component came to a host or left it."""
+        for cached in self._cached.values():
+            cached.changed.add(host)
+
+    def rank(self, query: RankQuery) -> Ranking:
+        if query.metric == "auto" or query.policy in ("randomized", "two_choices"):
+            # These draw lots, each time anew.
+            return self._balancer.rank(self._now, query)
+        cached = self._cached.get(query)
+        if cached is None:
+            cached = self._cached[query] = _Cached(query, self._balancer.rank(self._now, query), set())
+        elif cached.changed:
+            cached.ranking = self._updated(cached)
+            cached.changed = set()
+        return cached.ranking
+
+    def _updated(self, cached: _Cached) -> Ranking:
+        changed, old = cached.changed, cached.ranking
+        if cached.query.hosts is not None:
+            changed = changed & cached.query.hosts
+        new = self._balancer.rank(self._now, replace(cached.query, hosts=frozenset(changed)))
+        hosts = [one for one in old.hosts if one.host not in changed]
+        for one in new.hosts:
+            insort(hosts, one, key=lambda one: (-one.score, one.host))
+        left_out = {host: why for host, why in old.left_out.items() if host not in changed}
+        return replace(old, hosts=tuple(hosts), left_out=left_out | dict(new.left_out))

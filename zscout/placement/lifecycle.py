@@ -1,0 +1,413 @@
+"""The life of a component that does not move: placed, started, restarted, given up, stopped."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from zscout.placement.events import ComponentState, PlacementSpec, StartAnswered, StopAnswered
+from zscout.placement.model import ScoredHost
+from zscout.placement.orphans import Orphans, Probes
+from zscout.placement.state import (
+    OVER,
+    PROBE_TIMEOUT,
+    STOP_TIMEOUT,
+    ComponentRecord,
+    PlacementState,
+    Termination,
+)
+from zscout.types import SECOND, ComponentId, HostName, Ns
+
+GRACE: Final[Ns] = 2 * SECOND
+"""Within this a host must report what was inherited, or went on elsewhere."""
+MAX_PROBES: Final = 3
+"""A component without token of which so many probes report nothing is lost."""
+TRY_AGAIN: Final[Ns] = SECOND
+"""After this a component without an eligible host is tried again."""
+AT_ONCE: Final = 100
+"""Components placed in one instant; the next follow SHORTLY after."""
+SHORTLY: Final[Ns] = SECOND // 100
+CAUSES_NAMED: Final = 4
+"""In the reason why no host can start a component."""
+
+WAITING, STARTING, RUNNING = ComponentState.WAITING, ComponentState.STARTING, ComponentState.RUNNING
+BACKING_OFF, STOPPING = ComponentState.BACKING_OFF, ComponentState.STOPPING
+ENDED, GIVEN_UP = ComponentState.ENDED, ComponentState.GIVEN_UP
+
+
+class Lifecycle:
+    """Decides for every component that is not `moving`; for that, see `Migrations`."""
+
+    def __init__(self, state: PlacementState, orphans: Orphans, probes: Probes) -> None:
+        self.state, self.orphans, self.probes = state, orphans, probes
+
+    # Requests
+
+    def place(self, component: ComponentId, spec: PlacementSpec) -> None:
+        state = self.state
+        record = state.get(component)
+        if record is None:
+            record = state.add(component, spec)
+            if record is None:
+                count = len(state.components)
+                state.refuse(component, "too_many", f"{count} components are placed already")
+                return
+            self.place_again(record)
+        elif record.state in OVER:
+            state.revive(record)
+            self._reset(record, spec)
+            record.superseded = True
+            self.place_again(record)
+        elif not record.wanted:
+            # It is being stopped; what is requested now comes after that.
+            self._reset(record, spec)
+        elif record.spec != spec:
+            message = f"{component} is placed already, and is another: stop it first, or take another name"
+            state.refuse(component, "exists", message)
+            return
+        state.mark_changed(component, always=True)
+
+    def _reset(self, record: ComponentRecord, spec: PlacementSpec) -> None:
+        record.spec, record.wanted, record.movable = spec, True, False
+        record.restarts = record.failed_rounds = record.moves = 0
+        record.dead = None
+        record.reason = record.restart_cause = record.tail = ""
+        record.tried.clear()
+
+    def stop(self, record: ComponentRecord) -> None:
+        """For good. A migration must have been cancelled before."""
+        record.wanted = False
+        self.state.mark_changed(record.component, always=True)
+        if record.state is GIVEN_UP:
+            self._finish(record, ENDED, "stopped")
+        elif record.state not in (ENDED, STOPPING):
+            nowhere = record.state in (WAITING, BACKING_OFF)
+            record.enter(STOPPING)
+            record.reason = "asked to stop"
+            if nowhere:
+                self.check_stopped(record)
+            else:
+                record.unanswered = 0
+                self._command_stop(record)
+
+    # Choosing a host
+
+    def place_again(self, record: ComponentRecord, cause: str = "") -> None:
+        """Has it placed at the end of this instant."""
+        record.enter(WAITING)
+        record.restart_cause, record.whereabouts_unknown = cause, False
+        self.state.wake(record, None)
+        self.state.to_place[record.component] = None
+
+    def place_waiting(self) -> None:
+        """Places what is to be placed, the heaviest first."""
+        state = self.state
+        names = [name for name in state.to_place if name in state.components]
+        state.to_place = {}
+        waiting = [
+            (name, state.components[name].spec.kind)
+            for name in names
+            if state.components[name].state is WAITING
+        ]
+        for number, component in enumerate(state.balancer.heaviest_first(waiting)):
+            record = state.components[component]
+            state.mark_changed(component)
+            if number < AT_ONCE:
+                self._choose_host(record)
+            else:
+                record.reason = record.reason or "others are placed first"
+                state.wake(record, state.now + SHORTLY)
+
+    def _choose_host(self, record: ComponentRecord) -> None:
+        """The best host that was not tried in this round."""
+        eligible = self.state.eligible_hosts(record.spec)
+        hosts, tried = eligible.hosts, record.tried
+        untried = next((one for one in hosts if one.host not in tried), None)
+        if untried is not None:
+            self._start_on(record, untried)
+        elif not hosts:
+            tried.clear()
+            reason = f"no host will do: {eligible.why_none()}"
+            # Ages and amounts in it change all the time: that is not published.
+            if _without_figures(record.reason) != _without_figures(reason):
+                record.reason = reason
+            self.state.wake(record, self.state.now + TRY_AGAIN)
+        elif all(tried[one.host] for one in hosts):
+            causes = list(dict.fromkeys(tried[one.host] for one in hosts))
+            more = f"; and {len(causes) - CAUSES_NAMED} more" if len(causes) > CAUSES_NAMED else ""
+            reason = f"no host can start it: {'; '.join(causes[:CAUSES_NAMED])}{more}"
+            self._finish(record, GIVEN_UP, reason)
+        else:
+            tried.clear()
+            pause = self.state.back_off_time(record.failed_rounds)
+            record.failed_rounds += 1
+            reason = f"no host started it; tried again after {_seconds(pause)}: {record.restart_cause}"
+            self._back_off(record, reason, pause)
+
+    def _start_on(self, record: ComponentRecord, chosen: ScoredHost) -> None:
+        state, cause = self.state, record.restart_cause
+        record.enter(STARTING)
+        record.incarnation = state.next_incarnation(record.component)
+        record.host, record.superseded, record.running_since = chosen.host, False, None
+        record.token, record.confirmed, record.probed, record.unanswered = False, False, False, 0
+        record.reason = record.host_reason = f"{cause}; here: {chosen.reason}" if cause else chosen.reason
+        state.component_arrives(record.component, record.spec.kind, chosen.host)
+        state.start(record)
+
+    def _back_off(self, record: ComponentRecord, reason: str, pause: Ns) -> None:
+        record.enter(BACKING_OFF)
+        record.reason = reason
+        self.state.wake(record, self.state.now + pause)
+
+    def _finish(self, record: ComponentRecord, over: ComponentState, reason: str) -> None:
+        record.enter(over)
+        record.reason, record.drain_reason, record.restart_cause = reason, "", ""
+        record.whereabouts_unknown = False
+        self.state.retire(record)
+
+    # Starting and running
+
+    def start_answered(self, record: ComponentRecord, answer: StartAnswered) -> None:
+        """Of the record's own incarnation, not of a migration's target."""
+        record.start_until = None
+        if record.state is STOPPING:
+            # The stop may have come before the start: once more.
+            if answer.result in ("refused", "failed"):
+                self.stopped(record)
+            else:
+                self._command_stop(record)
+        elif answer.result == "failed" and record.state is not STARTING:
+            self.ended(record, Termination("failed", answer.reason, answer.tail))
+        elif answer.result == "ok":
+            record.movable, record.confirmed = answer.movable, True
+            self.runs(record)
+        elif record.state is STARTING:
+            self._not_started(record, answer)
+
+    def _not_started(self, record: ComponentRecord, answer: StartAnswered) -> None:
+        state, host = self.state, answer.host
+        if answer.result == "unknown":
+            pause = state.back_off_time(record.unanswered)
+            record.unanswered += 1
+            record.reason = f"{host} does not say whether it started: {answer.reason or 'no answer'}"
+            state.wake(record, state.now + pause)
+        elif answer.result == "refused":
+            record.ended_incarnations.append(record.incarnation)
+            state.component_left(record)
+            if answer.again:
+                # The host may know of another incarnation that lives there.
+                state.probe(record.component, host)
+            cause = f"{host} refused it: {answer.reason}"
+            record.tried[host] = "" if answer.again else cause
+            self.place_again(record, cause)
+        else:
+            self._start_failed(record, Termination("failed", answer.reason, answer.tail), again=answer.again)
+
+    def _start_failed(self, record: ComponentRecord, end: Termination, *, again: bool = True) -> None:
+        """It ended before it ran: the next host at once, a few times."""
+        host = record.host or "its host"
+        record.ended_incarnations.append(record.incarnation)
+        record.start_until, record.tail = None, end.tail
+        self.state.component_left(record)
+        cause = f"it did not start on {host}: {end.reason or end.cause}"
+        record.tried[host] = "" if again else cause
+        record.restarts += 1
+        if not self._exhausted(record, cause):
+            self.place_again(record, cause)
+
+    def runs(self, record: ComponentRecord, *, anew: bool = False) -> None:
+        """It is known to run where it is; `anew`: as another incarnation than before."""
+        if record.state is not RUNNING or anew:
+            record.enter(RUNNING)
+            record.running_since, record.whereabouts_unknown = self.state.now, False
+            record.failed_rounds, record.reason = 0, record.host_reason
+            record.tried.clear()
+        record.unanswered, record.start_until = 0, None
+        self.watch(record)
+        self.state.drain_soon(record.host)
+
+    def watch(self, record: ComponentRecord) -> None:
+        """Sets when a running component is checked next."""
+        state, at = self.state, None
+        if not (record.token and record.confirmed):
+            at = state.now + PROBE_TIMEOUT
+        elif record.restarts and record.running_since is not None:
+            at = max(state.now, record.running_since + state.rules.settled)
+        state.wake(record, at)
+
+    def check(self, record: ComponentRecord) -> Termination | None:
+        """Probes the host of a running component that has no token or is not confirmed, and resets the count
+        of restarts of one that settled. Returns how it ended, if it is to be taken for lost."""
+        state, host = self.state, record.host
+        if record.running_since is not None and state.now - record.running_since >= state.rules.settled:
+            record.restarts = 0
+        if record.token and record.confirmed:
+            self.watch(record)
+            return None
+        if host is None or host not in state.alive:
+            return Termination("lost", f"host {host} is gone", with_host=True)
+        if record.unanswered >= MAX_PROBES and not record.token:
+            self.orphans.add(record.component, record.incarnation, host)
+            return Termination("lost", f"its token is gone, and {host} tells nothing of it")
+        record.unanswered += 1
+        record.probed = True
+        state.probe(record.component, host)
+        state.wake(record, state.now + PROBE_TIMEOUT)
+        return None
+
+    # Ends and restarts
+
+    def ended(self, record: ComponentRecord, end: Termination) -> None:
+        """The record's incarnation has ended, or is taken for lost."""
+        state, rules = self.state, self.state.rules
+        if record.state is STOPPING:
+            self.stopped(record, certain=end.cause != "lost")
+            return
+        if record.state is STARTING and end.cause in ("failed", "lost") and not end.with_host:
+            self._start_failed(record, end)
+            return
+        host = record.host or "its host"
+        ran = state.now - record.running_since if record.running_since is not None else 0
+        if end.cause != "lost":
+            record.ended_incarnations.append(record.incarnation)
+        elif record.host is not None and end.with_host:
+            # It may come back with its host.
+            self.probes.add(record.host, record.component)
+        record.start_until, record.tail, record.drain_reason, record.unanswered = None, end.tail, "", 0
+        state.component_left(record)
+        if end.cause in ("moved", "superseded") and not record.whereabouts_unknown:
+            record.whereabouts_unknown = True
+            reason = f"it went on elsewhere ({end.cause}), it is not known where"
+            self._back_off(record, reason, GRACE)
+            return
+        cause = _cause(end, host)
+        if end.cause == "completed" and record.spec.restart != "always":
+            self._finish(record, ENDED, cause)
+        elif record.spec.restart == "never":
+            self._finish(record, GIVEN_UP if end.cause == "failed" else ENDED, cause)
+        elif end.with_host:
+            record.tried.clear()
+            self.place_again(record, cause)
+        elif ran >= rules.settled:
+            record.restarts = 0
+            self.place_again(record, cause)
+        else:
+            pause = state.back_off_time(record.restarts)
+            record.restarts += 1
+            if end.cause == "completed" or not self._exhausted(record, cause):
+                self._back_off(record, f"{cause}; started again after {_seconds(pause)}", pause)
+                record.restart_cause = cause
+
+    def _exhausted(self, record: ComponentRecord, cause: str) -> bool:
+        """Gives it up if that was its last try."""
+        if record.spec.restart == "never":
+            self._finish(record, GIVEN_UP, cause)
+        elif record.restarts >= self.state.rules.restarts:
+            self._finish(record, GIVEN_UP, f"{cause}; {record.restarts} starts in a row failed")
+        return record.state is GIVEN_UP
+
+    def host_lost(self, record: ComponentRecord, host: HostName) -> None:
+        self.ended(record, Termination("lost", f"host {host} is gone", with_host=True))
+
+    # Stopping
+
+    def _command_stop(self, record: ComponentRecord) -> None:
+        state = self.state
+        if record.host is not None and record.host in state.alive:
+            record.stop_confirmed = False
+            state.stop(record.component, record.incarnation, record.host)
+            state.wake(record, state.now + STOP_TIMEOUT)
+        elif record.host is None or state.now >= record.not_before:
+            self.stopped(record, certain=False)
+        else:
+            # Inherited: its host may be there, and has not joined yet.
+            state.wake(record, record.not_before)
+
+    def stop_answered(self, record: ComponentRecord, answer: StopAnswered) -> None:
+        state = self.state
+        record.stop_confirmed = answer.done
+        if not answer.done:
+            record.unanswered += 1
+            state.wake(record, state.now + state.back_off_time(record.unanswered))
+        elif record.start_until is not None or record.token:
+            # It began after that was reported, or its token goes in a moment.
+            state.wake(record, state.now + SECOND)
+        else:
+            self.stopped(record)
+
+    def stopped(self, record: ComponentRecord, *, certain: bool = True) -> None:
+        """What was stopped has ended; `certain` False: its host is gone."""
+        if certain:
+            record.ended_incarnations.append(record.incarnation)
+        elif record.host is not None:
+            self.probes.add(record.host, record.component)
+        record.start_until = None
+        self.state.component_left(record)
+        self.state.wake(record, None)
+        self.check_stopped(record)
+
+    def check_stopped(self, record: ComponentRecord) -> None:
+        """Stopped is a component once its orphans have ended, too."""
+        if record.host is not None or self.orphans.any(record.component):
+            return
+        if record.wanted:
+            record.superseded = True
+            self.place_again(record)
+        else:
+            self._finish(record, ENDED, "stopped")
+
+    def orphan_ended(self, component: ComponentId) -> None:
+        record = self.state.get(component)
+        if record is not None and record.state is STOPPING:
+            self.check_stopped(record)
+
+    # Time
+
+    def timer(self, record: ComponentRecord) -> None:
+        state = self.state
+        match record.state:
+            case ComponentState.BACKING_OFF if record.whereabouts_unknown:
+                record.whereabouts_unknown = False
+                self.ended(record, Termination("lost", "it went on elsewhere and was not heard of again"))
+            case ComponentState.WAITING | ComponentState.BACKING_OFF:
+                self.place_again(record, record.restart_cause)
+            case ComponentState.STARTING:
+                self._repeat_start(record)
+            case ComponentState.RUNNING:
+                if (end := self.check(record)) is not None:
+                    self.ended(record, end)
+            case ComponentState.STOPPING:
+                if record.start_until is not None and record.start_until <= state.now:
+                    record.start_until = None
+                self._command_stop(record)
+            case _:
+                state.forget(record.component)
+
+    def _repeat_start(self, record: ComponentRecord) -> None:
+        host = record.host
+        if host is None or host not in self.state.alive:
+            self.host_lost(record, host or "of its start")
+        elif record.start_until is not None:
+            self.start_answered(record, StartAnswered(record.component, record.incarnation, host, "unknown"))
+        else:
+            self.state.start(record)
+
+
+def _cause(end: Termination, host: HostName) -> str:
+    match end.cause:
+        case "completed":
+            return f"it completed on {host}" + (f": {end.reason}" if end.reason else "")
+        case "failed":
+            return f"it failed on {host}: {end.reason or 'no reason was told'}"
+        case "stopped":
+            return f"it was stopped on {host}, and not by the placer"
+        case _:
+            return end.reason
+
+
+def _seconds(pause: Ns) -> str:
+    return f"{pause / SECOND:g} s"
+
+
+def _without_figures(reason: str) -> str:
+    return re.sub(r"[\d.,]+", "#", reason)

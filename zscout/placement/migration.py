@@ -1,0 +1,358 @@
+"""Moving running components: on request, off a drained host, or because it pays (`rebalancing`).
+
+A standby starts on the target, then the source hands over to it. Whatever goes wrong, one of the two goes on;
+where no answer says which, both hosts are probed.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from zscout.placement.balancer import MAX_HOSTS
+from zscout.placement.events import ComponentState, MoveAnswered, StartAnswered
+from zscout.placement.lifecycle import Lifecycle
+from zscout.placement.state import (
+    PROBE_TIMEOUT,
+    ComponentRecord,
+    Migration,
+    PlacementState,
+    Termination,
+    TimerKind,
+)
+from zscout.types import SECOND, ComponentId, HostName, Ns
+
+MAX_STARTS: Final = 3
+"""Starts of the standby that are not answered."""
+HAND_OVER_TIMEOUT: Final[Ns] = 30 * SECOND
+"""After this both hosts are probed."""
+MAX_PROBES: Final = 3
+MAX_PATIENT_PROBES: Final = 15
+"""While one runs and the other stands by: they may be at it still, and a standby ends itself after 30 s."""
+RETRY: Final[Ns] = 5 * SECOND
+"""From a move off a drained host that failed to the next."""
+MOVES_PER_HOST: Final = 2
+"""Off a drained host at the same time."""
+
+RUNNING, MOVING = ComponentState.RUNNING, ComponentState.MOVING
+
+
+class Migrations:
+    """Decides for components that are `moving`."""
+
+    def __init__(self, state: PlacementState, lifecycle: Lifecycle) -> None:
+        self.state, self.lifecycle = state, lifecycle
+
+    # Beginning
+
+    def request(self, component: ComponentId, to: HostName | None) -> None:
+        state = self.state
+        record = state.get(component)
+        if record is None:
+            state.refuse(component, "unknown_component", f"there is no component {component}")
+        elif record.migration is not None:
+            if to in (None, record.migration.to):
+                state.mark_changed(component, always=True)
+            else:
+                message = f"{component} is moving to {record.migration.to} already: wait for that"
+                state.refuse(component, "move_failed", message)
+        elif record.state is not RUNNING:
+            message = f"{component} does not run: it is {record.state.replace('_', ' ')}"
+            state.refuse(component, "not_running", message)
+        elif to == record.host:
+            state.mark_changed(component, always=True)
+        elif not record.movable:
+            state.refuse(component, "not_movable", f"{component} gives no checkpoint: it can't be moved")
+        else:
+            eligible = state.eligible_hosts(record.spec, other_than=record.host, only=to)
+            if eligible.hosts:
+                self.begin(record, eligible.hosts[0].host, "as asked")
+                state.mark_changed(component, always=True)
+            elif to is not None:
+                message = f"{component} can't move there: {eligible.why_none()}"
+                state.refuse(component, "unknown_host", message)
+            else:
+                message = f"no other host will do for {component}: {eligible.why_none()}"
+                state.refuse(component, "move_failed", message)
+
+    def begin(self, record: ComponentRecord, to: HostName, why: str) -> None:
+        """The record runs and is movable, and `to` is eligible for it. `why`: in words."""
+        state = self.state
+        record.enter(MOVING)
+        record.migration = Migration(to, state.next_incarnation(record.component), why)
+        record.reason, record.drain_reason = f"moving to {to}, {why}", ""
+        state.component_arrives(_reservation(record), record.spec.kind, to)
+        state.start_standby(record, record.migration)
+
+    # The target
+
+    def target_answered(self, record: ComponentRecord, move: Migration, answer: StartAnswered) -> None:
+        if move.stage != "starting":
+            return
+        move.start_until = None
+        match answer.result:
+            case "ok":
+                move.stage, move.tries, move.target = "handing_over", 0, "standby"
+                self.state.wake_migration(record, self.state.now + HAND_OVER_TIMEOUT)
+                self.state.hand_over(record, move)
+                if not record.token:
+                    self._probe(record, move)
+            case "unknown":
+                self._target_silent(record, move, answer.reason or "it does not answer")
+            case _:
+                move.target = "ended"
+                self._stay(record, move, f"{answer.result}: {answer.reason}")
+
+    def _target_silent(self, record: ComponentRecord, move: Migration, reason: str) -> None:
+        move.start_until = None
+        move.tries += 1
+        if move.tries >= MAX_STARTS:
+            self._stay(record, move, reason)
+        else:
+            self.state.wake_migration(record, self.state.now + self.state.back_off_time(move.tries - 1))
+
+    def target_appeared(self, record: ComponentRecord, move: Migration) -> None:
+        """Its token: it has taken over. The source answers in a moment with the dead time."""
+        move.token, move.target = True, "running"
+        if move.stage == "handing_over" and move.source == "running":
+            self.state.wake_migration(record, self.state.now + PROBE_TIMEOUT)
+        else:
+            self._finish(record, move)
+
+    def target_listed(
+        self, record: ComponentRecord, move: Migration, *, running: bool, standby: bool
+    ) -> None:
+        if running:
+            move.target = "running"
+            if move.stage == "starting":
+                self._finish(record, move)
+            elif move.stage == "probing":
+                self._judge(record, move)
+        elif standby and move.stage == "starting":
+            self.target_answered(
+                record, move, StartAnswered(record.component, move.incarnation, move.to, "ok")
+            )
+        elif standby and move.stage == "probing":
+            move.target = "standby"
+            self._judge(record, move)
+
+    def target_ended(self, record: ComponentRecord, move: Migration, reason: str) -> None:
+        move.target, move.token = "ended", False
+        if move.stage == "starting":
+            self._stay(record, move, reason)
+        elif move.stage == "probing":
+            self._judge(record, move)
+
+    def target_host_lost(self, record: ComponentRecord, move: Migration) -> None:
+        if move.source == "ended":
+            self._lose(record, move)
+        else:
+            self._stay(record, move, f"host {move.to} is gone")
+
+    # The source
+
+    def answered(self, record: ComponentRecord, move: Migration, answer: MoveAnswered) -> None:
+        if move.stage == "starting":
+            return
+        if answer.result == "moved":
+            move.source = "ended"
+            self._finish(record, move, answer.dead)
+        elif answer.result == "unknown" or move.token:
+            # Refused, and yet the target took over: it was given back, or was not.
+            self._probe(record, move)
+        else:
+            self._stay(record, move, answer.reason)
+
+    def source_ended(self, record: ComponentRecord, move: Migration, end: Termination) -> None:
+        if move.stage == "starting":
+            self.cancel(record)
+            self.lifecycle.ended(record, end)
+            return
+        move.source, move.termination = "ended", end
+        if end.cause == "moved" or move.target == "running":
+            self._finish(record, move)
+        else:
+            self._probe(record, move)
+
+    def source_host_lost(self, record: ComponentRecord, move: Migration) -> None:
+        end = Termination("lost", f"host {record.host} is gone", with_host=True)
+        self.source_ended(record, move, end)
+
+    def source_vanished(self, record: ComponentRecord, move: Migration) -> None:
+        """Its token is gone: as a rule because it handed over, and its answer is on its way."""
+        if move.stage == "starting":
+            record.unanswered = 0
+            self.source_timer(record, move)
+        elif move.stage == "handing_over":
+            self.state.wake_migration(record, self.state.now + PROBE_TIMEOUT)
+
+    def source_timer(self, record: ComponentRecord, move: Migration) -> None:
+        if move.stage == "starting" and (end := self.lifecycle.check(record)) is not None:
+            self.source_ended(record, move, end)
+
+    def source_runs(self, record: ComponentRecord, move: Migration) -> None:
+        if move.stage == "probing":
+            move.source = "running"
+            self._judge(record, move)
+
+    # Which of them goes on
+
+    def _probe(self, record: ComponentRecord, move: Migration) -> None:
+        """Asks both hosts, or the one that is left."""
+        state = self.state
+        if move.stage != "probing":
+            move.stage, move.tries = "probing", 0
+        move.tries += 1
+        if move.source != "ended":
+            move.source = "unknown"
+            state.probe(record.component, record.host)
+        if not move.token and move.target != "ended":
+            move.target = "unknown"
+            state.probe(record.component, move.to)
+        state.wake_migration(record, state.now + PROBE_TIMEOUT)
+        self._judge(record, move)
+
+    def _judge(self, record: ComponentRecord, move: Migration) -> None:
+        match move.source, move.target:
+            case _, "running":
+                self._finish(record, move)
+            case "ended", "ended":
+                self._lose(record, move)
+            case "ended", "standby" if move.tries > 1 or (move.termination and move.termination.with_host):
+                self._lose(record, move)
+            case "running", "ended":
+                self._stay(record, move, "what stood by there has ended")
+            case _:
+                pass
+
+    def timer(self, record: ComponentRecord, move: Migration) -> None:
+        patient = (move.source, move.target) == ("running", "standby")
+        probes = MAX_PATIENT_PROBES if patient else MAX_PROBES
+        if move.stage == "starting" and move.start_until is not None:
+            self._target_silent(record, move, "it does not answer")
+        elif move.stage == "starting":
+            self.state.start_standby(record, move)
+        elif move.stage == "handing_over" or move.tries < probes:
+            self._probe(record, move)
+        elif move.source == "ended":
+            self._lose(record, move)
+        else:
+            self._stay(record, move, "nobody tells what came of it")
+
+    # Ends of a migration
+
+    def _finish(self, record: ComponentRecord, move: Migration, dead: Ns | None = None) -> None:
+        """The target runs, and is the record's incarnation from now on."""
+        state, old, source, token = self.state, record.incarnation, record.host, record.token
+        self._close(record, move)
+        state.component_left(record)
+        if move.source == "ended" or source is None:
+            record.ended_incarnations.append(old)
+        else:
+            self.lifecycle.orphans.add(record.component, old, source, token=token)
+        record.incarnation, record.host, record.token = move.incarnation, move.to, move.token
+        record.moves += 1
+        record.dead = dead
+        record.start_until, record.confirmed, record.probed = None, True, False
+        record.host_reason = f"moved from {source}, {move.why}"
+        state.component_arrives(record.component, record.spec.kind, move.to)
+        self.lifecycle.runs(record, anew=True)
+        state.drain_soon(source)
+
+    def _stay(self, record: ComponentRecord, move: Migration, reason: str) -> None:
+        """The source goes on."""
+        self.cancel(record, stop_standby=move.target != "ended")
+        record.reason = f"it did not move to {move.to}, {move.why}: {reason}"
+        record.unanswered = 0
+        self.lifecycle.watch(record)
+        self.state.drain_soon(record.host)
+
+    def _lose(self, record: ComponentRecord, move: Migration) -> None:
+        """Neither goes on: it is started anew, if it is to be."""
+        self.cancel(record)
+        self.lifecycle.ended(record, move.termination or Termination("lost", "it was lost while it moved"))
+
+    def cancel(self, record: ComponentRecord, *, stop_standby: bool = True) -> None:
+        """Ends the migration, if there is one."""
+        move = record.migration
+        if move is not None:
+            self._close(record, move)
+            if stop_standby:
+                self.lifecycle.orphans.add(
+                    record.component, move.incarnation, move.to, move.start_until, token=move.token
+                )
+
+    def _close(self, record: ComponentRecord, move: Migration) -> None:
+        state = self.state
+        state.balancer.gone(_reservation(record))
+        state.rankings.invalidate(move.to)
+        record.migration, record.not_before = None, state.now + RETRY
+        record.enter(RUNNING)
+        state.wake_migration(record, None)
+
+    # Drained hosts: nothing is placed there, and what is movable leaves, heaviest first
+
+    def drain(self, host: HostName) -> None:
+        """An unknown host is refused: it is a slip of the pen, and the host that was meant would go on."""
+        state = self.state
+        cordoned = state.balancer.cordoned
+        if host not in cordoned:
+            if host not in state.alive and host not in state.balancer.reports:
+                state.refuse(host, "unknown_host", f"there is no host {host}")
+                return
+            if len(cordoned) >= MAX_HOSTS:
+                state.refuse(host, "too_many", f"{len(cordoned)} hosts are drained already")
+                return
+        cordoned.add(host)
+        state.rankings.begin(state.now)
+        state.drain_soon(host)
+
+    def uncordon(self, host: HostName) -> None:
+        state = self.state
+        state.balancer.cordoned.discard(host)
+        state.rankings.begin(state.now)
+        for record in state.components.values():
+            if record.state is ComponentState.WAITING:
+                state.wake(record, max(state.now, record.not_before))
+            elif record.host == host and record.drain_reason:
+                record.drain_reason = ""
+                state.mark_changed(record.component)
+
+    def drain_timer(self) -> None:
+        on: dict[HostName, list[ComponentRecord]] = {}
+        for record in self.state.components.values():
+            if record.host in self.state.balancer.cordoned and record.state in (RUNNING, MOVING):
+                on.setdefault(record.host, []).append(record)
+        for host in sorted(on):
+            self._empty(host, on[host])
+
+    def _empty(self, host: HostName, records: list[ComponentRecord]) -> None:
+        """Moves what may go now, and notes of the rest why it stays."""
+        state = self.state
+        room = MOVES_PER_HOST - sum(record.migration is not None for record in records)
+        names = [(record.component, record.spec.kind) for record in records if record.migration is None]
+        for component in state.balancer.heaviest_first(names):
+            record = state.components[component]
+            if not record.movable:
+                self._stays(record, f"it can't be moved; {host} is drained")
+            elif record.not_before <= state.now and room > 0:
+                eligible = state.eligible_hosts(record.spec, other_than=host)
+                if eligible.hosts:
+                    room -= 1
+                    state.mark_changed(component)
+                    self.begin(record, eligible.hosts[0].host, f"{host} is drained")
+                else:
+                    record.not_before = state.now + RETRY
+                    why = f"{host} is drained, and no other host will do: {eligible.why_none()}"
+                    self._stays(record, why)
+        if any(record.movable and record.migration is None for record in records):
+            state.timers.set(TimerKind.DRAIN, "", state.now + RETRY)
+
+    def _stays(self, record: ComponentRecord, why: str) -> None:
+        if record.drain_reason != why:
+            record.drain_reason = why
+            self.state.mark_changed(record.component)
+
+
+def _reservation(record: ComponentRecord) -> ComponentId:
+    """Keeps room on the target; no component's name, for names have no blanks."""
+    return f"{record.component} on its way"

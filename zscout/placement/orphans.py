@@ -1,0 +1,191 @@
+"""What is repeated to a host until it answers: stops of incarnations that must not live, and probes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final
+
+from zscout.messages import Incarnation
+from zscout.placement.state import MAX_COMPONENTS, PROBE_TIMEOUT, STOP_TIMEOUT, PlacementState, TimerKind
+from zscout.types import SECOND, ComponentId, HostName, Ns
+
+MAX_ORPHANS: Final = 100
+"""Of one component."""
+PROBES_AT_ONCE: Final = 200
+"""To one host; the next follow when these are answered, or time is up."""
+
+
+@dataclass(slots=True)
+class Orphan:
+    host: HostName
+    start_until: Ns | None
+    """Until then its start may still be on the way, and a stop that came first has stopped nothing."""
+    token: bool = False
+    """It is alive: a report that it was stopped is older than its start."""
+    stop_confirmed: bool = False
+    tries: int = 0
+    due: Ns = 0
+
+
+class Orphans:
+    """Incarnations that must not live. Each is stopped until its host reports its end, or is lost."""
+
+    def __init__(self, state: PlacementState) -> None:
+        self._state = state
+        self._of: dict[ComponentId, dict[Incarnation, Orphan]] = {}
+
+    def any(self, component: ComponentId) -> bool:
+        return component in self._of
+
+    def has(self, component: ComponentId, incarnation: Incarnation) -> bool:
+        return incarnation in self._of.get(component, {})
+
+    def add(
+        self,
+        component: ComponentId,
+        incarnation: Incarnation,
+        host: HostName,
+        start_until: Ns | None = None,
+        *,
+        token: bool = False,
+    ) -> None:
+        """This incarnation must end. It has, if its host is gone."""
+        orphans = self._of.setdefault(component, {})
+        if host in self._state.alive and incarnation not in orphans and len(orphans) < MAX_ORPHANS:
+            orphans[incarnation] = Orphan(host, start_until, token)
+            self._stop(component, incarnation, orphans[incarnation])
+        self._set_timer(component)
+
+    def start_answered(self, component: ComponentId, incarnation: Incarnation) -> bool:
+        """Whether it is an orphan. It is stopped once more: the first stop may have come before its start."""
+        orphan = self._of.get(component, {}).get(incarnation)
+        if orphan is None:
+            return False
+        if orphan.start_until is not None:
+            orphan.start_until = None
+            self._stop(component, incarnation, orphan)
+            self._set_timer(component)
+        return True
+
+    def stop_answered(self, component: ComponentId, incarnation: Incarnation, *, done: bool) -> None:
+        orphan = self._of.get(component, {}).get(incarnation)
+        if orphan is None:
+            return
+        orphan.stop_confirmed = done
+        if done and orphan.start_until is None and not orphan.token:
+            self.ended(component, incarnation)
+        elif done:
+            orphan.due = self._state.now + SECOND
+        else:
+            orphan.tries += 1
+            orphan.due = self._state.now + self._state.back_off_time(orphan.tries)
+        self._set_timer(component)
+
+    def token(self, component: ComponentId, incarnation: Incarnation, *, alive: bool) -> None:
+        """Its liveliness token appeared or vanished."""
+        orphan = self._of.get(component, {}).get(incarnation)
+        if orphan is not None:
+            orphan.token = alive
+            if alive:
+                orphan.start_until = None
+            elif orphan.stop_confirmed:
+                self.ended(component, incarnation)
+
+    def ended(self, component: ComponentId, incarnation: Incarnation) -> None:
+        if self._of.get(component, {}).pop(incarnation, None) is not None:
+            record = self._state.components.get(component)
+            if record is not None:
+                record.ended_incarnations.append(incarnation)
+        self._set_timer(component)
+
+    def host_lost(self, host: HostName) -> list[ComponentId]:
+        """Whose orphans were lost with the host."""
+        found = []
+        for component, orphans in list(self._of.items()):
+            there = [incarnation for incarnation, orphan in orphans.items() if orphan.host == host]
+            for incarnation in there:
+                del orphans[incarnation]
+            if there:
+                found.append(component)
+            self._set_timer(component)
+        return found
+
+    def timer(self, component: ComponentId) -> None:
+        now = self._state.now
+        for incarnation, orphan in self._of.get(component, {}).items():
+            if orphan.due <= now:
+                if orphan.start_until is not None and orphan.start_until <= now:
+                    orphan.start_until = None
+                self._stop(component, incarnation, orphan)
+        self._set_timer(component)
+
+    def _stop(self, component: ComponentId, incarnation: Incarnation, orphan: Orphan) -> None:
+        orphan.due = self._state.now + STOP_TIMEOUT
+        self._state.stop(component, incarnation, orphan.host)
+
+    def _set_timer(self, component: ComponentId) -> None:
+        orphans = self._of.get(component)
+        if not orphans:
+            self._of.pop(component, None)
+        due = min((orphan.due for orphan in orphans.values()), default=None) if orphans else None
+        self._state.timers.set(TimerKind.ORPHANS, component, due)
+
+
+class Probes:
+    """Components of which a host is asked until it answers: those whose token nobody expected, and, after the
+    host was lost, all that it had."""
+
+    def __init__(self, state: PlacementState) -> None:
+        self._state = state
+        self._open: dict[HostName, dict[ComponentId, None]] = {}
+        self._tries: dict[HostName, int] = {}
+        self._count = 0
+
+    def add(self, host: HostName, component: ComponentId) -> None:
+        """Asks at once if the host is there, else when it joins."""
+        if self._count >= MAX_COMPONENTS:
+            # The oldest are of hosts that will not come back.
+            self._drop(next(iter(self._open)))
+        probes = self._open.setdefault(host, {})
+        if component not in probes:
+            probes[component] = None
+            self._count += 1
+            if host in self._state.alive:
+                self._state.probe(component, host)
+                self._tries.setdefault(host, 0)
+                self._state.timers.set(TimerKind.PROBES, host, self._state.now + PROBE_TIMEOUT)
+
+    def has(self, host: HostName, component: ComponentId) -> bool:
+        return component in self._open.get(host, {})
+
+    def answered(self, host: HostName, component: ComponentId | None) -> list[ComponentId]:
+        """A host listed this component, or (None) all. Returns those that were asked for."""
+        probes = self._open.get(host, {})
+        found = list(probes) if component is None else [component] if component in probes else []
+        for one in found:
+            del probes[one]
+        self._count -= len(found)
+        if not probes:
+            self._drop(host)
+        return found
+
+    def host_joined(self, host: HostName) -> None:
+        if host in self._open:
+            self._tries[host] = 0
+            self.timer(host)
+
+    def timer(self, host: HostName) -> None:
+        state = self._state
+        if host not in state.alive:
+            return
+        for component in islice(self._open.get(host, {}), PROBES_AT_ONCE):
+            state.probe(component, host)
+        self._tries[host] = tries = self._tries.get(host, 0) + 1
+        pause = max(PROBE_TIMEOUT, state.back_off_time(tries))
+        state.timers.set(TimerKind.PROBES, host, state.now + pause)
+
+    def _drop(self, host: HostName) -> None:
+        self._count -= len(self._open.pop(host, {}))
+        self._tries.pop(host, None)
+        self._state.timers.set(TimerKind.PROBES, host, None)

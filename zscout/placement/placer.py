@@ -1,0 +1,195 @@
+"""The pure core of the component placer: events in, effects out, time passed in.
+
+    effects = placer.handle(now, PlaceRequested("counter", spec), ...)
+
+Every decision about where components run is made here and in the modules around the one `state`: `lifecycle`
+places, restarts and stops; `migration` and `rebalancing` move; `reconciler` decides which incarnation counts.
+
+A batch of events is one instant: the events are applied in the order given, then the timers that are due,
+then all that is to be placed, the heaviest first. The effects are to be carried out in their order: what has
+changed is published before it is acted upon.
+
+Of every component one incarnation runs, or none. Each start on another host and each start after an end has
+a higher incarnation than all before; a start whose outcome is unknown is repeated on the same host under the
+same incarnation, until that host's node is gone. So nothing runs twice for long, whatever is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from zscout.config.placement_policy import DEFAULT_PLACEMENT, PlacementPolicy
+from zscout.placement.balancer import Balancer
+from zscout.placement.events import (
+    ComponentsListed,
+    ComponentState,
+    ComponentStatus,
+    DrainRequested,
+    HostJoined,
+    HostLost,
+    Inherited,
+    MoveAnswered,
+    MoveRequested,
+    PlacerEffect,
+    PlaceRequested,
+    PlacerEvent,
+    PlacerTick,
+    PlacerWakeAt,
+    StartAnswered,
+    StopAnswered,
+    StopRequested,
+    TokenAppeared,
+    TokenVanished,
+    UncordonRequested,
+)
+from zscout.placement.lifecycle import Lifecycle
+from zscout.placement.migration import Migrations
+from zscout.placement.orphans import Orphans, Probes
+from zscout.placement.rebalancing import Rebalancer
+from zscout.placement.reconciler import Reconciler
+from zscout.placement.state import PlacementState, TimerKind
+from zscout.types import ComponentId, HostName, Ns
+
+
+@dataclass(frozen=True, slots=True)
+class PlacerStatus:
+    """`components` as they were last published: a view that follows what is handled."""
+
+    components: Mapping[ComponentId, ComponentStatus]
+    cordoned: frozenset[HostName]
+
+
+class Placer:
+    """All components of one fleet. `balancer` knows the hosts, and learns what is placed; `counter` is that
+    of the term, and makes incarnations higher than those of terms before."""
+
+    def __init__(self, balancer: Balancer, counter: int, rules: PlacementPolicy = DEFAULT_PLACEMENT) -> None:
+        self._state = state = PlacementState(balancer, counter, rules)
+        self._orphans, self._probes = Orphans(state), Probes(state)
+        self._lifecycle = Lifecycle(state, self._orphans, self._probes)
+        self._migrations = Migrations(state, self._lifecycle)
+        self._rebalancer = Rebalancer(state, self._migrations)
+        self._reconciler = Reconciler(state, self._lifecycle, self._migrations)
+        self._wake: Ns | None = None
+        if rules.rebalance:
+            state.timers.set(TimerKind.REBALANCE, "", 0)
+
+    def status(self) -> PlacerStatus:
+        state = self._state
+        return PlacerStatus(MappingProxyType(state.published), frozenset(state.balancer.cordoned))
+
+    def handle(self, now: Ns, *events: PlacerEvent) -> list[PlacerEffect]:
+        """Applies one instant's events. Raises ValueError if `now` goes backwards."""
+        state = self._state
+        state.begin(now)
+        for event in events:
+            self._apply(event)
+        while (due := state.timers.pop_due(now)) or state.to_place:
+            for kind, name in due:
+                self._timer(kind, name)
+            self._lifecycle.place_waiting()
+        effects = state.finish()
+        at = state.timers.next()
+        if at != self._wake:
+            self._wake = at
+            effects.append(PlacerWakeAt(at))
+        return effects
+
+    def _apply(self, event: PlacerEvent) -> None:
+        match event:
+            case PlaceRequested(component, spec):
+                self._lifecycle.place(component, spec)
+            case StopRequested(component):
+                self._stop(component)
+            case MoveRequested(component, to):
+                self._migrations.request(component, to)
+            case DrainRequested(host):
+                self._migrations.drain(host)
+            case UncordonRequested(host):
+                self._migrations.uncordon(host)
+            case StartAnswered():
+                self._start_answered(event)
+            case StopAnswered():
+                self._stop_answered(event)
+            case MoveAnswered():
+                self._move_answered(event)
+            case TokenAppeared():
+                self._reconciler.appeared(event)
+            case TokenVanished():
+                self._reconciler.vanished(event)
+            case ComponentsListed():
+                self._reconciler.listed(event)
+            case HostJoined(host):
+                self._reconciler.host_joined(host)
+            case HostLost(host):
+                self._reconciler.host_lost(host)
+            case Inherited(components, cordoned):
+                self._state.balancer.cordoned |= cordoned
+                for status in components:
+                    self._reconciler.inherited(status)
+            case PlacerTick():
+                pass
+
+    def _stop(self, component: ComponentId) -> None:
+        record = self._state.get(component)
+        if record is None:
+            self._state.refuse(component, "unknown_component", f"there is no component {component}")
+        else:
+            self._migrations.cancel(record)
+            self._lifecycle.stop(record)
+
+    # Answers: those about an incarnation that no longer counts change nothing
+
+    def _start_answered(self, answer: StartAnswered) -> None:
+        if self._orphans.start_answered(answer.component, answer.incarnation):
+            return
+        record = self._state.get(answer.component)
+        if record is None:
+            return
+        move, answering = record.migration, (answer.incarnation, answer.host)
+        if move is not None and answering == (move.incarnation, move.to):
+            self._migrations.target_answered(record, move, answer)
+        elif move is None and answering == (record.incarnation, record.host):
+            self._lifecycle.start_answered(record, answer)
+
+    def _stop_answered(self, answer: StopAnswered) -> None:
+        self._orphans.stop_answered(answer.component, answer.incarnation, done=answer.done)
+        record = self._state.get(answer.component)
+        if record is None or record.state is not ComponentState.STOPPING:
+            return
+        if (answer.incarnation, answer.host) == (record.incarnation, record.host):
+            self._lifecycle.stop_answered(record, answer)
+        else:
+            self._lifecycle.check_stopped(record)
+
+    def _move_answered(self, answer: MoveAnswered) -> None:
+        record = self._state.get(answer.component)
+        if record is None or record.migration is None:
+            return
+        if (answer.incarnation, answer.host) == (record.incarnation, record.host):
+            self._migrations.answered(record, record.migration, answer)
+
+    def _timer(self, kind: TimerKind, name: str) -> None:
+        match kind:
+            case TimerKind.DRAIN:
+                self._migrations.drain_timer()
+            case TimerKind.REBALANCE:
+                self._rebalancer.timer()
+            case TimerKind.ORPHANS:
+                self._orphans.timer(name)
+            case TimerKind.PROBES:
+                self._probes.timer(name)
+            case TimerKind.LIFECYCLE | TimerKind.MIGRATION:
+                record = self._state.get(name)
+                if record is None:
+                    return
+                move = record.migration
+                if kind is TimerKind.MIGRATION:
+                    if move is not None:
+                        self._migrations.timer(record, move)
+                elif move is not None:
+                    self._migrations.source_timer(record, move)
+                else:
+                    self._lifecycle.timer(record)

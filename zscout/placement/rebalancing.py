@@ -1,0 +1,151 @@
+"""Rebalancing: moves the one component that gains most, if that has paid for a while.
+
+The gain is predicted as metric `composite` does: how fast a component runs where it is, and how fast it would
+run on the target. Others count as well: what they lose on the target, less what they gain on the host that it
+leaves. The load average forgets what left a host as slowly as it came to see it; that is subtracted.
+
+Against going back and forth: a move must make it run better by `gain`, for `steady` at a stretch; component
+and hosts have been left alone for `rest`; and one moves at a time. Two equal hosts never swap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Final
+
+from zscout.placement.balancer import LOAD_TIME
+from zscout.placement.events import ComponentState
+from zscout.placement.metrics import Outlook, rate
+from zscout.placement.migration import Migrations
+from zscout.placement.model import STALE, Profile, RankQuery
+from zscout.placement.state import ComponentRecord, PlacementState, TimerKind
+from zscout.types import SECOND, ComponentId, HostName, Ns
+
+EVERY: Final[Ns] = SECOND
+TARGETS: Final = 8
+"""Hosts considered for each kind: the best."""
+FORGOTTEN: Final[Ns] = 8 * LOAD_TIME
+"""After this a thousandth of what left a host is still in its load average."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Change:
+    """A move that would pay: the component runs better by `gain`, as a share of how it runs now."""
+
+    gain: float
+    record: ComponentRecord
+    to: HostName
+
+
+class Rebalancer:
+    def __init__(self, state: PlacementState, migrations: Migrations) -> None:
+        self.state, self.migrations = state, migrations
+        self._paying: dict[tuple[ComponentId, HostName], Ns] = {}
+        """Since when each move has paid."""
+
+    def timer(self) -> None:
+        """Moves one component at most."""
+        state = self.state
+        state.timers.set(TimerKind.REBALANCE, "", state.now + EVERY)
+        if any(record.migration is not None for record in state.components.values()):
+            self._paying.clear()
+            return
+        found = self._changes()
+        before, self._paying = self._paying, {}
+        for one in found:
+            pair = (one.record.component, one.to)
+            self._paying[pair] = before.get(pair, state.now)
+        ripe = [
+            one
+            for one in found
+            if state.now - self._paying[one.record.component, one.to] >= state.rules.steady
+        ]
+        if ripe:
+            best = max(ripe, key=lambda one: (one.gain, one.record.component, one.to))
+            self._paying.clear()
+            state.mark_changed(best.record.component)
+            self.migrations.begin(best.record, best.to, f"where it runs {best.gain:.0%} better")
+
+    def _changes(self) -> list[_Change]:
+        """All moves that would pay now. Of equal components on one host the first by name stands for all."""
+        state = self.state
+        groups: dict[tuple[HostName, RankQuery], ComponentRecord] = {}
+        running: Counter[HostName] = Counter()
+        for _, record in sorted(state.components.items()):
+            host, spec = record.host, record.spec
+            if host is None or record.state is not ComponentState.RUNNING:
+                continue
+            running[host] += 1
+            if self._may_leave(record, host):
+                query = RankQuery(spec.kind, "composite", "pending", spec.requirements, spec.hosts)
+                groups.setdefault((host, query), record)
+        outlook, targets = cache(self._outlook), cache(self._targets)
+        found = []
+        for (host, query), record in groups.items():
+            profile = state.balancer.profile(record.spec.kind)
+            for target in targets(query):
+                if target == host:
+                    continue
+                here, there = _without(outlook(host), profile), outlook(target)
+                gain = rate(there, profile) / rate(here, profile) - 1
+                others = running[host] - 1, running[target]
+                if gain >= state.rules.gain and _pays(here, there, profile, others):
+                    found.append(_Change(gain, record, target))
+        return found
+
+    def _may_leave(self, record: ComponentRecord, host: HostName) -> bool:
+        # One that came lately: its host is not at rest then.
+        state = self.state
+        return (
+            record.movable
+            and record.wanted
+            and record.token
+            and record.not_before <= state.now
+            and host not in state.balancer.cordoned
+            and self._at_rest(host)
+        )
+
+    def _at_rest(self, host: HostName) -> bool:
+        state = self.state
+        last = state.balancer.reports.get(host)
+        if host not in state.alive or last is None or state.now - last[0] > STALE:
+            return False
+        return state.now - state.last_change.get(host, state.now) >= state.rules.rest
+
+    def _targets(self, query: RankQuery) -> list[HostName]:
+        ranking = self.state.rankings.rank(query)
+        return [one.host for one in ranking.hosts if self._at_rest(one.host)][:TARGETS]
+
+    def _outlook(self, host: HostName) -> Outlook:
+        """A host as the balancer sees it, less what left it and shows in its load average still."""
+        state = self.state
+        outlook = state.balancer.outlook(state.now, host, pending=True)
+        departed = state.departed.get(host, deque())
+        while departed and state.now - departed[0][0] > FORGOTTEN:
+            departed.popleft()
+        gone = sum(cores * math.exp(-(state.now - at) / LOAD_TIME) for at, cores in departed)
+        return replace(outlook, load=max(0.0, outlook.load - gone))
+
+
+def _without(outlook: Outlook, profile: Profile) -> Outlook:
+    """The host if the component were not there."""
+    load = max(0.0, outlook.load - profile.wants(outlook.report.speed))
+    return replace(outlook, load=load, memory=outlook.memory + profile.memory)
+
+
+def _share(outlook: Outlook, more: float = 0.0) -> float:
+    """How fast what runs there runs, and what it would be with so many more cores wanted."""
+    report = outlook.report
+    return report.speed * min(1.0, report.cores / max(outlook.load + more, 0.01))
+
+
+def _pays(here: Outlook, there: Outlook, profile: Profile, others: tuple[int, int]) -> bool:
+    """Whether all components of both hosts together run better for the move. `here` is without it."""
+    wants_here, wants_there = profile.wants(here.report.speed), profile.wants(there.report.speed)
+    own = rate(there, profile) - rate(here, profile)
+    stay = others[0] * (_share(here) - _share(here, wants_here))
+    meet = others[1] * (_share(there, wants_there) - _share(there))
+    return own + stay + meet > 0

@@ -1,0 +1,315 @@
+"""Which incarnation of a component counts, by tokens, hosts' lists, and what the placer of the term before
+published. Of two that live the higher one counts; the lower is stopped.
+"""
+
+from __future__ import annotations
+
+from zscout.messages import Incarnation
+from zscout.placement.events import (
+    ComponentsListed,
+    ComponentState,
+    ComponentStatus,
+    ListedComponent,
+    TokenAppeared,
+    TokenVanished,
+)
+from zscout.placement.lifecycle import GRACE, Lifecycle
+from zscout.placement.migration import Migrations
+from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, PlacementState, Termination
+from zscout.types import ComponentId, HostName
+
+WAITING, STARTING, RUNNING = ComponentState.WAITING, ComponentState.STARTING, ComponentState.RUNNING
+BACKING_OFF, STOPPING = ComponentState.BACKING_OFF, ComponentState.STOPPING
+
+
+class Reconciler:
+    def __init__(self, state: PlacementState, lifecycle: Lifecycle, migrations: Migrations) -> None:
+        self.state, self.lifecycle, self.migrations = state, lifecycle, migrations
+        self.orphans, self.probes = lifecycle.orphans, lifecycle.probes
+
+    # Tokens
+
+    def appeared(self, token: TokenAppeared) -> None:
+        state, component, incarnation, host = self.state, token.component, token.incarnation, token.host
+        record = state.get(component)
+        if not state.is_plausible(incarnation):
+            return
+        state.note_incarnation(component, incarnation)
+        self.orphans.token(component, incarnation, alive=True)
+        if record is None or host not in state.alive:
+            # If its node's token is late, the host is probed when it joins.
+            self.probes.add(host, component)
+        if record is None:
+            return
+        if incarnation in record.ended_incarnations:
+            # Late news, or it started after it was stopped.
+            self.orphans.add(component, incarnation, host, token=True)
+        elif (move := record.migration) is not None and incarnation == move.incarnation:
+            self.migrations.target_appeared(record, move)
+        elif incarnation != record.incarnation or record.superseded:
+            self._other_runs(record, incarnation, host, token=True)
+        elif self._must_not_live(record):
+            self.orphans.add(component, incarnation, host, token=True)
+        elif self._can_be_at(record, host):
+            record.token = True
+            if record.migration is None and record.state is not STOPPING:
+                self.lifecycle.runs(record)
+
+    def vanished(self, token: TokenVanished) -> None:
+        """How it ended, its host reports; a token may also be gone for a while with the network."""
+        component, incarnation = token.component, token.incarnation
+        record = self.state.get(component)
+        self.orphans.token(component, incarnation, alive=False)
+        self.lifecycle.orphan_ended(component)
+        if record is None:
+            return
+        move = record.migration
+        if (incarnation, token.host) == (record.incarnation, record.host):
+            record.token = False
+            if move is not None:
+                self.migrations.source_vanished(record, move)
+            elif record.state is RUNNING:
+                record.unanswered = 0
+                self.lifecycle.timer(record)
+            elif record.state is STOPPING and record.stop_confirmed:
+                self.lifecycle.stopped(record)
+        elif move is not None and incarnation == move.incarnation:
+            move.token, move.target = False, "unknown"
+
+    def _must_not_live(self, record: ComponentRecord) -> bool:
+        """Its incarnation ended, or is being stopped and its host was believed gone."""
+        return record.state in OVER or (record.state is STOPPING and record.host is None)
+
+    def _can_be_at(self, record: ComponentRecord, host: HostName) -> bool:
+        """Whether the incarnation can be at that host; if it was nowhere, it is there from now on."""
+        if record.host is None and host in self.state.alive:
+            record.host = host
+            record.host_reason = f"found running on {host}"
+        return record.host == host
+
+    def _other_runs(
+        self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool
+    ) -> None:
+        """An incarnation runs that is not the record's."""
+        state = self.state
+        if self.orphans.has(record.component, incarnation):
+            return
+        stopped = record.state is STOPPING or record.state in OVER
+        if stopped or incarnation < record.incarnation + record.superseded:
+            self.orphans.add(record.component, incarnation, host, token=token)
+            return
+        if host not in state.alive:
+            return
+        if record.host is not None:
+            self.orphans.add(
+                record.component, record.incarnation, record.host, record.start_until, token=record.token
+            )
+        self.migrations.cancel(record)
+        state.component_left(record)
+        record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
+        record.superseded = False
+        record.host_reason = f"found running on {host}"
+        self.lifecycle.runs(record, anew=True)
+
+    # Hosts' lists
+
+    def listed(self, listing: ComponentsListed) -> None:
+        state, host, only = self.state, listing.host, listing.only
+        # What a host sent before it was lost is no answer.
+        answered = self.probes.answered(host, only) if host in state.alive else []
+        for one in listing.components:
+            if only in (None, one.component):
+                self._listed(host, one)
+        present = {(one.component, one.incarnation) for one in listing.components}
+        for record in self._on(host) if only is None else filter(None, [state.components.get(only)]):
+            self._not_listed(record, listing, present)
+        for name in answered:
+            waiting = state.components.get(name)
+            if waiting is not None and waiting.state is WAITING:
+                state.wake(waiting, state.now)
+
+    def _on(self, host: HostName) -> list[ComponentRecord]:
+        """What is on a host, or on its way there."""
+        return [
+            record
+            for record in self.state.components.values()
+            if record.host == host or (record.migration is not None and record.migration.to == host)
+        ]
+
+    def _listed(self, host: HostName, listed: ListedComponent) -> None:
+        state, component, incarnation = self.state, listed.component, listed.incarnation
+        if not state.is_plausible(incarnation):
+            return
+        state.note_incarnation(component, incarnation)
+        record = state.get(component)
+        if record is None:
+            self._adopt(host, listed)
+        elif listed.ended is not None:
+            end = Termination(listed.ended, listed.reason, listed.tail)
+            self._listed_as_ended(record, host, incarnation, end)
+        elif incarnation in record.ended_incarnations:
+            self.orphans.add(component, incarnation, host)
+        elif (move := record.migration) is not None and incarnation == move.incarnation:
+            self.migrations.target_listed(record, move, running=listed.running, standby=listed.standby)
+        elif incarnation == record.incarnation and not record.superseded:
+            self._listed_alive(record, host, listed)
+        elif not listed.standby:
+            self._other_runs(record, incarnation, host, token=False)
+
+    def _adopt(self, host: HostName, listed: ListedComponent) -> None:
+        """A placer of a term before had it started."""
+        state = self.state
+        if listed.ended is not None or listed.standby or host not in state.alive:
+            return
+        record = state.add(listed.component, listed.spec, STARTING, listed.incarnation, host)
+        if record is None:
+            return
+        record.movable, record.confirmed = listed.movable, listed.running
+        record.host_reason = f"found running on {host}"
+        if listed.running:
+            self.lifecycle.runs(record)
+        else:
+            record.reason = f"found starting on {host}"
+            state.start(record)
+
+    def _listed_alive(self, record: ComponentRecord, host: HostName, listed: ListedComponent) -> None:
+        """The record's incarnation lives."""
+        if self._must_not_live(record):
+            if not listed.standby:
+                self.orphans.add(record.component, listed.incarnation, host)
+        elif record.state is not STOPPING and not listed.standby and self._can_be_at(record, host):
+            if listed.running:
+                record.movable, record.confirmed = listed.movable, True
+                record.unanswered, record.probed = 0, False
+                if record.migration is not None:
+                    self.migrations.source_runs(record, record.migration)
+                else:
+                    self.lifecycle.runs(record)
+            elif record.state in (WAITING, BACKING_OFF):
+                record.enter(STARTING)
+                self.state.start(record)
+
+    def _listed_as_ended(
+        self, record: ComponentRecord, host: HostName, incarnation: Incarnation, end: Termination
+    ) -> None:
+        move = record.migration
+        if self.orphans.has(record.component, incarnation):
+            self.orphans.ended(record.component, incarnation)
+            self.lifecycle.orphan_ended(record.component)
+        elif incarnation in record.ended_incarnations and record.host is None:
+            pass
+        elif move is not None and incarnation == move.incarnation:
+            record.ended_incarnations.append(incarnation)
+            reason = f"what stood by there has ended: {end.reason or end.cause}"
+            self.migrations.target_ended(record, move, reason)
+        elif incarnation != record.incarnation or record.superseded or record.state in OVER:
+            pass
+        elif move is not None:
+            self.migrations.source_ended(record, move, end)
+        elif record.host in (host, None):
+            record.host = host
+            self.lifecycle.ended(record, end)
+
+    def _not_listed(
+        self,
+        record: ComponentRecord,
+        listing: ComponentsListed,
+        present: set[tuple[ComponentId, Incarnation]],
+    ) -> None:
+        """An incarnation that a list lacks is not there, unless it started after the list was made: a token,
+        or a start that is not answered, prove more."""
+        state, move, host = self.state, record.migration, listing.host
+        if (
+            move is not None
+            and move.to == host
+            and (record.component, move.incarnation) not in present
+            and move.stage == "probing"
+            and not move.token
+        ):
+            state.mark_changed(record.component)
+            self.migrations.target_ended(record, move, "what stood by there is gone")
+        if record.host != host or (record.component, record.incarnation) in present:
+            return
+        asked = record.probed or listing.only is None
+        if record.token or record.start_until is not None or not asked:
+            return
+        end = Termination("lost", f"{host} knows nothing of it any more")
+        state.mark_changed(record.component)
+        if record.migration is not None:
+            self.migrations.source_ended(record, record.migration, end)
+        elif record.state in (RUNNING, STOPPING):
+            self.lifecycle.ended(record, end)
+
+    # Hosts
+
+    def host_joined(self, host: HostName) -> None:
+        state = self.state
+        if host in state.alive:
+            return
+        state.alive.add(host)
+        state.last_change[host] = state.now
+        state.drain_soon(host)
+        self.probes.host_joined(host)
+        for record in state.components.values():
+            if record.state is WAITING:
+                if self.probes.has(host, record.component):
+                    # Perhaps it is there still: better than to start it anew.
+                    record.not_before = state.now + PROBE_TIMEOUT
+                state.wake(record, max(state.now, record.not_before))
+            elif record.state is STOPPING and record.host == host:
+                state.wake(record, state.now)
+            elif record.state is RUNNING and record.host == host:
+                # Its list or its token comes in a moment.
+                state.wake(record, state.now + GRACE)
+
+    def host_lost(self, host: HostName) -> None:
+        """What it had is gone with it, or, if its node was only silent, is probed when it is back."""
+        state = self.state
+        state.alive.discard(host)
+        state.last_change.pop(host, None)
+        state.departed.pop(host, None)
+        for component in self.orphans.host_lost(host):
+            self.probes.add(host, component)
+            self.lifecycle.orphan_ended(component)
+        for record in self._on(host):
+            state.mark_changed(record.component)
+            self.probes.add(host, record.component)
+            move = record.migration
+            if move is None:
+                self.lifecycle.host_lost(record, host)
+            elif move.to == host:
+                self.migrations.target_host_lost(record, move)
+            else:
+                self.migrations.source_host_lost(record, move)
+
+    # What was published before
+
+    def inherited(self, status: ComponentStatus) -> None:
+        """It stands until a host reports otherwise, or none does within GRACE."""
+        state = self.state
+        if not state.is_plausible(status.incarnation):
+            return
+        state.note_incarnation(status.component, status.incarnation)
+        record = state.get(status.component)
+        if record is not None:
+            # A host was quicker; that it is to stop is known here only.
+            if not status.wanted and record.wanted and record.state not in OVER:
+                self.migrations.cancel(record)
+                self.lifecycle.stop(record)
+            return
+        moved = status.state is ComponentState.MOVING
+        stands = RUNNING if moved else status.state
+        host = status.host if stands in (STARTING, RUNNING, STOPPING) else None
+        record = state.add(status.component, status.spec, stands, status.incarnation, host)
+        if record is None:
+            return
+        record.reason = f"it was to move to {status.to}" if moved else status.reason
+        record.host_reason, record.tail, record.wanted = status.reason, status.tail, status.wanted
+        record.movable, record.restarts = status.movable, status.restarts
+        record.moves, record.dead = status.moves, status.dead
+        record.running_since = state.now if stands is RUNNING else None
+        record.not_before = state.now + GRACE
+        if stands in OVER:
+            state.retire(record)
+        else:
+            state.wake(record, record.not_before)

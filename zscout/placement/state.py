@@ -1,0 +1,456 @@
+"""The placer's one state, and the few operations that change it; what to change is decided elsewhere
+(`lifecycle`, `migration`, `rebalancing`, `reconciler`)."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from itertools import islice
+from typing import Final, Literal, TypeAlias
+
+from zscout.config.placement_policy import PlacementPolicy
+from zscout.messages import Incarnation
+from zscout.placement.balancer import LOAD_TIME, Balancer, RankingCache
+from zscout.placement.events import (
+    ComponentChanged,
+    ComponentForgotten,
+    ComponentState,
+    ComponentStatus,
+    EndCause,
+    HostCommand,
+    MoveCommand,
+    PlacementRefused,
+    PlacementSpec,
+    PlacerEffect,
+    ProbeCommand,
+    StartCommand,
+    StopCommand,
+)
+from zscout.placement.model import RankQuery, ScoredHost
+from zscout.types import SECOND, ComponentId, HostName, Kind, Ns
+
+PER_TERM: Final = 1_000
+"""Incarnations of a component begin, in each term, at its counter times this."""
+FAR_AHEAD: Final = 1_000_000
+"""An incarnation this far above what the term gives is not believed: it would leave no room above it."""
+PROBE_TIMEOUT: Final[Ns] = 2 * SECOND
+START_SLACK: Final[Ns] = 2 * PROBE_TIMEOUT
+"""Beyond the time that a start may take: then it is commanded again."""
+STOP_TIMEOUT: Final[Ns] = 15 * SECOND
+"""More than a component may take to end."""
+MAX_COMPONENTS: Final = 10_000
+MAX_ENDED: Final = 1_000
+"""Ended and given-up components that are kept, each for RETENTION."""
+RETENTION: Final[Ns] = 3_600 * SECOND
+MAX_ENDED_INCARNATIONS: Final = 16
+"""Of one component: those that are known to have ended."""
+HOSTS_NAMED: Final = 3
+"""In the reason why there is no eligible host."""
+
+_S = ComponentState
+TRANSITIONS: Final[Mapping[ComponentState, frozenset[ComponentState]]] = {
+    _S.WAITING: frozenset({_S.STARTING, _S.RUNNING, _S.BACKING_OFF, _S.STOPPING, _S.ENDED, _S.GIVEN_UP}),
+    _S.STARTING: frozenset({_S.WAITING, _S.RUNNING, _S.BACKING_OFF, _S.STOPPING, _S.ENDED, _S.GIVEN_UP}),
+    _S.RUNNING: frozenset({_S.WAITING, _S.MOVING, _S.BACKING_OFF, _S.STOPPING, _S.ENDED, _S.GIVEN_UP}),
+    _S.MOVING: frozenset({_S.RUNNING}),
+    _S.BACKING_OFF: frozenset({_S.WAITING, _S.STARTING, _S.RUNNING, _S.STOPPING, _S.ENDED, _S.GIVEN_UP}),
+    _S.STOPPING: frozenset({_S.WAITING, _S.ENDED}),
+    _S.ENDED: frozenset({_S.WAITING}),
+    _S.GIVEN_UP: frozenset({_S.WAITING, _S.ENDED}),
+}
+OVER: Final = frozenset({ComponentState.ENDED, ComponentState.GIVEN_UP})
+
+SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
+"""What is known of the source or the target of a migration."""
+
+
+@dataclass(frozen=True, slots=True)
+class Termination:
+    """How an incarnation ended. `with_host`: with its host, so that it does not count as its failure."""
+
+    cause: EndCause
+    reason: str
+    tail: str = ""
+    with_host: bool = False
+
+
+@dataclass(slots=True)
+class Migration:
+    """A move under way: the target gets ready (`starting`), the source hands over (`handing_over`), or the
+    outcome is unknown and both hosts are asked (`probing`)."""
+
+    to: HostName
+    incarnation: Incarnation
+    why: str
+    stage: Literal["starting", "handing_over", "probing"] = "starting"
+    start_until: Ns | None = None
+    tries: int = 0
+    source: SideState = "running"
+    target: SideState = "unknown"
+    token: bool = False
+    """The target has its token: it has taken over."""
+    termination: Termination | None = None
+    """Of the source, if it ended while the outcome was unknown."""
+
+
+@dataclass(slots=True)
+class ComponentRecord:
+    """A component. `host` is where its incarnation is, or starts; None: nowhere."""
+
+    component: ComponentId
+    spec: PlacementSpec
+    state: ComponentState = ComponentState.WAITING
+    """Changed by `enter` alone."""
+    incarnation: Incarnation = 0
+    superseded: bool = False
+    """The incarnation belongs to what was placed before under this name, and must not live."""
+    host: HostName | None = None
+    wanted: bool = True
+    reason: str = ""
+    host_reason: str = ""
+    """Why it is where it is: the reason while it runs."""
+    drain_reason: str = ""
+    """Why it is still on a host that is drained; shown in place of `reason`."""
+    restart_cause: str = ""
+    tail: str = ""
+    movable: bool = False
+    restarts: int = 0
+    failed_rounds: int = 0
+    """How often all hosts were tried in vain."""
+    moves: int = 0
+    dead: Ns | None = None
+    running_since: Ns | None = None
+    start_until: Ns | None = None
+    """A start is commanded and not answered; it is taken for lost then."""
+    unanswered: int = 0
+    """Attempts in a row of the present command or probe that were not answered."""
+    token: bool = False
+    confirmed: bool = False
+    """Its host reported that it runs, and whether it is movable."""
+    probed: bool = False
+    """A probe is sent, and not answered."""
+    stop_confirmed: bool = False
+    """Its host reported that it has ended, or never was there."""
+    tried: dict[HostName, str] = field(default_factory=dict)
+    """Hosts that did not start it in this round, with the reason if another try there would not help."""
+    whereabouts_unknown: bool = False
+    """It reported that it went on elsewhere, and no host has reported it yet."""
+    migration: Migration | None = None
+    """There exactly while it is `moving`."""
+    not_before: Ns = 0
+    """Until then it is neither moved off a drained host nor, if inherited, placed."""
+    ended_incarnations: deque[Incarnation] = field(
+        default_factory=lambda: deque(maxlen=MAX_ENDED_INCARNATIONS)
+    )
+
+    def enter(self, state: ComponentState) -> None:
+        """Raises ValueError for a transition that the table does not have."""
+        if state not in TRANSITIONS[self.state] and state is not self.state:
+            raise ValueError(f"{self.component}: from {self.state} to {state}")
+        self.state = state
+
+    def status(self) -> ComponentStatus:
+        return ComponentStatus(
+            component=self.component,
+            spec=self.spec,
+            state=self.state,
+            incarnation=self.incarnation,
+            host=self.host,
+            to=self.migration.to if self.migration is not None else None,
+            reason=self.drain_reason or self.reason,
+            movable=self.movable,
+            wanted=self.wanted,
+            restarts=self.restarts,
+            moves=self.moves,
+            dead=self.dead,
+            tail=self.tail,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class EligibleHosts:
+    """Hosts that can run a component, best first, and of the others why not."""
+
+    hosts: tuple[ScoredHost, ...]
+    left_out: Mapping[HostName, str]
+    elsewhere: bool = False
+    """The host where it is was excluded."""
+
+    def why_none(self) -> str:
+        """One bounded line: why there is no host."""
+        named = [f"{host}: {reason}" for host, reason in islice(sorted(self.left_out.items()), HOSTS_NAMED)]
+        more = len(self.left_out) - len(named)
+        none = "there is no other that it may use" if self.elsewhere else "there is no host"
+        return "; ".join(named) + (f"; and {more} more" if more else "") or none
+
+
+class TimerKind(IntEnum):
+    """In the order in which timers of one instant are handled."""
+
+    DRAIN = 0
+    LIFECYCLE = 1
+    PROBES = 2
+    MIGRATION = 3
+    REBALANCE = 4
+    ORPHANS = 5
+
+
+TimerKey: TypeAlias = tuple[TimerKind, str]
+"""With the name of a component or host; empty where there is one timer of the kind."""
+
+
+class Timers:
+    """One time for each key, on the caller's clock."""
+
+    SLACK: Final = 64
+    """Outdated entries that the heap may hold beside as many as count."""
+
+    def __init__(self) -> None:
+        self._at: dict[TimerKey, Ns] = {}
+        self._heap: list[tuple[Ns, TimerKey]] = []
+
+    def set(self, kind: TimerKind, name: str, at: Ns | None) -> None:
+        """Replaces the time of this key; None: removes it."""
+        key = kind, name
+        if at is None:
+            self._at.pop(key, None)
+        elif self._at.get(key) != at:
+            self._at[key] = at
+            heapq.heappush(self._heap, (at, key))
+            if len(self._heap) > 2 * len(self._at) + self.SLACK:
+                self._heap = [(when, one) for one, when in self._at.items()]
+                heapq.heapify(self._heap)
+
+    def pop_due(self, now: Ns) -> list[TimerKey]:
+        """Removes and returns the keys whose time has come, soonest first."""
+        found = []
+        while self._heap and self._heap[0][0] <= now:
+            at, key = heapq.heappop(self._heap)
+            if self._at.get(key) == at:
+                del self._at[key]
+                found.append(key)
+        return found
+
+    def next(self) -> Ns | None:
+        """The soonest time that is set."""
+        while self._heap and self._at.get(self._heap[0][1]) != self._heap[0][0]:
+            heapq.heappop(self._heap)
+        return self._heap[0][0] if self._heap else None
+
+
+class PlacementState:
+    """Everything that the placer knows. `now` is the instant that is handled."""
+
+    def __init__(self, balancer: Balancer, counter: int, rules: PlacementPolicy) -> None:
+        self.balancer, self.rules = balancer, rules
+        self.rankings = RankingCache(balancer)
+        self.now: Ns = 0
+        self.components: dict[ComponentId, ComponentRecord] = {}
+        self.published: dict[ComponentId, ComponentStatus] = {}
+        self.to_place: dict[ComponentId, None] = {}
+        """Placed at the end of this instant."""
+        self.alive: set[HostName] = set()
+        """Hosts whose node has its token."""
+        self.last_change: dict[HostName, Ns] = {}
+        """When the placer last brought a component to a host or took one from it."""
+        self.departed: dict[HostName, deque[tuple[Ns, float]]] = {}
+        """What left a host: when, and how many cores of it the load average showed then."""
+        self.timers = Timers()
+        self._lowest: Incarnation = counter * PER_TERM
+        self._highest = self._lowest + FAR_AHEAD
+        self._incarnations: dict[ComponentId, Incarnation] = {}
+        """The highest of each component."""
+        self._ended: dict[ComponentId, None] = {}
+        """Ended and given-up components, the oldest first."""
+        self._changed: dict[ComponentId, bool] = {}
+        self._commands: list[HostCommand | PlacementRefused] = []
+
+    # One instant
+
+    def begin(self, now: Ns) -> None:
+        """Raises ValueError if time goes backwards."""
+        if now < self.now:
+            raise ValueError(f"time went backwards: {now} after {self.now}")
+        self.now = now
+        self._changed, self._commands = {}, []
+        self.rankings.begin(now)
+
+    def finish(self) -> list[PlacerEffect]:
+        """The effects of this instant. Changes come first: they are published before they are acted upon, so
+        that the next placer knows of every start."""
+        effects: list[PlacerEffect] = []
+        for component, always in self._changed.items():
+            record = self.components.get(component)
+            if record is None:
+                if self.published.pop(component, None) is not None:
+                    effects.append(ComponentForgotten(component))
+                continue
+            status = record.status()
+            if always or self.published.get(component) != status:
+                self.published[component] = status
+                effects.append(ComponentChanged(component))
+        # A host may have been lost in this very instant, after a command to it.
+        return effects + [
+            one for one in self._commands if isinstance(one, PlacementRefused) or one.host in self.alive
+        ]
+
+    # Components
+
+    def mark_changed(self, component: ComponentId, *, always: bool = False) -> None:
+        """Has its status published if it differs, or `always`: a request waits for it."""
+        self._changed[component] = always or self._changed.get(component, False)
+
+    def get(self, component: ComponentId) -> ComponentRecord | None:
+        """To be changed."""
+        record = self.components.get(component)
+        if record is not None:
+            self.mark_changed(component)
+        return record
+
+    def add(
+        self,
+        component: ComponentId,
+        spec: PlacementSpec,
+        state: ComponentState = ComponentState.WAITING,
+        incarnation: Incarnation = 0,
+        host: HostName | None = None,
+    ) -> ComponentRecord | None:
+        """None: there is no room for it."""
+        if len(self.components) >= MAX_COMPONENTS:
+            if not self._ended:
+                return None
+            self.forget(next(iter(self._ended)))
+        record = self.components[component] = ComponentRecord(component, spec, state, incarnation, host=host)
+        self.mark_changed(component)
+        return record
+
+    def retire(self, record: ComponentRecord) -> None:
+        """It is only remembered from now on."""
+        self._ended[record.component] = None
+        self.wake(record, self.now + RETENTION)
+        if len(self._ended) > MAX_ENDED:
+            self.forget(next(iter(self._ended)))
+
+    def revive(self, record: ComponentRecord) -> None:
+        self._ended.pop(record.component, None)
+
+    def forget(self, component: ComponentId) -> None:
+        """Its highest incarnation becomes the lowest for all, so that none is used twice."""
+        self._ended.pop(component, None)
+        if self.components.pop(component, None) is not None:
+            self.mark_changed(component)
+        self._lowest = max(self._lowest, self._incarnations.pop(component, 0))
+        self.timers.set(TimerKind.LIFECYCLE, component, None)
+
+    # Incarnations
+
+    def is_plausible(self, incarnation: Incarnation) -> bool:
+        return incarnation <= self._highest
+
+    def note_incarnation(self, component: ComponentId, incarnation: Incarnation) -> None:
+        """It exists or existed: the next one must be higher."""
+        if incarnation > self._incarnations.get(component, self._lowest):
+            if component not in self._incarnations and len(self._incarnations) >= 2 * MAX_COMPONENTS:
+                self._lowest = incarnation
+            else:
+                self._incarnations[component] = incarnation
+
+    def next_incarnation(self, component: ComponentId) -> Incarnation:
+        incarnation = max(self._incarnations.get(component, 0), self._lowest) + 1
+        self.note_incarnation(component, incarnation)
+        return incarnation
+
+    # Hosts
+
+    def eligible_hosts(
+        self, spec: PlacementSpec, *, other_than: HostName | None = None, only: HostName | None = None
+    ) -> EligibleHosts:
+        hosts = spec.hosts if only is None else frozenset({only})
+        ranking = self.rankings.rank(RankQuery(spec.kind, spec.metric, spec.policy, spec.requirements, hosts))
+        found = tuple(one for one in ranking.hosts if one.host in self.alive and one.host != other_than)
+        left_out = dict(ranking.left_out)
+        if only is not None and spec.hosts is not None and only not in spec.hosts:
+            found, left_out = (), {only: "it is not among the hosts that the component asks for"}
+        elif not found:
+            left_out |= {one.host: "its node is not there" for one in ranking.hosts if one.host != other_than}
+            known = self.alive if hosts is None else self.alive & hosts
+            left_out |= dict.fromkeys(known - self.balancer.reports.keys(), "no report of it")
+            if other_than is not None:
+                left_out.pop(other_than, None)
+        return EligibleHosts(found, left_out, other_than is not None)
+
+    def component_arrives(self, component: ComponentId, kind: Kind, host: HostName) -> None:
+        """It is on its way to a host."""
+        self.balancer.placed(self.now, component, kind, host)
+        self.rankings.invalidate(host)
+        self.last_change[host] = self.now
+
+    def component_left(self, record: ComponentRecord) -> None:
+        """It is not on its host any more."""
+        host = record.host
+        self.balancer.gone(record.component)
+        if host is not None:
+            self.rankings.invalidate(host)
+        if host is not None and host in self.alive:
+            self.last_change[host] = self.now
+            last = self.balancer.reports.get(host)
+            if record.running_since is not None and self.rules.rebalance and last is not None:
+                wants = self.balancer.profile(record.spec.kind).wants(last[1].speed)
+                shown = 1 - math.exp(-(self.now - record.running_since) / LOAD_TIME)
+                self.departed.setdefault(host, deque(maxlen=100)).append((self.now, wants * shown))
+        record.host, record.running_since, record.token, record.probed = None, None, False, False
+
+    # Timers
+
+    def wake(self, record: ComponentRecord, at: Ns | None) -> None:
+        self.timers.set(TimerKind.LIFECYCLE, record.component, at)
+
+    def wake_migration(self, record: ComponentRecord, at: Ns | None) -> None:
+        self.timers.set(TimerKind.MIGRATION, record.component, at)
+
+    def drain_soon(self, host: HostName | None) -> None:
+        """There may be something to move off this host, if it is drained."""
+        if host in self.balancer.cordoned:
+            self.timers.set(TimerKind.DRAIN, "", self.now)
+
+    def back_off_time(self, failures: int) -> Ns:
+        return min(self.rules.back_off << min(failures, 20), self.rules.longest_back_off)
+
+    # Effects
+
+    def start(self, record: ComponentRecord) -> None:
+        """Commands the start of the record's incarnation, for the first time or again."""
+        if record.host is not None and record.host in self.alive:
+            record.start_until = self.now + self.rules.start_timeout + START_SLACK
+            self.wake(record, record.start_until)
+            self._commands.append(
+                StartCommand(record.component, record.incarnation, record.host, record.spec)
+            )
+
+    def start_standby(self, record: ComponentRecord, move: Migration) -> None:
+        if move.to in self.alive:
+            move.start_until = self.now + self.rules.start_timeout + START_SLACK
+            self.wake_migration(record, move.start_until)
+            self._commands.append(
+                StartCommand(record.component, move.incarnation, move.to, record.spec, standby=True)
+            )
+
+    def hand_over(self, record: ComponentRecord, move: Migration) -> None:
+        if record.host is not None:
+            self._commands.append(
+                MoveCommand(record.component, record.incarnation, record.host, move.to, move.incarnation)
+            )
+
+    def stop(self, component: ComponentId, incarnation: Incarnation, host: HostName) -> None:
+        self._commands.append(StopCommand(component, incarnation, host))
+
+    def probe(self, component: ComponentId, host: HostName | None) -> None:
+        if host is not None:
+            self._commands.append(ProbeCommand(host, component))
+
+    def refuse(self, subject: str, code: str, message: str) -> None:
+        self._commands.append(PlacementRefused(subject, code, message))

@@ -1,0 +1,214 @@
+"""What a pass could change at all, in groups that can be decided apart.
+
+Candidates that share no RC, not even by way of others, are decided apart: so a slow voter stops nobody who
+has nothing to do with it, and the cost is that of the groups.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from operator import attrgetter
+
+from zscout.scheduling.candidates import candidates
+from zscout.scheduling.model import Arc, Rc
+from zscout.scheduling.packing import PackingItem, PackingProblem
+from zscout.scheduling.reservations import Reservations
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.strategy import Actions
+from zscout.scheduling.votes import HolderSet
+from zscout.types import ArcId, Ns
+
+
+def conflict_groups(
+    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None
+) -> list[ConflictGroup]:
+    """The groups in which there is a choice, best-ranked first; none if more than `limit` ARCs could start.
+
+    One newcomer is no choice where nobody has to end for it, or those have to whose exclusive RCs it needs:
+    `priority` starts it, as any strategy would."""
+    return [
+        ConflictGroup(state, members, reserved)
+        for members in split(candidates(state, reserved, limit) or ())
+        if len(members) > 1
+        and (
+            sum(arc.hold is None for arc in members) > 1 or any(arc.mask & state.sharable for arc in members)
+        )
+    ]
+
+
+def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
+    """The ARCs in groups that have no RC in common, each in rank order; the best-ranked group first."""
+    members = sorted(arcs, key=attrgetter("rank"))
+    if _one_group(members):
+        return [members]
+    leader = list(range(len(members)))
+
+    def find(number: int) -> int:
+        while leader[number] != number:
+            leader[number] = leader[leader[number]]
+            number = leader[number]
+        return number
+
+    first: dict[int, int] = {}
+    """By bit: the first that needs the RC."""
+    for number, arc in enumerate(members):
+        mask = arc.mask
+        while mask:
+            bit = mask & -mask
+            mask ^= bit
+            leader[find(first.setdefault(bit, number))] = find(number)
+    groups: dict[int, list[Arc]] = {}
+    for number, arc in enumerate(members):
+        groups.setdefault(find(number), []).append(arc)
+    # Each begins with its best-ranked, and they were met in that order.
+    return list(groups.values())
+
+
+def _level_key(arc: Arc, first: set[ArcId], now: Ns) -> tuple[int, int]:
+    """What sorts ARCs into levels, the best smallest: first their priority. A protected hold counts for more,
+    as only those from its protection upwards may end it. Where some are to go `first`, they go before their
+    equals, but not before those who run: equals are not preempted."""
+    if (below := arc.protected_below(now)) is not None:
+        return min(-arc.priority, 1 - below), 0
+    if arc.hold is not None:
+        later = bool(first) and arc.past_min_runtime(now)
+    else:
+        later = bool(first) and arc.id not in first
+    return -arc.priority, 2 if later else 1
+
+
+def _one_group(arcs: Sequence[Arc]) -> bool:
+    """Whether a few looks are enough to see that there is one group only: the usual case."""
+    mask, rest = 0, list(arcs)
+    for _ in range(3):
+        others = []
+        for arc in rest:
+            if mask and not arc.mask & mask:
+                others.append(arc)
+            else:
+                mask |= arc.mask
+        if not others:
+            return True
+        rest = others
+    return False
+
+
+class ConflictGroup:
+    """ARCs that are decided together, and how the RCs have voted on them."""
+
+    def __init__(self, state: SchedulerState, arcs: list[Arc], reserved: Reservations | None = None) -> None:
+        self.state, self.votes = state, state.votes
+        now = state.now
+        first = {arc.id for arc in arcs if reserved is not None and reserved.goes_first(arc)}
+        keyed = sorted((_level_key(arc, first, now), arc.rank, arc) for arc in arcs)
+        self.arcs = [arc for _, _, arc in keyed]
+        """Best first."""
+        self.mask = 0
+        """All that they need or hold."""
+        for arc in arcs:
+            self.mask |= arc.mask
+        keys = [key for key, _, _ in keyed]
+        levels = {key: level for level, key in enumerate(dict.fromkeys(keys))}
+        exclusive = ~state.sharable
+        self.items = [
+            PackingItem(
+                mask=arc.mask & exclusive,
+                width=arc.mask.bit_count(),
+                level=levels[key],
+                running=arc.hold is not None,
+                past_min_runtime=arc.past_min_runtime(now),
+            )
+            for arc, key in zip(self.arcs, keys, strict=True)
+        ]
+        self._number = {arc.id: number for number, arc in enumerate(self.arcs)}
+        self.sharables = list(state.rcs_in(self.mask & state.sharable))
+        vetoes = {rc.name: set(self._vetoes(rc)) for rc in self.sharables}
+        self.nogoods = set().union(*vetoes.values())
+        """Sets that vetoes rule out, as `PackingProblem` has them."""
+        self._short = {name for name, nogoods in vetoes.items() if nogoods}
+        """RCs that have not enough for all."""
+
+    def problem(self) -> PackingProblem:
+        return PackingProblem(self.items, sorted(self.nogoods))
+
+    def ask(self, chosen: int) -> list[tuple[Rc, HolderSet]] | None:
+        """What has to be asked before this set can be taken. None: a veto, now in `nogoods`, rules it out."""
+        questions: list[tuple[Rc, HolderSet]] = []
+        ruled_out = False
+        for rc in self.sharables:
+            holders = frozenset(self._holders(rc, chosen))
+            # Who holds it now has been accepted; an RC that can't carry its holders any longer reports that.
+            if holders <= rc.holders.keys():
+                continue
+            answer = self.votes.known(rc.name, holders)
+            if answer is None and not self.votes.silent(rc.name):
+                questions.append((rc, self._probe(rc, holders) if rc.name in self._short else holders))
+            elif answer is None or not answer.accept:
+                # Who was not asked in time is taken to refuse, from the first that it was not asked about.
+                ranked, accepted = self._ranked(rc, holders)
+                self.nogoods.add(self._bits(frozenset(ranked[: accepted + 1]) if answer is None else holders))
+                ruled_out = True
+        return None if ruled_out else questions
+
+    def take(self, chosen: int, actions: Actions) -> None:
+        """Carries the set out: ends who has to end, starts who is to start."""
+        taken = [chosen >> number & 1 for number in range(len(self.arcs))]
+        starting = [arc for arc, one in zip(self.arcs, taken, strict=True) if one and arc.hold is None]
+        ending = [arc for arc, one in zip(self.arcs, taken, strict=True) if not one and arc.hold is not None]
+        for victim in ending:
+            actions.preempt(victim, by=self._taker(victim, starting))
+        for arc in starting:
+            actions.start(arc)
+
+    def _vetoes(self, rc: Rc) -> Iterator[int]:
+        """The vetoes of `rc` that bear on these ARCs. Who else holds it stays."""
+        for holders in self.votes.vetoed(rc.name):
+            if all(arc in self._number or arc in rc.holders for arc in holders) and (
+                nogood := self._bits(holders)
+            ):
+                yield nogood
+
+    def _probe(self, rc: Rc, holders: HolderSet) -> HolderSet:
+        """What to ask an RC that is short: half of those whom it has not accepted yet, beside the others.
+
+        A veto of few rules out far more sets than one of many; in a few rounds all are asked."""
+        ranked, accepted = self._ranked(rc, holders)
+        return frozenset(ranked[: (accepted + len(ranked) + 1) // 2])
+
+    def _ranked(self, rc: Rc, holders: HolderSet) -> tuple[list[ArcId], int]:
+        """Those who hold `rc` already, then the others by rank; and how many of these it has accepted.
+
+        Not all of `holders` are accepted."""
+        newcomers = (arc.id for arc in self.arcs if arc.id in holders and arc.id not in rc.holders)
+        ranked = [*(holders & rc.holders.keys()), *newcomers]
+        accepted = len(ranked) - 1
+        while accepted and not self._accepted(rc, frozenset(ranked[:accepted])):
+            accepted -= 1
+        return ranked, accepted
+
+    def _accepted(self, rc: Rc, holders: HolderSet) -> bool:
+        answer = self.votes.known(rc.name, holders)
+        return holders <= rc.holders.keys() or (answer is not None and answer.accept)
+
+    def _holders(self, rc: Rc, chosen: int) -> Iterator[ArcId]:
+        """Who would hold `rc`."""
+        for holder in rc.holders:
+            if holder not in self._number:
+                yield holder
+        for number, arc in enumerate(self.arcs):
+            if chosen >> number & 1 and arc.mask & rc.bit:
+                yield arc.id
+
+    def _bits(self, holders: HolderSet) -> int:
+        return sum(1 << self._number[arc] for arc in holders if arc in self._number)
+
+    def _taker(self, victim: Arc, starting: list[Arc]) -> Arc:
+        """For whom a hold is taken away: the best-ranked newcomer that needs one of its exclusive RCs, else
+        one of its sharable ones, else the best-ranked of all."""
+        entitled = [arc for arc in starting if victim.preemptible_by(arc, self.state.now)] or starting
+        exclusive = ~self.state.sharable
+        for mask in (victim.mask & exclusive, victim.mask):
+            for arc in entitled:
+                if arc.mask & mask:
+                    return arc
+        return entitled[0]

@@ -1,0 +1,255 @@
+"""The components of one host: what is asked of its node about them (`host/<host>/component`)."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+import msgspec
+
+from zscout.behaviors.components.kinds import installed
+from zscout.config.fleet import Fleet
+from zscout.config.node import MAX_KINDS, ComponentsConfig
+from zscout.keyexpr import BadName, check_name
+from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Supervisor
+from zscout.messages import (
+    MAX_ERROR,
+    MAX_MOVE,
+    MAX_PARAMS_SIZE,
+    MAX_PLACED,
+    ActivateComponent,
+    Checkpoint,
+    CheckpointComponent,
+    ComponentList,
+    ComponentOperation,
+    ListComponents,
+    MoveComponent,
+    Output,
+    Problem,
+    ReadOutput,
+    RestoreComponent,
+    StartComponent,
+    StopComponent,
+)
+from zscout.services.node.component_process import ComponentProcess
+from zscout.services.node.limits import ControlGroups
+from zscout.services.node.process_use import RunningComponent
+from zscout.services.recorder.process import beside
+
+log = logging.getLogger("zscout.components")
+
+MAX_ENDED: Final = 64
+"""Ended components that are still listed."""
+MAX_UNDERWAY: Final = 512
+"""Operations at one time."""
+MAKE_WAY: Final = 5.0
+"""Seconds that an incarnation on its way out has until the next one is refused."""
+GRACE: Final = 2.0
+"""Seconds that components have to end when their node does."""
+
+
+class ComponentHost:
+    """Starts, watches and ends the components of this host."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        rules: ComponentsConfig,
+        on_failure: Callable[[Exception], object],
+        limits: ControlGroups | None = None,
+    ) -> None:
+        self.mesh, self._rules = mesh, rules
+        self._fleet = msgspec.structs.replace(fleet, mesh=beside(fleet.mesh))
+        self._limits = limits or ControlGroups()
+        self._living: dict[str, ComponentProcess] = {}
+        self._ended: OrderedDict[str, ComponentProcess] = OrderedDict()
+        self._known: OrderedDict[str, int] = OrderedDict()
+        """The highest incarnation of each component that was started here."""
+        self._served: Declaration | None = None
+        self.supervisor = Supervisor("the component host", on_failure)
+        self._underway = 0
+        self._stopping = False
+
+    async def start(self) -> None:
+        await asyncio.to_thread(self._limits.sweep)
+        key = self.mesh.keys.component(self.mesh.me.host)
+        self._served = self.mesh.serve(key, ComponentOperation, self._on_request, limit=MAX_MOVE)
+
+    async def stop(self) -> None:
+        """Ends all components, side by side, each within GRACE seconds."""
+        self._stopping = True
+        await asyncio.gather(*(process.stop(GRACE) for process in list(self._living.values())))
+        if self._served is not None:
+            self._served.close()
+        await self.supervisor.close()
+
+    def running(self) -> list[RunningComponent]:
+        """For the load report; may be called from any thread."""
+        found = []
+        for process in list(self._living.values()):
+            pid, start = process.pid, process.start
+            if pid is not None:
+                found.append(RunningComponent(start.component, start.spec.kind, start.incarnation, pid))
+        return found
+
+    # What is asked
+
+    def _on_request(self, request: IncomingQuery[ComponentOperation]) -> None:
+        if self._underway >= MAX_UNDERWAY:
+            raise Refused("busy", "too many operations are under way here; ask again")
+        self._underway += 1
+        self.supervisor.spawn(self._answer(request))
+
+    async def _answer(self, request: IncomingQuery[ComponentOperation]) -> None:
+        try:
+            request.answer(await self._do(request.message))
+        except Refused as refused:
+            request.refuse(refused.problem)
+        except BadName as error:
+            request.refuse(Problem("bad_request", str(error)))
+        except Exception:
+            log.exception("an operation on a component failed")
+            request.refuse(Problem("internal", "the request failed here; see this node's log"))
+        finally:
+            self._underway -= 1
+
+    async def _do(self, operation: ComponentOperation) -> msgspec.Struct:
+        match operation:
+            case StartComponent():
+                return await self._start(operation)
+            case StopComponent():
+                process = self._find(operation.component, operation.incarnation, old="unknown_component")
+                await process.stop(operation.grace)
+                return process.view()
+            case CheckpointComponent():
+                process = self._find(operation.component)
+                state = await process.checkpoint()
+                return Checkpoint(operation.component, process.start.incarnation, state)
+            case ListComponents():
+                return await self._list(operation.component)
+            case ReadOutput():
+                process = self._find(operation.component)
+                start, end, text = process.output.read(operation.start)
+                over = process.output.over
+                return Output(operation.component, process.start.incarnation, start, end, text, over)
+            case MoveComponent():
+                check_name(operation.to, "host")
+                if operation.to == self.mesh.me.host or operation.to_incarnation <= operation.incarnation:
+                    raise Refused(
+                        "bad_request", "it moves to another host, and gets a higher incarnation there"
+                    )
+                return await self._find(operation.component, operation.incarnation).move(operation)
+            case RestoreComponent():
+                process = self._find(operation.component, operation.incarnation)
+                await process.restore(operation)
+                return process.view()
+            case ActivateComponent():
+                process = self._find(operation.component, operation.incarnation)
+                await process.activate()
+                return process.view()
+
+    async def _start(self, start: StartComponent) -> msgspec.Struct:
+        before = self._living.get(start.component)
+        if before is not None and before.leaving and start.incarnation > before.start.incarnation:
+            # It moved away, failed or is being stopped: what comes next may be here before it is quite gone.
+            with suppress(TimeoutError):
+                async with asyncio.timeout(MAKE_WAY):
+                    await before.over.wait()
+        process = self._same(start) or await self._launch(start)
+        await process.settled.wait()
+        return process.view()
+
+    async def _launch(self, start: StartComponent) -> ComponentProcess:
+        self._check(start)
+        kinds = await asyncio.to_thread(installed)
+        # Another one may have asked meanwhile.
+        process = self._same(start)
+        if process is not None:
+            return process
+        where = kinds.get(start.spec.kind)
+        if where is None:
+            there = ", ".join(self._startable(kinds)) or "none"
+            message = f"no kind {start.spec.kind!r} is installed here; there are {there}"
+            raise Refused("unknown_kind", message[:MAX_ERROR])
+        if len(self._living) >= self._rules.max:
+            raise Refused(
+                "too_many", f"{len(self._living)} components run here; [components] max allows no more"
+            )
+        if self._stopping:
+            raise Refused("not_allowed", "this node is stopping")
+        name = start.component
+        self._known[name] = start.incarnation
+        self._known.move_to_end(name)
+        while len(self._known) > MAX_PLACED:
+            self._known.popitem(last=False)
+        self._ended.pop(name, None)
+        process = ComponentProcess(self.mesh.me.host, self._fleet, self._limits, start, where, self._on_over)
+        self._living[name] = process
+        process.begin(self.supervisor)
+        log.info("starts %s.%d (%s)", name, start.incarnation, start.spec.kind)
+        return process
+
+    def _same(self, start: StartComponent) -> ComponentProcess | None:
+        """The process that this start has led to already. Raises Refused where another one is in its way."""
+        name = start.component
+        process = self._living.get(name) or self._ended.get(name)
+        if process is not None and process.start.incarnation == start.incarnation:
+            return process
+        known = self._known.get(name, 0)
+        if start.incarnation <= known:
+            raise Refused("old_incarnation", f"{name} was started here as incarnation {known} already")
+        if name in self._living:
+            raise Refused("runs_already", f"incarnation {known} of {name} lives here; stop it first")
+        return None
+
+    def _check(self, start: StartComponent) -> None:
+        check_name(start.component, "component")
+        kinds = self._rules.kinds
+        if not self._rules.allow:
+            raise Refused("not_allowed", "this host starts no components: [components] allow is false")
+        if kinds is not None and start.spec.kind not in kinds:
+            allowed = ", ".join(kinds) or "none"
+            message = f"this host starts no {start.spec.kind!r}; [components] kinds names {allowed}"
+            raise Refused("not_allowed", message[:MAX_ERROR])
+        size = len(msgspec.json.encode(start.spec.params))
+        if size > MAX_PARAMS_SIZE:
+            raise Refused(
+                "too_large", f"params are {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are taken"
+            )
+
+    async def _list(self, component: str | None) -> ComponentList:
+        kinds = await asyncio.to_thread(installed)
+        found = {**self._ended, **self._living}
+        views = [found[name].view() for name in sorted(found) if component in (None, name)]
+        return ComponentList(self.mesh.me.host, views, self._startable(kinds)[:MAX_KINDS])
+
+    def _startable(self, kinds: dict[str, str]) -> list[str]:
+        if not self._rules.allow:
+            return []
+        allowed = self._rules.kinds
+        return sorted(kind for kind in kinds if allowed is None or kind in allowed)
+
+    def _find(
+        self, component: str, incarnation: int | None = None, *, old: str = "old_incarnation"
+    ) -> ComponentProcess:
+        """`old` is the code where a higher incarnation was started here: the one that is meant has ended."""
+        process = self._living.get(component) or self._ended.get(component)
+        if process is None:
+            raise Refused("unknown_component", f"there is no component {component[:80]!r} on this host")
+        own = process.start.incarnation
+        if incarnation is not None and incarnation != own:
+            code = old if incarnation < own else "unknown_component"
+            raise Refused(code, f"{component} is here as incarnation {own}, not {incarnation}")
+        return process
+
+    def _on_over(self, process: ComponentProcess) -> None:
+        name = process.start.component
+        del self._living[name]
+        self._ended[name] = process
+        while len(self._ended) > MAX_ENDED:
+            self._ended.popitem(last=False)

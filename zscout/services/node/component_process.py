@@ -1,0 +1,388 @@
+"""One component as its node sees it: a child process, its orders, its messages, and how it ended."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final
+
+import msgspec
+
+from zscout.behaviors.components import channel
+from zscout.behaviors.components.channel import (
+    BadFrame,
+    CheckpointTaken,
+    ComponentJob,
+    ComponentReport,
+    EndReport,
+    MovedAway,
+    OrderAnswer,
+    OrderDeclined,
+    PhaseReport,
+)
+from zscout.behaviors.components.processes import VARIABLE, kill_family
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import new_instance
+from zscout.mesh import Refused, Supervisor, clock
+from zscout.messages import (
+    ComponentView,
+    HowEnded,
+    MoveComponent,
+    Moved,
+    Phase,
+    RestoreComponent,
+    StartComponent,
+)
+from zscout.services.node.component_output import OutputReader, OutputRing
+from zscout.services.node.limits import ComponentGroup, ControlGroups
+from zscout.types import SECOND, Ns
+
+log = logging.getLogger("zscout.components")
+
+LINGER: Final = 2.0
+"""Seconds from a process's last word to its end."""
+PATIENCE: Final = 5.0
+"""Seconds that a component has to come to a safe point for a checkpoint."""
+SLACK: Final = 5.0
+"""Seconds beyond that for its answer."""
+
+
+class ComponentProcess:
+    """One incarnation of a component. `where` is the kind's `module:class`; `fleet` how a child joins;
+    `on_over` is called once, when it has ended."""
+
+    def __init__(
+        self,
+        host: str,
+        fleet: Fleet,
+        limits: ControlGroups,
+        start: StartComponent,
+        where: str,
+        on_over: Callable[[ComponentProcess], None],
+    ) -> None:
+        self._host, self._fleet, self._limits = host, fleet, limits
+        self.start, self._where, self._on_over = start, where, on_over
+        self.phase: Phase = "starting"
+        self.ended: HowEnded | None = None
+        self.reason = ""
+        self.movable = False
+        self.moved: Moved | None = None
+        self.output = OutputRing()
+        self.settled = asyncio.Event()
+        """It stands by, runs, or has ended."""
+        self.running = asyncio.Event()
+        """It runs, or has ended."""
+        self.over = asyncio.Event()
+        self._began: Ns = clock.now()
+        self._lasted: Ns | None = None
+        self._tag = f"{start.component}.{start.incarnation}-{new_instance()}"
+        self._child: subprocess.Popen[bytes] | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._group = ComponentGroup(0, 0)
+        self._verdict: EndReport | None = None
+        """How it ends if it is this node that ends it."""
+        self._end_report: EndReport | None = None
+        self._gone = False
+        """Its process is no more, but not everything of it is cleared up."""
+        self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
+        self._number = 0
+        self._moving: tuple[MoveComponent, asyncio.Task[Moved]] | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Of its process, until that was waited for."""
+        return self._child.pid if self._child is not None and self._child.returncode is None else None
+
+    @property
+    def leaving(self) -> bool:
+        """Whether it will have ended before long, of itself or because it was ordered to."""
+        return (
+            self.phase == "stopping" or self.moved is not None or self._gone or self._end_report is not None
+        )
+
+    def begin(self, supervisor: Supervisor) -> None:
+        """Starts it; `supervisor` is its host's. What fails at it ends this component alone, as `failed`."""
+        self._supervisor = supervisor
+        supervisor.spawn(self._live())
+
+    def view(self) -> ComponentView:
+        lasted = self._lasted if self._lasted is not None else clock.now() - self._began
+        failed = self.ended == "failed"
+        return ComponentView(
+            component=self.start.component,
+            incarnation=self.start.incarnation,
+            host=self._host,
+            spec=self.start.spec,
+            phase=self.phase,
+            movable=self.movable,
+            uptime=lasted / SECOND,
+            pid=self.pid,
+            ended=self.ended,
+            reason=self.reason if self.ended is not None else self._group.missing,
+            tail=self.output.tail() if failed else "",
+        )
+
+    # Orders. Each raises Refused.
+
+    async def stop(self, grace: float) -> None:
+        """Returns when it has ended: by itself within `grace` seconds, or killed."""
+        if self.phase != "ended":
+            self.phase = "stopping"
+            self._send(channel.StopOrder())
+        try:
+            async with asyncio.timeout(grace):
+                await self.over.wait()
+        except TimeoutError:
+            self._kill(
+                EndReport("stopped", f"it was killed: it had not ended {grace:g} s after it was asked to")
+            )
+        await self.over.wait()
+
+    async def checkpoint(self) -> bytes:
+        self._check_runs()
+        answer = await self._ask(channel.CheckpointOrder(self._next(), PATIENCE), PATIENCE + SLACK)
+        assert isinstance(answer, CheckpointTaken)  # noqa: S101 - of an order that is answered so
+        return answer.state
+
+    async def move(self, order: MoveComponent) -> Moved:
+        """Asked again for the same move it answers with the outcome of that one."""
+        if self.moved is not None and self.moved.incarnation == order.to_incarnation:
+            return self.moved
+        if self._moving is not None and not self._moving[1].done():
+            if self._moving[0].to_incarnation != order.to_incarnation:
+                raise Refused("move_failed", f"it is moving to {self._moving[0].to} already")
+        else:
+            self._check_runs()
+            self._moving = order, asyncio.get_running_loop().create_task(self._move(order))
+        return await asyncio.shield(self._moving[1])
+
+    async def _move(self, order: MoveComponent) -> Moved:
+        # Without an end: once it is committed it may last until the other node is known to be gone.
+        answer = await self._ask(
+            channel.MoveOrder(self._next(), order.to, order.to_incarnation, order.patience), None
+        )
+        assert isinstance(answer, MovedAway)  # noqa: S101
+        if self.phase == "running":
+            self.phase = "stopping"
+        self.moved = Moved(order.component, order.to, order.to_incarnation, answer.dead)
+        return self.moved
+
+    async def restore(self, order: RestoreComponent) -> None:
+        if self.phase != "standby":
+            raise Refused("move_failed", f"it is {self.phase} here; only one that stands by is restored")
+        await self._ask(channel.RestoreOrder(self._next(), order.state, order.requests), SLACK)
+
+    async def activate(self) -> None:
+        """Returns when it runs, or has ended."""
+        self._send(channel.ActivateOrder())
+        await self.running.wait()
+
+    def _check_runs(self) -> None:
+        if self.phase != "running":
+            raise Refused("bad_request", f"{self.start.component} is {self.phase} here; it must run for that")
+
+    async def _ask(self, order: Any, timeout: float | None) -> OrderAnswer:
+        answered: asyncio.Future[OrderAnswer] = asyncio.get_running_loop().create_future()
+        self._waiting[order.number] = answered
+        try:
+            self._send(order)
+            async with asyncio.timeout(timeout):
+                answer = await answered
+        except TimeoutError:
+            raise Refused("not_safe", f"it did not answer within {timeout:g} s") from None
+        finally:
+            self._waiting.pop(order.number, None)
+        if isinstance(answer, OrderDeclined):
+            raise Refused(answer.code, answer.message)
+        return answer
+
+    def _send(self, order: msgspec.Struct) -> None:
+        if self._writer is not None and not self._writer.is_closing():
+            self._writer.write(channel.pack(order))
+
+    def _next(self) -> int:
+        self._number += 1
+        return self._number
+
+    # Its life
+
+    async def _live(self) -> None:
+        late = self._supervisor.call_later(self._fleet.placement.start_timeout / SECOND, self._late)
+        try:
+            await self._run_child()
+        except OSError as error:
+            self._verdict = self._verdict or EndReport("failed", f"it can't be started: {error}")
+        except Exception as error:
+            log.exception("%s failed at its node", self._tag)
+            self._verdict = self._verdict or EndReport("failed", f"its node failed: {error}")
+        finally:
+            late.cancel()
+            await asyncio.shield(self._finish())
+
+    async def _run_child(self) -> None:
+        spec = self.start.spec
+        if spec.memory_limit or spec.cpu_limit:
+            name = f"{self.start.component}.{self.start.incarnation}"
+            self._group = await asyncio.to_thread(self._limits.group, name, spec.memory_limit, spec.cpu_limit)
+        ours, theirs = socket.socketpair()
+        reading, writing = os.pipe()
+        output = OutputReader(reading, self.output)
+        try:
+            with theirs:
+                self._child = await asyncio.to_thread(self._spawn, theirs.fileno(), writing)
+        except OSError:
+            ours.close()
+            output.finish()
+            raise
+        finally:
+            os.close(writing)
+        child = self._child
+        try:
+            # It waits for its job: what it uses from now on counts.
+            await asyncio.to_thread(self._group.enter, child.pid)
+            await self._serve_connection(ours, child)
+        finally:
+            ours.close()
+            # As long as nobody waited for it, nobody else has its number.
+            with suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)
+            await asyncio.to_thread(child.wait)
+            await asyncio.to_thread(kill_family, self._tag)
+            output.finish()
+
+    async def _serve_connection(self, connection: socket.socket, child: subprocess.Popen[bytes]) -> None:
+        """Gives a child its job, and returns when it has ended."""
+        loop = asyncio.get_running_loop()
+        stream, writer = await asyncio.open_unix_connection(sock=connection, limit=channel.MAX_FRAME)
+        self._writer = writer
+        self._send(self._job())
+        if self.phase == "stopping":
+            self._send(channel.StopOrder())
+        if self._verdict is not None:
+            self._kill(self._verdict)
+        gone = asyncio.Event()
+        handle = os.pidfd_open(child.pid)
+        loop.add_reader(handle, gone.set)
+        receiving = loop.create_task(self._receive(stream))
+        try:
+            await gone.wait()
+            self._gone = True
+            # Its last messages are on their way.
+            with suppress(TimeoutError):
+                async with asyncio.timeout(LINGER):
+                    await receiving
+        finally:
+            loop.remove_reader(handle)
+            os.close(handle)
+            receiving.cancel()
+            writer.close()
+
+    def _spawn(self, connection: int, writing: int) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(  # noqa: S603 - nothing of it comes over the mesh
+            [sys.executable, "-P", "-m", "zscout.behaviors.components.runner", str(connection)],
+            stdin=subprocess.DEVNULL,
+            stdout=writing,
+            stderr=writing,
+            pass_fds=(connection,),
+            start_new_session=True,
+            env=os.environ | {VARIABLE: self._tag, "PYTHONUNBUFFERED": "1", "ZSCOUT_HOST": self._host},
+        )
+
+    def _job(self) -> ComponentJob:
+        start = self.start
+        return ComponentJob(
+            component=start.component,
+            incarnation=start.incarnation,
+            kind=start.spec.kind,
+            where=self._where,
+            params=start.spec.params,
+            host=self._host,
+            fleet=self._fleet,
+            tag=self._tag,
+            standby=start.standby,
+            memory=self._group.each,
+        )
+
+    async def _receive(self, stream: asyncio.StreamReader) -> None:
+        try:
+            while True:
+                telling: ComponentReport | None = await channel.read(stream, ComponentReport)
+                if telling is None:
+                    return
+                self._on_message(telling)
+        except BadFrame as error:
+            self._kill(EndReport("failed", f"it was killed: what it said to its node is no message: {error}"))
+
+    def _on_message(self, telling: ComponentReport) -> None:
+        match telling:
+            case PhaseReport(phase=phase, movable=movable):
+                self.movable = movable
+                if self.phase != "stopping":
+                    self.phase = phase
+                if not self.settled.is_set():
+                    asyncio.get_running_loop().run_in_executor(None, self._group.settle)
+                self.settled.set()
+                if phase == "running":
+                    self.running.set()
+            case EndReport():
+                self._end_report = telling
+                self._supervisor.call_later(LINGER, self._kill, telling)
+            case _:
+                waiting = self._waiting.get(telling.number)
+                if waiting is not None and not waiting.done():
+                    waiting.set_result(telling)
+
+    def _late(self) -> None:
+        if not self.settled.is_set():
+            timeout = self._fleet.placement.start_timeout / SECOND
+            self._kill(EndReport("failed", f"it was killed: it did not get ready within {timeout:g} s"))
+
+    def _kill(self, verdict: EndReport) -> None:
+        """Ends it by force, unless it has ended."""
+        if self.over.is_set():
+            return
+        self._verdict = self._verdict or verdict
+        if self.pid is not None:
+            # Its number is its own until it was waited for.
+            with suppress(ProcessLookupError):
+                os.killpg(self.pid, signal.SIGKILL)
+
+    async def _finish(self) -> None:
+        ends = self._end_report or self._how()
+        await asyncio.to_thread(self._group.close)
+        self._lasted = clock.now() - self._began
+        self.phase, self.ended, self.reason = "ended", ends.how, ends.reason
+        words = f"{ends.how}: {ends.reason}" if ends.reason else ends.how
+        log.info("%s.%d %s", self.start.component, self.start.incarnation, words)
+        for waiting in self._waiting.values():
+            if not waiting.done():
+                waiting.set_exception(Refused("move_failed", f"it has ended, {words}"))
+        try:
+            self._on_over(self)
+        finally:
+            for event in (self.settled, self.running, self.over):
+                event.set()
+
+    def _how(self) -> EndReport:
+        """How one ended that had no last word."""
+        if self._verdict is not None:
+            return self._verdict
+        code = self._child.returncode if self._child is not None else None
+        if code == -signal.SIGKILL and self._group.overdrawn():
+            return EndReport(
+                "failed", f"killed: used more memory than its limit of {self._group.memory} bytes"
+            )
+        if code is not None and code < 0:
+            try:
+                name = signal.Signals(-code).name
+            except ValueError:
+                name = f"signal {-code}"
+            return EndReport("failed", f"killed by {name}")
+        return EndReport("failed", f"its process left with code {code} and without a word")

@@ -1,0 +1,252 @@
+"""Limits of memory and processor time for components, by control groups (v1, or v2 where the node may).
+
+A component that has a limit gets a group of its own below the node's. Where that can't be had, memory is
+limited for each of its processes by itself (RLIMIT_DATA), and processor time is not.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import psutil
+
+from zscout.services.node.cgroup import group_folders, own_groups, read_field, read_text
+
+log = logging.getLogger("zscout.components")
+
+PERIOD_US: Final = 100_000
+LEAST_US: Final = 1_000
+"""Of each period: the kernel takes no less."""
+START_CORES: Final = 1.0
+PREFIX: Final = "zscout."
+LEAF: Final = "zscout-node"
+"""The group (v2) that the node moves itself into: one with processes can't limit groups within it."""
+CLOSE_TRIES: Final = 50
+CLOSE_PAUSE: Final = 0.02
+"""Seconds. A group can't be removed before the kernel is done with its last process."""
+
+
+class ComponentGroup:
+    """The limits of one component. Not for the event loop: its methods wait for files, `close` up to 1 s."""
+
+    def __init__(self, memory: int, cpu: float) -> None:
+        self.folders: list[Path] = []
+        self.memory = memory
+        """Bytes; 0: no limit."""
+        self.cpu = cpu
+        """Cores; 0: no limit."""
+        self.memory_set = self.cpu_set = False
+        self._throttle: tuple[Path, str] | None = None
+        """The file, and what it is to say once the component is ready."""
+
+    @property
+    def each(self) -> int:
+        """Bytes that each process is to limit itself to, as there is no group to do it for all; 0: none."""
+        return 0 if self.memory_set else self.memory
+
+    @property
+    def missing(self) -> str:
+        """Which limits this host can't set, in words."""
+        parts = []
+        if self.memory and not self.memory_set:
+            parts.append("memory_limit holds for each of its processes, not for all together")
+        if self.cpu and not self.cpu_set:
+            parts.append("cpu_limit can't be set")
+        return f"{' and '.join(parts)}: this host lets its node make no control groups" if parts else ""
+
+    @property
+    def start_cpu(self) -> float:
+        """Cores that it may use until it is ready."""
+        return max(self.cpu, START_CORES)
+
+    def throttle_by(self, file: Path, text: str) -> None:
+        """What `settle` is to write."""
+        self._throttle = file, text
+
+    def enter(self, pid: int) -> None:
+        """Puts a process in, and all that it starts from now on. Raises OSError."""
+        for folder in self.folders:
+            _write(folder / "cgroup.procs", str(pid))
+
+    def settle(self) -> None:
+        """The component is ready: from now on its limit of processor time holds. Before, START_CORES do, so
+        that one that may use little later is ready in time."""
+        if self._throttle is not None:
+            file, text = self._throttle
+            with suppress(OSError):  # it has ended meanwhile
+                _write(file, text)
+
+    def overdrawn(self) -> bool:
+        """Whether the kernel killed something of it because it used more memory than its limit."""
+        names = ("memory.events", "memory.oom_control")
+        return self.memory_set and any(
+            (read_field(folder / name, "oom_kill") or 0) > 0 for folder in self.folders for name in names
+        )
+
+    def close(self) -> None:
+        """Kills what is still in it, and removes it."""
+        for folder in self.folders:
+            for last in range(CLOSE_TRIES):
+                _kill_all(folder)
+                try:
+                    folder.rmdir()
+                except FileNotFoundError:
+                    break
+                except OSError as error:
+                    if last == CLOSE_TRIES - 1:
+                        log.warning("the control group %s can't be removed: %s", folder, error)
+                    time.sleep(CLOSE_PAUSE)
+                else:
+                    break
+        self.folders = []
+
+
+class ControlGroups:
+    """Makes groups. `root` is where they are mounted, `of` the file that says which ones the node is in."""
+
+    def __init__(self, root: Path = Path("/sys/fs/cgroup"), of: Path = Path("/proc/self/cgroup")) -> None:
+        self._root = root
+        self._of = own_groups(of)
+
+    def group(self, name: str, memory: int, cpu: float) -> ComponentGroup:
+        """A group for one component: `memory` in bytes, `cpu` in cores, 0 for no limit. What can't be set is
+        listed by the group. Not for the event loop."""
+        group = ComponentGroup(memory, cpu)
+        name = f"{PREFIX}{os.getpid()}.{name}"
+        if memory:
+            group.memory_set = self._v1(group, "memory", name) or self._unified(group, "memory", name)
+        if cpu:
+            group.cpu_set = self._v1(group, "cpu", name) or self._unified(group, "cpu", name)
+        return group
+
+    def sweep(self) -> None:
+        """Removes the groups of nodes that were killed. Not for the event loop."""
+        for parent in (self._own("memory"), self._own("cpu"), self._base()):
+            for folder in _folders(parent):
+                owner = folder.name.removeprefix(PREFIX).partition(".")[0]
+                if owner.isdecimal() and not Path("/proc", owner).exists():
+                    with suppress(OSError):
+                        folder.rmdir()
+
+    def _own(self, controller: str) -> Path:
+        """The node's own group of v1, or the deepest above it that can be seen: in a container the way to it
+        may be the host's."""
+        return group_folders(self._root / controller, self._of.get(controller, ()))[-1]
+
+    def _v1(self, group: ComponentGroup, controller: str, name: str) -> bool:
+        own = self._own(controller)
+        if not (own / "tasks").is_file():
+            return False
+        folder = own / name
+        if controller == "memory":
+            # The second counts swap as well; not every kernel has it, and it can't be below the first.
+            wanted = {"memory.limit_in_bytes": str(group.memory)}
+            also = {"memory.memsw.limit_in_bytes": str(group.memory)}
+        else:
+            wanted = {"cpu.cfs_period_us": str(PERIOD_US), "cpu.cfs_quota_us": str(_quota(group.start_cpu))}
+            also = {}
+            group.throttle_by(folder / "cpu.cfs_quota_us", str(_quota(group.cpu)))
+        return _make(group, folder, wanted, also)
+
+    def _unified(self, group: ComponentGroup, controller: str, name: str) -> bool:
+        base = self._base()
+        if not _may_delegate(base, controller):
+            return False
+        if controller == "memory":
+            wanted = {"memory.max": str(group.memory)}
+            also = {"memory.swap.max": "0", "memory.oom.group": "1"}
+        else:
+            wanted, also = {"cpu.max": f"{_quota(group.start_cpu)} {PERIOD_US}"}, {}
+            group.throttle_by(base / name / "cpu.max", f"{_quota(group.cpu)} {PERIOD_US}")
+        return _make(group, base / name, wanted, also)
+
+    def _base(self) -> Path:
+        own = group_folders(self._root, self._of.get("", ()))[-1]
+        return own.parent if own.name == LEAF else own
+
+
+def _make(group: ComponentGroup, folder: Path, wanted: dict[str, str], also: dict[str, str]) -> bool:
+    try:
+        folder.mkdir(exist_ok=True)
+        for name, value in wanted.items():
+            _write(folder / name, value)
+    except OSError as error:
+        log.info("no limits by %s: %s", folder, error)
+        with suppress(OSError):
+            folder.rmdir()
+        return False
+    for name, value in also.items():
+        with suppress(OSError):
+            if (folder / name).exists():
+                _write(folder / name, value)
+    if folder not in group.folders:
+        group.folders.append(folder)
+    return True
+
+
+def _may_delegate(base: Path, controller: str) -> bool:
+    """Whether groups below `base` have a controller; gives it to them where this may be. A group that holds
+    processes can't (but for the root): if they are all the node's own, they are moved into one below."""
+    if controller not in read_text(base / "cgroup.controllers").split():
+        return False
+    switch = base / "cgroup.subtree_control"
+    if controller in read_text(switch).split():
+        return True
+    try:
+        try:
+            _write(switch, f"+{controller}")
+        except OSError:
+            residents = _numbers(base / "cgroup.procs")
+            if not residents or not all(map(_is_ours, residents)):
+                raise
+            (base / LEAF).mkdir(exist_ok=True)
+            for pid in residents:
+                _write(base / LEAF / "cgroup.procs", str(pid))
+            _write(switch, f"+{controller}")
+    except OSError as error:
+        log.info("no limits by %s: %s", base, error)
+        return False
+    return True
+
+
+def _is_ours(pid: int) -> bool:
+    """Whether a process is this one or descends from it."""
+    try:
+        return os.getpid() in (pid, *(parent.pid for parent in psutil.Process(pid).parents()))
+    except psutil.Error:
+        return False
+
+
+def _kill_all(folder: Path) -> None:
+    for pid in _numbers(folder / "cgroup.procs"):
+        with suppress(OSError):
+            os.kill(pid, 9)
+
+
+def _quota(cores: float) -> int:
+    return max(LEAST_US, round(cores * PERIOD_US))
+
+
+def _folders(parent: Path) -> list[Path]:
+    try:
+        return [folder for folder in parent.iterdir() if folder.name.startswith(PREFIX)]
+    except OSError:
+        return []
+
+
+def _write(file: Path, text: str) -> None:
+    # Without O_CREAT: in a folder that is no control group nothing is to appear.
+    handle = os.open(file, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC)
+    try:
+        os.write(handle, text.encode())
+    finally:
+        os.close(handle)
+
+
+def _numbers(file: Path) -> list[int]:
+    return [int(word) for word in read_text(file).split() if word.isdecimal()]

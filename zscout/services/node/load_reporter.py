@@ -1,0 +1,217 @@
+"""Publishes how loaded this host is: measured, once a second, dropped rather than queued."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+from zscout.keyexpr import Role, Token, new_instance
+from zscout.mesh import Mesh, Supervisor
+from zscout.messages import LoadReport
+from zscout.services.node.cgroup import Cgroup, HostMemory
+from zscout.services.node.host_figures import (
+    CpuMeter,
+    Paced,
+    clock,
+    cores,
+    memory,
+    speed,
+    temperature,
+)
+from zscout.services.node.process_use import (
+    ComponentProcesses,
+    LoadAverage,
+    NoComponents,
+    TreeMeter,
+    TreeUse,
+    UseMeter,
+)
+
+log = logging.getLogger("zscout.load")
+
+PERIOD: Final = 1.0
+"""Seconds between two reports."""
+RESTARTS: Final = (1.0, 60.0)
+"""Seconds before a reporter that failed starts again: the first time, and at most."""
+SPEED_EVERY: Final = 60.0
+SPEED_TRIES: Final = 5
+"""Of every measurement but the first."""
+SENSORS_EVERY: Final = 10.0
+"""Seconds; reading a sensor may take milliseconds, and one file for each core."""
+SENSORS_SHARE: Final = 0.0002
+USES_SHARE: Final = 0.002
+"""Of one core, that is spent on looking at what components use: many are looked at less often."""
+TREE_SHARE: Final = 0.004
+"""Likewise, at looking at this process and its descendants."""
+
+
+class LoadReporter:
+    """Publishes this host's load until stopped. `labels` are the host's; `processes` its components. With
+    `tree` only the load of this process and its descendants, as if the host had no other programs.
+
+    One that fails is logged, and withdraws its liveliness token: the host is seen to report no load. It
+    starts again after RESTARTS seconds: a node that runs devices does not end for want of figures."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        labels: Iterable[str] = (),
+        processes: ComponentProcesses | None = None,
+        *,
+        tree: bool = False,
+    ) -> None:
+        self.mesh = mesh
+        self._tree = tree
+        self._labels = tuple(labels)
+        self._processes = processes or NoComponents()
+        self._pause = RESTARTS[0]
+        self._restart: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        me = self.mesh.me
+        self._publisher = self.mesh.publisher(self.mesh.keys.load(me.host), LoadReport, data=True)
+        self._token = self.mesh.alive(Token(me.host, Role.LOAD, me.client, new_instance()))
+        self._supervisor = Supervisor("the load reporter", self._failed)
+        self._supervisor.spawn(self._run())
+
+    async def stop(self) -> None:
+        if self._restart is not None:
+            self._restart.cancel()
+        if self._supervisor.active:
+            self._leave()
+        await self._supervisor.close()
+
+    def _failed(self, _error: Exception) -> None:
+        self._leave()
+        self._restart = asyncio.get_running_loop().call_later(self._pause, self.start)
+        self._pause = min(2 * self._pause, RESTARTS[1])
+
+    def _leave(self) -> None:
+        self._token.close()
+        self._publisher.close()
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        due = loop.time() + PERIOD
+        # In a thread: it reads files, of which a sensor's may take its time.
+        gauge = await asyncio.to_thread(self._gauge)
+        failed = False
+        while True:
+            await asyncio.sleep(due - loop.time())
+            # After a stall the reports that were missed are not made up for.
+            due = max(due + PERIOD, loop.time())
+            try:
+                report = await asyncio.to_thread(gauge.report)
+            except Exception:  # a host that can't be measured once may be the next time
+                if not failed:
+                    log.exception("this host's load can't be measured; it is tried again every second")
+                failed = True
+            else:
+                failed = False
+                self._publisher.put(report)
+                self._pause = RESTARTS[0]
+
+    def _gauge(self) -> Gauge:
+        load = TreeLoad(TreeMeter()) if self._tree else None
+        return Gauge(self.mesh.me.host, self._labels, self._processes, load=load)
+
+
+class HostLoadFigures(NamedTuple):
+    """How busy a host is, or what is taken for one."""
+
+    averages: tuple[float, float, float]
+    cpu: float
+    """Percent of all cores."""
+    available: int
+    """Bytes of memory."""
+
+
+class HostLoad:
+    """The load of the whole host, or of the container where that has limits."""
+
+    def __init__(self, cgroup: Cgroup) -> None:
+        self._cpu = CpuMeter(cgroup)
+
+    def __call__(self, size: float, ram: HostMemory) -> HostLoadFigures:
+        """Of so many cores, with this memory; CPU use since the last call."""
+        return HostLoadFigures(os.getloadavg(), self._cpu.percent(size), ram.available)
+
+
+class TreeLoad:
+    """The load of one process tree, as if there were no other programs."""
+
+    def __init__(self, meter: TreeMeter) -> None:
+        self._meter = meter
+        self._average = LoadAverage()
+        self._uses = Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
+
+    def __call__(self, size: float, ram: HostMemory) -> HostLoadFigures:
+        """Of so many cores, with this memory; CPU use since the tree was last looked at."""
+        use = self._uses()
+        percent = min(100.0, 100 * use.cores / size)
+        return HostLoadFigures(self._average.averages, percent, max(0, ram.total - use.memory))
+
+    def _measure(self) -> TreeUse:
+        use = self._meter.measure()
+        self._average.add(use.wanted, use.elapsed)
+        return use
+
+
+class Gauge:
+    """Measures one host again and again. Takes 30 ms to make; use it from one thread at a time."""
+
+    def __init__(
+        self,
+        host: str,
+        labels: tuple[str, ...] = (),
+        processes: ComponentProcesses | None = None,
+        cgroup: Cgroup | None = None,
+        *,
+        load: TreeLoad | None = None,
+    ) -> None:
+        self._host, self._labels = host, labels
+        self._cgroup = cgroup or Cgroup()
+        self._load = load or HostLoad(self._cgroup)
+        self._number = 0
+        self._speed = speed()
+        self._fresh = True
+        self._speeds = Paced(self._measure_speed, least=SPEED_EVERY, share=1.0)
+        self._clocks = Paced(clock, least=SENSORS_EVERY, share=SENSORS_SHARE)
+        self._temperatures = Paced(temperature, least=SENSORS_EVERY, share=SENSORS_SHARE)
+        meter = UseMeter(processes or NoComponents())
+        self._uses = Paced(meter.measure, least=PERIOD / 2, share=USES_SHARE)
+
+    def report(self) -> LoadReport:
+        """The host's load now; CPU use since the last call."""
+        self._number += 1
+        size, ram = cores(self._cgroup), memory(self._cgroup)
+        load = self._load(size, ram)
+        now, rated = self._clocks()
+        return LoadReport(
+            host=self._host,
+            number=self._number,
+            # Readers of the first version take whole numbers only.
+            cores=int(size) if size.is_integer() else size,
+            load_average=load.averages,
+            cpu=load.cpu,
+            memory_available=load.available,
+            memory_total=ram.total,
+            speed=round(self._speeds(), 3),
+            clock=round(now, 1),
+            clock_rated=round(rated, 1),
+            temperature=self._temperatures(),
+            labels=self._labels,
+            components=self._uses(),
+        )
+
+    def _measure_speed(self) -> float:
+        if self._fresh:
+            self._fresh = False
+            return self._speed
+        found = speed(SPEED_TRIES)
+        # A few tries may find a processor that was only asleep: believed at once if faster, else by halves.
+        self._speed = found if found > self._speed else (self._speed + found) / 2
+        return self._speed

@@ -1,0 +1,224 @@
+"""The component placer on the mesh, beside the leading RCM: a pure core, its requests and its commands.
+
+What is requested and observed becomes an event of the core; its effects become queries to nodes, whose
+answers are events again. Each change is published, for the candidates that may have to go on and for all who
+watch.
+"""
+
+from __future__ import annotations
+
+import logging
+from asyncio import TimerHandle, sleep
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Final
+
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import Role, Token, incarnation_of
+from zscout.mesh import Mesh
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import Placements, PlacerOperation
+from zscout.placement.events import (
+    ComponentChanged,
+    ComponentForgotten,
+    ComponentStatus,
+    HostCommand,
+    HostJoined,
+    HostLost,
+    Inherited,
+    PlacementRefused,
+    PlacerEvent,
+    PlacerTick,
+    PlacerWakeAt,
+    TokenAppeared,
+    TokenVanished,
+)
+from zscout.placement.placer import Placer
+from zscout.services.placement.convert import placement_of
+from zscout.services.placement.load_balancer import LoadBalancer
+from zscout.services.placement.node_client import NodeClient
+from zscout.services.placement.request_handler import PlacerQuery, PlacerRequestHandler
+from zscout.types import SECOND, HostName, Ns, Term
+
+log = logging.getLogger("zscout.placer")
+
+BEGIN: Final = 2.0
+"""Seconds at most until a new placer begins, though not all hosts have listed what runs there."""
+LIST_TRIES: Final = 5
+LIST_AGAIN: Final = 0.5
+"""Seconds until a host that did not answer is asked again."""
+PUBLISH_AT_ONCE: Final = 200
+"""Components in one publication."""
+
+
+class ComponentPlacer:
+    """The placer of one term. `inherited` is what the one before it published; after `on_failure` it places
+    nothing more, and is to be stopped."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        term: Term,
+        balancer: LoadBalancer,
+        inherited: Inherited,
+        on_failure: Callable[[Exception], object],
+    ) -> None:
+        self.mesh, self.term = mesh, term
+        self._core = Placer(balancer.core, term.counter, fleet.placement)
+        self._supervisor = Supervisor("the component placer", on_failure)
+        self._requests = PlacerRequestHandler(self._core.status, term, self._supervisor)
+        self._nodes = NodeClient(mesh, fleet.placement.start_timeout)
+        self._inherited = inherited
+        self._instances: dict[HostName, set[str]] = {}
+        """Of each host's node, those that live."""
+        self._unlisted: set[HostName] = set()
+        """Hosts that have not listed yet what runs there."""
+        self._cordoned: frozenset[HostName] = frozenset()
+        """As published last."""
+        self._declarations = ExitStack()
+        self._wake: TimerHandle | None = None
+        self._begin_by: TimerHandle | None = None
+
+    def start(self) -> None:
+        keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
+        self._publisher = mesh.publisher(keys.placements, Placements)
+        self._declarations.callback(self._publisher.close)
+        self._feed(self._inherited)
+        for declared in (
+            mesh.watch(keys.alive_any(Role.NODE), guard(self._on_node)),
+            mesh.watch(keys.alive_any(Role.COMPONENT), guard(self._on_component)),
+            mesh.serve(keys.placer, PlacerOperation, guard(self._on_request)),
+        ):
+            self._declarations.callback(declared.close)
+        self._begin_by = self._supervisor.call_later(BEGIN, self._begin)
+
+    def stop(self) -> None:
+        """Stops placing. Nothing is stopped: what runs, runs for the next placer."""
+        self._supervisor.cancel()
+        self._requests.close()
+        self._declarations.close()
+
+    # Observations
+
+    def _on_node(self, token: Token, alive: bool) -> None:
+        host = token.host
+        instances = self._instances.setdefault(host, set())
+        if alive:
+            # A node that started anew has lost its components, though its old token may live on for a while.
+            if instances:
+                self._feed(HostLost(host))
+            instances.add(token.instance)
+            self._feed(HostJoined(host))
+            self._unlisted.add(host)
+            self._supervisor.spawn(self._list_components(token))
+            return
+        instances.discard(token.instance)
+        if not instances:
+            del self._instances[host]
+            self._feed(HostLost(host))
+            self._listed(host)
+
+    async def _list_components(self, node: Token) -> None:
+        """Asks a host what runs there until it answers."""
+        for _ in range(LIST_TRIES):
+            if node.instance not in self._instances.get(node.host, ()):
+                break
+            listing = await self._nodes.list_components(node.host)
+            if listing is not None:
+                self._feed(listing)
+                break
+            await sleep(LIST_AGAIN)
+        self._listed(node.host)
+
+    def _listed(self, host: HostName) -> None:
+        self._unlisted.discard(host)
+        if not self._unlisted:
+            self._begin()
+
+    def _on_component(self, token: Token, alive: bool) -> None:
+        event = TokenAppeared if alive else TokenVanished
+        self._feed(event(token.name, incarnation_of(token.instance), token.host))
+
+    # Requests
+
+    def _begin(self) -> None:
+        """Carries out requests from now on: all hosts have listed what runs there, or had their time."""
+        if self._begin_by is not None:
+            self._begin_by.cancel()
+            self._begin_by = None
+            for query, event in self._requests.open():
+                self._carry_out_request(query, event)
+
+    def _on_request(self, query: PlacerQuery) -> None:
+        event = self._requests.receive(query)
+        if event is not None:
+            self._carry_out_request(query, event)
+
+    def _carry_out_request(self, query: PlacerQuery, event: PlacerEvent) -> None:
+        self._requests.begin(query)
+        self._requests.finish(query, self._feed(event))
+
+    # Events into the core, effects out of it
+
+    def _feed(self, event: PlacerEvent) -> list[PlacementRefused]:
+        """Carries out what follows from an event; returns what the core refused."""
+        refusals: list[PlacementRefused] = []
+        changed: dict[str, ComponentStatus | None] = {}
+        effects = self._core.handle(self.mesh.now(), event)
+        status = self._core.status()
+        for effect in effects:
+            match effect:
+                case PlacementRefused():
+                    refusals.append(effect)
+                case ComponentChanged(component):
+                    changed[component] = status.components[component]
+                case ComponentForgotten(component):
+                    changed[component] = None
+                case PlacerWakeAt(at):
+                    self._wake_at(at)
+                case _:
+                    self._supervisor.spawn(self._command(effect))
+        if changed or self._cordoned != status.cordoned:
+            self._publish(changed, status.cordoned)
+        return refusals
+
+    async def _command(self, command: HostCommand) -> None:
+        event = await self._nodes.carry_out(command)
+        if event is not None:
+            self._feed(event)
+
+    def _wake_at(self, at: Ns | None) -> None:
+        if self._wake is not None:
+            self._wake.cancel()
+        self._wake = None
+        if at is not None:
+            delay = max(0.0, (at - self.mesh.now()) / SECOND)
+            self._wake = self._supervisor.call_later(delay, self._woken, at)
+
+    def _woken(self, at: Ns) -> None:
+        # A timer may go off a little early, and the core gives each time of waking only once.
+        if self.mesh.now() < at:
+            self._wake_at(at)
+        else:
+            self._feed(PlacerTick())
+
+    def _publish(self, changed: dict[str, ComponentStatus | None], cordoned: frozenset[HostName]) -> None:
+        self._cordoned = cordoned
+        statuses = [status for status in changed.values() if status is not None]
+        forgotten = [name for name, status in changed.items() if status is None]
+        for first in range(0, max(1, len(statuses)), PUBLISH_AT_ONCE):
+            some = [placement_of(status) for status in statuses[first : first + PUBLISH_AT_ONCE]]
+            self._publisher.put(Placements(self.term, some, sorted(cordoned), forgotten))
+            forgotten = []
+        for status in statuses:
+            log.info("%s", describe(status))
+        self._requests.changed(changed)
+
+
+def describe(status: ComponentStatus) -> str:
+    """One line for the log."""
+    where = f" on {status.host}" if status.host is not None else ""
+    to = f" to {status.to}" if status.to is not None else ""
+    why = f": {status.reason}" if status.reason else ""
+    return f"{status.component} {status.state.replace('_', ' ')}{where}{to}{why}"

@@ -1,0 +1,90 @@
+"""What every candidate keeps of the placer's publications, so that it can go on when it leads.
+
+What runs, the nodes list; what ran on a host that died together with the leader, nobody else would know.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import ExitStack
+from typing import Final
+
+from zscout.keyexpr import BadName, Role, Token, check_name
+from zscout.mesh import Mesh
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import MAX_PLACED, ListPlacements, Placement, Placements, absurd
+from zscout.placement.events import Inherited
+from zscout.services.placement.convert import status_of
+from zscout.types import NO_TERM, ComponentId, HostName, Term
+
+log = logging.getLogger(__name__)
+
+ASK_TIMEOUT: Final = 2.0
+TRIES: Final = 3
+
+
+class PlacementLedger:
+    """Follows publications while its candidate stands, and keeps them from one candidacy to the next."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self.term: Term = NO_TERM
+        self._placements: dict[ComponentId, Placement] = {}
+        self._current: set[ComponentId] = set()
+        """Those that were published or listed since `start`."""
+        self._cordoned: frozenset[HostName] = frozenset()
+        self._declarations = ExitStack()
+
+    def start(self, supervisor: Supervisor) -> None:
+        keys, mesh = self.mesh.keys, self.mesh
+        self._supervisor = supervisor
+        self._current.clear()
+        for declared in (
+            mesh.subscribe(keys.placements, Placements, supervisor.guard(self._on_placements)),
+            mesh.watch(keys.alive_any(Role.RCM), supervisor.guard(self._on_leader)),
+        ):
+            self._declarations.callback(declared.close)
+
+    def stop(self) -> None:
+        self._declarations.close()
+
+    def inherited(self) -> Inherited:
+        """Everything that is known, for a placer that begins."""
+        return Inherited(tuple(map(status_of, self._placements.values())), self._cordoned)
+
+    def _on_placements(self, _key: str, published: Placements) -> None:
+        if published.term < self.term or absurd(published.term, self.term):
+            return
+        self.term = published.term
+        self._cordoned = frozenset(published.cordoned)
+        for placement in published.components:
+            component = check_name(placement.component, "component")
+            if len(self._placements) < 2 * MAX_PLACED or component in self._placements:
+                self._placements[component] = placement
+                self._current.add(component)
+        for component in published.forgotten:
+            self._placements.pop(component, None)
+            self._current.discard(component)
+
+    def _on_leader(self, token: Token, alive: bool) -> None:
+        """A candidate that comes late asks for what was published before."""
+        if alive and token.host != self.mesh.me.host:
+            self._supervisor.spawn(self._catch_up())
+
+    async def _catch_up(self) -> None:
+        for _ in range(TRIES):
+            reply = await self.mesh.ask_one(
+                self.mesh.keys.placer, ListPlacements(), Placements, timeout=ASK_TIMEOUT
+            )
+            if reply is not None and reply.message is not None:
+                # What was published meanwhile is newer than the answer or the same.
+                listed = reply.message
+                fresh = [one for one in listed.components if one.component not in self._current]
+                try:
+                    self._on_placements("", Placements(listed.term, fresh, listed.cordoned))
+                except BadName as error:
+                    log.warning("ignored a list of placements: %s", error)
+                return
+            await asyncio.sleep(ASK_TIMEOUT)
+        log.warning("the leading placer did not list its components in %d tries", TRIES)

@@ -1,0 +1,106 @@
+"""The load balancer: load reports in, rankings out. It runs beside the leading RCM."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import random
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Final
+
+from zscout.keyexpr import Role, Token, check_name
+from zscout.mesh import IncomingQuery, Mesh
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import HostRanking, LoadReport, RankAsk, RankedHost
+from zscout.placement.balancer import Balancer
+from zscout.placement.model import RankQuery, Requirements
+from zscout.services.placement.convert import report_of
+from zscout.types import HostName
+
+log = logging.getLogger(__name__)
+
+READ_EVERY: Final = 0.1
+"""Seconds; the reports of a thousand hosts would else wake this loop a thousand times in each."""
+AT_ONCE: Final = 32
+"""Reports that are read between two other things that the loop has to do."""
+DEPTH: Final = 4_096
+"""Reports kept until they are read; of more the oldest are lost, and the next ones make up for them."""
+
+
+class LoadBalancer:
+    """Answers which hosts are best, until it is stopped or fails. What it knows of hosts comes from their
+    reports alone, so a new leader's balancer knows all that report within a second."""
+
+    def __init__(
+        self, mesh: Mesh, on_failure: Callable[[Exception], object], rng: random.Random | None = None
+    ) -> None:
+        self.mesh = mesh
+        self.core = Balancer(rng or random.Random())  # noqa: S311 - lots and noise, not secrets
+        self._supervisor = Supervisor("the load balancer", on_failure)
+        self._lost: set[HostName] = set()
+        """Hosts that are gone: reports that they sent before, and that are not read yet, must not bring them
+        back. Cleared once all of those are read."""
+        self._declarations = ExitStack()
+
+    def start(self) -> None:
+        keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
+        self._reports = mesh.overhear(keys.load_any, LoadReport, depth=DEPTH)
+        for declared in (
+            self._reports,
+            mesh.watch(keys.alive_any(Role.LOAD), guard(self._on_reporter)),
+            mesh.serve(keys.rank, RankAsk, guard(self._on_query)),
+        ):
+            self._declarations.callback(declared.close)
+        self._supervisor.call_later(READ_EVERY, self._read)
+
+    def stop(self) -> None:
+        self._supervisor.cancel()
+        self._declarations.close()
+
+    def _read(self) -> None:
+        """Reads a few reports at most: whatever else waits for this loop is done in between."""
+        read = 0
+        for key, report in itertools.islice(self._reports.each(), AT_ONCE):
+            read += 1
+            self._on_load(key, report)
+        if read < AT_ONCE:
+            self._lost.clear()
+        self._supervisor.call_later(0.0 if read == AT_ONCE else READ_EVERY, self._read)
+
+    def _on_load(self, key: str, report: LoadReport) -> None:
+        # A report is believed of the host in whose key it stands.
+        try:
+            if key == self.mesh.keys.load(report.host) and report.host not in self._lost:
+                self.core.reported(self.mesh.now(), report_of(report))
+        except ValueError as error:
+            log.debug("ignored a load report on %.200r: %s", key, error)
+
+    def _on_reporter(self, token: Token, alive: bool) -> None:
+        if alive:
+            self._lost.discard(token.host)
+        else:
+            self._lost.add(token.host)
+            self.core.lost(token.host)
+
+    def _on_query(self, query: IncomingQuery[RankAsk]) -> None:
+        ask = query.message
+        for host in ask.hosts or ():
+            check_name(host, "host")
+        rank_query = RankQuery(
+            kind=ask.kind,
+            metric=ask.metric,
+            policy=ask.policy,
+            requirements=Requirements(frozenset(ask.labels), ask.memory),
+            hosts=None if ask.hosts is None else frozenset(ask.hosts),
+        )
+        ranking = self.core.rank(self.mesh.now(), rank_query, ask.at_most)
+        query.answer(
+            HostRanking(
+                hosts=[RankedHost(one.host, one.score, one.reason) for one in ranking.hosts],
+                metric=ranking.metric,
+                why=ranking.why,
+                left_out=dict(itertools.islice(ranking.left_out.items(), ask.at_most)),
+                more=ranking.more,
+            )
+        )

@@ -1,0 +1,193 @@
+"""Requests of operators and programs to the placer: what each is for the core, and when it is answered.
+
+A request to place, end or move a component is answered once the component is in a state that ends it, or when
+its `wait` is over.
+"""
+
+from __future__ import annotations
+
+from asyncio import TimerHandle
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+import msgspec
+
+from zscout.keyexpr import check_name
+from zscout.mesh import IncomingQuery, Refused
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import (
+    MAX_PARAMS_SIZE,
+    ComponentSpec,
+    DrainHost,
+    EndComponent,
+    ListPlacements,
+    MigrateComponent,
+    PlaceComponent,
+    PlacementOperation,
+    Placements,
+    PlacerOperation,
+    UncordonHost,
+)
+from zscout.placement.events import (
+    ComponentState,
+    ComponentStatus,
+    DrainRequested,
+    MoveRequested,
+    PlacementRefused,
+    PlaceRequested,
+    PlacerEvent,
+    StopRequested,
+    UncordonRequested,
+)
+from zscout.placement.placer import PlacerStatus
+from zscout.services.placement.convert import placement_of, spec_of
+from zscout.types import Term
+
+MAX_WAIT: Final = 60.0
+MAX_WAITING: Final = 1_000
+"""Requests that wait for their answer at one time."""
+
+PlacerQuery: TypeAlias = IncomingQuery[PlacerOperation]
+
+OVER: Final = frozenset({ComponentState.ENDED, ComponentState.GIVEN_UP})
+SETTLED: Final = OVER | {ComponentState.RUNNING, ComponentState.WAITING}
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """An operation that has not come to its end; `before` is the status when it was requested."""
+
+    operation: PlacementOperation
+    before: ComponentStatus | None
+    timer: TimerHandle
+
+
+class PlacerRequestHandler:
+    """`receive` gives the event of a request, which the caller feeds to the core between `begin` and
+    `finish`."""
+
+    def __init__(self, status: Callable[[], PlacerStatus], term: Term, supervisor: Supervisor) -> None:
+        self._status, self.term, self._supervisor = status, term, supervisor
+        self._early: list[tuple[PlacerQuery, PlacerEvent]] = []
+        self._is_open = False
+        self._waiting: dict[PlacerQuery, _Waiting] = {}
+
+    def receive(self, query: PlacerQuery) -> PlacerEvent | None:
+        """None: it is answered, or kept until `open`. Raises Refused and BadName."""
+        operation = query.message
+        if isinstance(operation, ListPlacements):
+            query.answer(self.placements(operation.component))
+            return None
+        if len(self._early) + len(self._waiting) >= MAX_WAITING:
+            raise Refused("busy", "too many operations are waiting here; ask again")
+        event = _event_of(operation)
+        if self._is_open:
+            return event
+        self._early.append((query, event))
+        return None
+
+    def open(self) -> list[tuple[PlacerQuery, PlacerEvent]]:
+        """From now on requests are carried out. Returns those that came before."""
+        self._is_open = True
+        early, self._early = self._early, []
+        return early
+
+    def close(self) -> None:
+        """Refuses what still waits: another placer has to be asked."""
+        problem = Refused("not_leading", "this placer stopped leading; ask again").problem
+        for query in (*(query for query, _ in self._early), *self._waiting):
+            query.refuse(problem)
+        self._early, self._waiting = [], {}
+
+    def begin(self, query: PlacerQuery) -> None:
+        operation = query.message
+        if isinstance(operation, PlacementOperation):
+            before = self._status().components.get(operation.component)
+            timer = self._supervisor.call_later(min(operation.wait, MAX_WAIT), self._timed_out, query)
+            self._waiting[query] = _Waiting(operation, before, timer)
+
+    def finish(self, query: PlacerQuery, refusals: Sequence[PlacementRefused]) -> None:
+        """The core has handled it, or refused it."""
+        if refusals:
+            self._pop(query)
+            query.refuse(Refused(refusals[0].code, refusals[0].message).problem)
+        elif isinstance(query.message, DrainHost | UncordonHost):
+            query.answer(self.placements(host=query.message.host))
+
+    def changed(self, components: Collection[str]) -> None:
+        """Answers requests about these components that have come to their end."""
+        for query, waiting in list(self._waiting.items()):
+            operation, component = waiting.operation, waiting.operation.component
+            if component not in components:
+                continue
+            status = self._status().components.get(component)
+            ends = OVER if isinstance(operation, EndComponent) else SETTLED
+            if status is not None and status.state not in ends:
+                continue
+            self._pop(query)
+            if status is None:
+                query.refuse(Refused("unknown_component", "nothing is known of it").problem)
+            elif isinstance(operation, MigrateComponent) and _stayed(waiting.before, status, operation):
+                reason = status.reason or f"it goes on on {status.host}"
+                query.refuse(Refused("move_failed", reason).problem)
+            else:
+                query.answer(placement_of(status))
+
+    def placements(self, component: str | None = None, *, host: str | None = None) -> Placements:
+        """All components, or that one, or those of a host."""
+        status = self._status()
+        return Placements(
+            self.term,
+            [
+                placement_of(one)
+                for name, one in sorted(status.components.items())
+                if component in (None, name) and host in (None, one.host)
+            ],
+            sorted(status.cordoned),
+        )
+
+    def _timed_out(self, query: PlacerQuery) -> None:
+        waiting = self._pop(query)
+        status = self._status().components.get(waiting.operation.component) if waiting else None
+        if status is not None:
+            query.answer(placement_of(status))
+
+    def _pop(self, query: PlacerQuery) -> _Waiting | None:
+        waiting = self._waiting.pop(query, None)
+        if waiting is not None:
+            waiting.timer.cancel()
+        return waiting
+
+
+def _stayed(before: ComponentStatus | None, now: ComponentStatus, move: MigrateComponent) -> bool:
+    return before is not None and now.host == before.host and now.host != move.to
+
+
+def _event_of(operation: PlacementOperation | DrainHost | UncordonHost) -> PlacerEvent:
+    match operation:
+        case PlaceComponent(component, spec):
+            _check_spec(component, spec)
+            return PlaceRequested(component, spec_of(spec))
+        case EndComponent(component):
+            return StopRequested(check_name(component, "component"))
+        case MigrateComponent(component, to):
+            to = None if to is None else check_name(to, "host")
+            return MoveRequested(check_name(component, "component"), to)
+        case DrainHost(host):
+            return DrainRequested(check_name(host, "host"))
+        case UncordonHost(host):
+            return UncordonRequested(check_name(host, "host"))
+
+
+def _check_spec(component: str, spec: ComponentSpec) -> None:
+    """Raises BadName or Refused for what can't be placed."""
+    check_name(component, "component")
+    check_name(spec.kind, "kind")
+    for host in spec.hosts or ():
+        check_name(host, "host")
+    for label in spec.labels:
+        check_name(label, "label")
+    size = len(msgspec.json.encode(spec.params))
+    if size > MAX_PARAMS_SIZE:
+        raise Refused("too_large", f"the parameters have {size} bytes; at most {MAX_PARAMS_SIZE} are taken")

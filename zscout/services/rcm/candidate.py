@@ -1,0 +1,228 @@
+"""A node's candidacy for the RCM: sees whether somebody leads, and takes over when nobody does.
+
+Taking over: ask the RCs whether they still see a leader; take a term above all that is known; ask all RCs
+and clients what stands, which binds the RCs to the new term; lead over that.
+
+When anything of it fails, a candidate steps down: its tokens go, so that others take over, and after a while
+it stands again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import TypeVar
+
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import BadName, Role, Token, client_of, new_instance
+from zscout.mesh import Mesh, Reply
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import ClientRequests, Grants, RcAsk, RcState, absurd
+from zscout.services.placement.component_placer import ComponentPlacer
+from zscout.services.placement.ledger import PlacementLedger
+from zscout.services.placement.load_balancer import LoadBalancer
+from zscout.services.rcm.election import Election
+from zscout.services.rcm.rcm import Rcm
+from zscout.services.rcm.recovery import recover
+from zscout.types import NO_TERM, SECOND, Ns, Term
+
+log = logging.getLogger(__name__)
+R = TypeVar("R")
+
+MAX_ATTEMPTS = 3
+"""Terms tried in one go when RCs turn out to have promised higher ones."""
+BACKOFF, MAX_BACKOFF = 1.0, 30.0
+"""Seconds until a candidate that failed stands again: doubled each time, at most."""
+PROVEN: Ns = 60 * SECOND
+"""A candidate that failed no sooner than this begins with BACKOFF anew."""
+
+
+class Candidate:
+    """Stands by, leads when it must, steps down when a higher term is seen or when anything fails."""
+
+    def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
+        self.mesh, self.fleet = mesh, fleet
+        self.known: Term = NO_TERM
+        """The highest term seen anywhere."""
+        self.rcm: Rcm | None = None
+        self.ledger = PlacementLedger(mesh)
+        self._reign = ExitStack()
+        """Ends the RCM, and the load balancer and the placer beside it, while this node leads."""
+        self._candidacy = ExitStack()
+        """Takes back what is declared while it stands."""
+        self._changed = asyncio.Event()
+        self._failures = 0
+        self._again: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        self._stand()
+
+    async def stop(self) -> None:
+        if self._again is not None:
+            self._again.cancel()
+        self._withdraw()
+        await self._supervisor.close()
+
+    def _stand(self) -> None:
+        """Becomes a candidate: others see its token from now on."""
+        keys, mesh = self.mesh.keys, self.mesh
+        self._again, self._since = None, mesh.now()
+        # A leader is silent for as long as this when its program hangs but its session lives.
+        silence = max(4 * self.fleet.timing.heartbeat, round(self.fleet.mesh.lease * SECOND))
+        self.election = Election(mesh.me.host, self.fleet.candidates, silence=silence, now=self._since)
+        self._supervisor = Supervisor("the candidate", self._failed)
+        guard = self._supervisor.guard
+        try:
+            self._candidacy.callback(self.ledger.stop)
+            self.ledger.start(self._supervisor)
+            for declared in (
+                mesh.subscribe(keys.grants, Grants, guard(self._on_grants)),
+                mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)),
+                mesh.watch(keys.alive_any(Role.CANDIDATE), guard(self._on_candidate)),
+                mesh.alive(Token(mesh.me.host, Role.CANDIDATE, mesh.me.client, new_instance())),
+            ):
+                self._candidacy.callback(declared.close)
+            self._supervisor.spawn(self._run())
+        except Exception as error:  # noqa: BLE001 - it is logged there
+            self._supervisor.fail(error)
+
+    def _failed(self, _: Exception) -> None:
+        """Steps down and withdraws; stands again, as a new candidate, after a while."""
+        if self._again is not None:
+            return
+        if self.mesh.now() - self._since > PROVEN:
+            self._failures = 0
+        delay = min(BACKOFF * 2**self._failures, MAX_BACKOFF)
+        self._failures += 1
+        log.error("this candidate withdraws, and stands again in %g s", delay)
+        self._again = asyncio.get_running_loop().call_later(delay, self._stand)
+        self._withdraw()
+
+    def _withdraw(self) -> None:
+        self._supervisor.cancel()
+        with self._candidacy.pop_all():
+            self._stop_leading()
+
+    def _stop_leading(self) -> None:
+        self.rcm = None
+        self._reign.close()
+
+    # What is seen
+
+    def _on_grants(self, _key: str, grants: Grants) -> None:
+        self.election.published(grants.term, self.mesh.now())
+        self._see(grants.term)
+
+    def _on_leader(self, token: Token, alive: bool) -> None:
+        mine = self.rcm is not None and token.instance == self.rcm.term.rcm
+        if not mine:
+            log.info("%s %s", token.host, "leads" if alive else "does not lead any more")
+        self.election.leader(token.instance, alive=alive, now=self.mesh.now())
+        self._changed.set()
+
+    def _on_candidate(self, token: Token, alive: bool) -> None:
+        self.election.candidate(token.host, alive=alive)
+        self._changed.set()
+
+    def _see(self, term: Term) -> None:
+        if absurd(term, self.known):
+            log.warning("ignored term %d: absurdly far above %d", term.counter, self.known.counter)
+            return
+        if term > self.known:
+            self.known = term
+        if self.rcm is not None and term > self.rcm.term:
+            log.warning(
+                "stepping down: term %d of another RCM is above %d", term.counter, self.rcm.term.counter
+            )
+            self._stop_leading()
+            self._changed.set()
+
+    # Leading
+
+    async def _run(self) -> None:
+        while True:
+            self._changed.clear()
+            now = self.mesh.now()
+            at = self.election.next_try(now) if self.rcm is None else None
+            if at is not None and at <= now:
+                await self._try()
+                continue
+            try:
+                async with asyncio.timeout(None if at is None else (at - now) / SECOND):
+                    await self._changed.wait()
+            except TimeoutError:
+                pass
+
+    async def _try(self) -> None:
+        if await self._leader_elsewhere() or not await self._take_over():
+            self.election.failed(self.mesh.now())
+
+    async def _leader_elsewhere(self) -> bool:
+        """Whether most RCs still see a leader: then it is this candidate that is cut off."""
+        timeout = self.fleet.timing.rebuild / SECOND
+        replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=timeout)
+        states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
+        for state in states:
+            self._see(state.term)
+        seeing = sum(1 for state in states if state.leader)
+        if seeing * 2 > len(states):
+            log.info("%d of %d RCs still see a leader: waiting", seeing, len(states))
+            return True
+        return False
+
+    async def _take_over(self) -> bool:
+        timeout = self.fleet.timing.rebuild / SECOND
+        keys = self.mesh.keys
+        for _ in range(MAX_ATTEMPTS):
+            if self.election.sees_leader(self.mesh.now()):
+                return False
+            term = Term(self.known.counter + 1, new_instance())
+            question = RcAsk(promise=term)
+            rcs, clients = await asyncio.gather(
+                self.mesh.ask(keys.rc_state_any, question, RcState, timeout=timeout),
+                self.mesh.ask(keys.requests_any, question, ClientRequests, timeout=timeout),
+            )
+            problems = [*(reply.problem for reply in rcs), *(reply.problem for reply in clients)]
+            for problem in problems:
+                if problem is not None and problem.term is not None:
+                    self._see(problem.term)
+            if self.known > term:
+                continue
+            open_requests = self._credible(clients, lambda answer: keys.requests(client_of(answer.client)))
+            self._lead(term, self._credible(rcs, lambda state: keys.rc_state(state.rc)), open_requests)
+            return True
+        return False
+
+    def _credible(self, replies: list[Reply[R]], key_of: Callable[[R], str]) -> list[R]:
+        """The messages of `replies` that name in themselves whom their key names; others prove nothing."""
+        messages = []
+        for reply in replies:
+            try:
+                if reply.message is not None and reply.key == key_of(reply.message):
+                    messages.append(reply.message)
+            except BadName as error:
+                log.warning("ignored an answer on %.200r: %s", reply.key, error)
+        return messages
+
+    def _lead(self, term: Term, states: list[RcState], open_requests: list[ClientRequests]) -> None:
+        recovered = recover(states, open_requests, self.mesh.now())
+        self.known = term
+        log.info(
+            "leading in term %d: %d RCs, %d holds, %d waiting",
+            term.counter,
+            len(recovered.rcs),
+            len(recovered.standing),
+            len(recovered.waiting),
+        )
+        rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed)
+        self._reign.callback(rcm.stop)
+        rcm.start(recovered)
+        balancer = LoadBalancer(self.mesh, self._failed)
+        self._reign.callback(balancer.stop)
+        balancer.start()
+        inherited = self.ledger.inherited()
+        placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, inherited, self._failed)
+        self._reign.callback(placer.stop)
+        placer.start()

@@ -1,0 +1,206 @@
+"""The leading RCM: the scheduling core on the mesh.
+
+    in        queries, tokens, reports of RCs, votes and time become
+    events    of the core, all of one instant together; it returns
+    effects,  which go
+    out       as a publication, notices, answers and proposals, in this order.
+
+Nothing is decided here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Collection, Sequence
+
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import Role, Token
+from zscout.mesh import Declaration, IncomingQuery, Mesh
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import Operation, RcmState, RcState, StateAsk
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import WakeAt
+from zscout.scheduling.events import ClientLost, Event, HandedOver, LeadTaken, RcReported, Requested, Tick
+from zscout.scheduling.strategies import STRATEGIES
+from zscout.services.rcm import convert
+from zscout.services.rcm.history import ArcHistory
+from zscout.services.rcm.membership import Membership, NewerTerm, RcSeen, discrepancies
+from zscout.services.rcm.notices import Notices
+from zscout.services.rcm.publisher import GrantsPublisher
+from zscout.services.rcm.recovery import RecoveredState
+from zscout.services.rcm.registry import RequestRegistry
+from zscout.services.rcm.request_handler import FindClient, Renotify, RequestHandler
+from zscout.services.rcm.voting import Voting
+from zscout.types import SECOND, Ns, RcName, Term
+
+log = logging.getLogger(__name__)
+
+MAX_LISTED = 1_000
+"""Queued ARCs in one answer."""
+
+
+class Rcm:
+    """One reign of one RCM, from taking the lead to giving it up. When any of its work fails, `on_failure` is
+    called with the error, once: the reign is to be stopped then."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        term: Term,
+        on_newer: Callable[[Term], None],
+        on_failure: Callable[[Exception], object],
+    ) -> None:
+        self.mesh, self.fleet, self.term = mesh, fleet, term
+        self._on_newer = on_newer
+        self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
+        self.core = Core(STRATEGIES[fleet.strategy](), fleet.scheduling)
+        # What is known
+        self.history = ArcHistory(mesh, self.supervisor)
+        self.registry = RequestRegistry(mesh, self.core, term)
+        # In
+        supervisor, receive = self.supervisor, self._receive
+        self.requests = RequestHandler(
+            mesh, fleet, self.core, self.registry, self.history, supervisor, receive
+        )
+        self.membership = Membership(mesh, fleet, term, supervisor, receive)
+        # Out
+        self.publisher = GrantsPublisher(mesh, fleet, self.core, self.registry)
+        self.notices = Notices(mesh, self.core, self.registry, self.history, supervisor)
+        self.voting = Voting(mesh, fleet, self.core, supervisor, receive)
+        self._declared: list[Declaration] = []
+        self._wake: asyncio.TimerHandle | None = None
+        self._wake_at: Ns | None = None
+        self._armed: Ns = 0
+        """When the timer goes off: it may be earlier than it need be."""
+
+    # Beginning and end
+
+    def start(self, recovered: RecoveredState) -> None:
+        """Begins to lead. Everything that is declared here is declared by the leader only."""
+        keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
+        joined = self.membership.join(recovered.rcs)
+        for request in recovered.requests:
+            self.registry.enter(request.arc, request.name)
+            self.membership.expect(request.client)
+        lead = LeadTaken(self.term, tuple(recovered.standing), tuple(recovered.waiting))
+        # RCs receive the new term first; full lists end whatever was found to be half a gang.
+        self._decide([*joined, lead], named=recovered.rcs)
+        limit = self.fleet.limits.max_payload
+        self._declared = [
+            mesh.serve(keys.schedule_any, Operation, guard(self.requests.on_operation), limit=limit),
+            mesh.serve(keys.rcm_state, StateAsk, guard(self._on_state_asked)),
+            *self.membership.watch(),
+            mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
+        ]
+        self.supervisor.spawn(self.publisher.beat())
+
+    def stop(self) -> None:
+        """Stops leading. Nothing is revoked: what stands, stands for the next RCM."""
+        for declared in reversed(self._declared):
+            declared.close()
+        self._declared = []
+        self.supervisor.cancel()
+        self.notices.flush()
+        self.history.flush()
+        self.requests.close()
+        self.publisher.close()
+
+    # In
+
+    def _receive(self, *inputs: Event | FindClient | Renotify | RcSeen | NewerTerm) -> None:
+        """What has happened; events that come together are one instant."""
+        if not self.supervisor.active:
+            return
+        events: list[Event] = []
+        for one in inputs:
+            match one:
+                case FindClient(client, then):
+                    self.membership.find(client, then)
+                case Renotify(arcs):
+                    self.notices.publish(arcs)
+                case RcSeen(rc, state):
+                    self._compare(rc, state)
+                case NewerTerm(term):
+                    self._on_newer(term)
+                case ClientLost(client) if not self.core.arcs_of(client):
+                    pass
+                case _:
+                    events.append(one)
+        if events:
+            # What was asked before is decided before.
+            self.requests.flush()
+            self._decide(events)
+
+    def _compare(self, rc: RcName, state: RcState) -> None:
+        """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
+        current = state.term == self.term and self.publisher.is_current(rc, state.seq)
+        ended, superfluous = discrepancies(state, self.core.holders(rc), self.mesh.now(), current=current)
+        if ended:
+            self._receive(RcReported(rc, ended))
+        if superfluous:
+            self.publisher.publish([], [rc])
+
+    # Events, and out
+
+    def _decide(self, events: Sequence[Event], named: Collection[RcName] | None = None) -> None:
+        """One instant. RCs that are `named` are published, whatever becomes of them."""
+        for event in events:
+            match event:
+                case Requested(request):
+                    self.membership.expect(request.client)
+                case HandedOver(to=client):
+                    self.membership.expect(client)
+        effects = self.core.handle(self.mesh.now(), *events)
+        self.publisher.publish(effects, named)
+        self.notices.report(effects, self.requests.waiting, self.requests.given_up)
+        self.requests.answer(effects)
+        self.voting.propose(effects)
+        for effect in effects:
+            if isinstance(effect, WakeAt):
+                self._set_wake(effect.at)
+        if news := self.core.strategy.news():
+            log.info("%s", news)
+
+    def _set_wake(self, at: Ns | None) -> None:
+        """A timer that goes off too early is left alone: most ends are put off before they come."""
+        self._wake_at = at
+        if at is None or (self._wake is not None and self._armed <= at):
+            return
+        if self._wake is not None:
+            self._wake.cancel()
+        self._armed = at
+        delay = max(0.0, (at - self.mesh.now()) / SECOND)
+        self._wake = self.supervisor.call_later(delay, self._on_wake)
+
+    def _on_wake(self) -> None:
+        self._wake = None
+        at = self._wake_at
+        if at is not None and self.mesh.now() < at:
+            self._set_wake(at)
+        elif at is not None:
+            self._receive(Tick())
+
+    # How things stand
+
+    def _on_state_asked(self, query: IncomingQuery[StateAsk]) -> None:
+        asked, now = query.message, self.mesh.now()
+        status = self.core.status(0 if asked.holds_only else MAX_LISTED)
+        holds = [convert.hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
+        if asked.holds_only:
+            query.answer(RcmState(self.term, self.publisher.seq, self.mesh.me.host, holds))
+            return
+        starts = self.registry.forecasts.starts(now) if asked.forecast else {}
+        query.answer(
+            RcmState(
+                term=self.term,
+                seq=self.publisher.seq,
+                host=self.mesh.me.host,
+                holds=holds,
+                queue=[convert.wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
+                rcs=convert.rc_views(status.rcs),
+                story=self.history.of(asked.arc) if asked.arc is not None else [],
+                more=status.waiting - len(status.queued),
+            )
+        )

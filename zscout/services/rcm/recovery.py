@@ -1,0 +1,151 @@
+"""What stands when a new RCM takes the lead, from the answers of RCs and clients. Pure.
+
+RCs know the holds, clients their requests and places. A hold stands if every RC of its gang is there and
+holds it under the same grant; a gang with an absent RC is broken, and queued again with its place. What a
+client that answers does not ask for any more is not carried on: it gave it up while nobody led.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from decimal import Decimal
+
+from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
+from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState
+from zscout.scheduling.events import RecoveredHold, RecoveredRequest
+from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.patterns import check_patterns
+from zscout.services.rcm import convert
+from zscout.types import SECOND, Grant, Need, Ns, RcName, duration, exact_amounts
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class RecoveredState:
+    """What stood when the lead was taken: the RCs that promised, holds, queue."""
+
+    rcs: dict[str, RcState] = field(default_factory=dict)
+    standing: list[RecoveredHold] = field(default_factory=list)
+    waiting: list[RecoveredRequest] = field(default_factory=list)
+
+    @property
+    def requests(self) -> Iterator[ArcRequest]:
+        yield from (held.request for held in self.standing)
+        yield from (one.request for one in self.waiting)
+
+
+def recover(states: Iterable[RcState], clients: Iterable[ClientRequests], now: Ns) -> RecoveredState:
+    """Combines the answers. What is malformed is left out and logged, and all else is recovered."""
+    result = RecoveredState(rcs={state.rc: state for state in states})
+    parts: dict[tuple[str, Grant], dict[RcName, Holder]] = {}
+    for state in result.rcs.values():
+        for holder in state.holders:
+            arc = convert.arc_id(holder.client, holder.id)
+            parts.setdefault((arc, holder.grant), {})[state.rc] = holder
+    asked: dict[str, tuple[str, OpenRequest]] = {}
+    answered: set[str] = set()
+    for answer in clients:
+        answered.add(answer.client)
+        for request in answer.requests:
+            asked[convert.arc_id(answer.client, request.id)] = (answer.client, request)
+
+    seen: set[str] = set()
+    for (arc, grant), held in sorted(parts.items(), key=lambda item: item[0][1], reverse=True):
+        if arc in seen:
+            continue
+        seen.add(arc)
+        if arc not in asked and next(iter(held.values())).client in answered:
+            log.info("%s is given up by its client", arc)
+            continue
+        try:
+            _recover_hold(result, arc, grant, held, asked.get(arc), now)
+        except (BadName, ValueError) as error:
+            log.warning("the hold of %s is not carried on: %s", arc, error)
+    for arc, (client, request) in asked.items():
+        if arc in seen:
+            continue
+        try:
+            # A request without a place was never answered: its client will ask again.
+            if request.place is not None:
+                wanted = _request(arc, client, request.needs, request)
+                since = now - round(request.waited * SECOND)
+                result.waiting.append(RecoveredRequest(wanted, request.place, since))
+        except (BadName, ValueError) as error:
+            log.warning("the request %s is not carried on: %s", arc, error)
+    # A client that handed over a hold, and missed the answer, lists it as well: what the RCs hold counts.
+    stands = {(held.place, convert.request_id(held.request.arc)) for held in result.standing}
+    result.waiting = sorted(
+        (one for one in result.waiting if (one.place, convert.request_id(one.request.arc)) not in stands),
+        key=lambda one: one.place,
+    )
+    return result
+
+
+def _recover_hold(
+    result: RecoveredState,
+    arc: str,
+    grant: Grant,
+    held: dict[RcName, Holder],
+    asked: tuple[str, OpenRequest] | None,
+    now: Ns,
+) -> None:
+    # An RC from before there were patterns passes on nothing about them.
+    some = max(held.values(), key=lambda holder: len(holder.bound))
+    patterns = _patterns(some)
+    needs: dict[str, Amounts] = {patterns.get(name, name): {} for name in some.rcs}
+    # An absent RC's parameters are known to the client only, unless another RC meets a like pattern: those
+    # of one kind have all the same.
+    kinds = {_kind(patterns[name]): holder.params for name, holder in held.items() if name in patterns}
+    needs |= {need: kinds[_kind(need)] for need in patterns.values() if _kind(need) in kinds}
+    if asked is not None:
+        needs |= {need: params for need, params in asked[1].needs.items() if need in needs}
+    needs |= {patterns.get(name, name): holder.params for name, holder in held.items()}
+    request = _request(arc, some.client, needs, some)
+    # The core ends a gang with an absent RC, and names what was lost; a present RC without it breaks it.
+    if all(name in held or name not in result.rcs for name in some.rcs):
+        remaining = min(holder.remaining for holder in held.values())
+        end = now + round(remaining * SECOND)
+        result.standing.append(
+            RecoveredHold(request, some.place, grant, end - request.min_runtime, end, some.bound)
+        )
+    else:
+        result.waiting.append(RecoveredRequest(request, some.place))
+
+
+def _patterns(holder: Holder) -> dict[RcName, Need]:
+    """By RC: the pattern that it meets. Raises BadName, ValueError."""
+    for rc in holder.rcs:
+        check_rc(rc)
+    for need, rc in holder.bound.items():
+        if not is_pattern(check_need(need)) or rc not in holder.rcs or not matcher(need)(rc):
+            raise ValueError(f"it does not hold {rc[:130]!r} for {need[:130]!r}")
+    patterns = {rc: need for need, rc in holder.bound.items()}
+    if len(patterns) < len(holder.bound):
+        raise ValueError("one RC is reported to meet two of its patterns")
+    return patterns
+
+
+def _request(arc: str, client: str, needs: dict[str, Amounts], source: OpenRequest | Holder) -> ArcRequest:
+    client_of(client)
+    check_name(source.id, "id")
+    check_name(source.arc, "arc")
+    for need in needs:
+        check_need(need)
+    wanted = {need: exact_amounts(params) for need, params in needs.items()}
+    check_patterns(wanted)
+    return ArcRequest(
+        arc=arc,
+        client=client,
+        needs=wanted,
+        priority=source.priority,
+        min_runtime=duration(Decimal(source.min_runtime), "min_runtime"),
+        keep=source.keep,
+        label=source.arc,
+    )
+
+
+def _kind(need: str) -> str:
+    return need.partition("/")[0]

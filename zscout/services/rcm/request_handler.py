@@ -1,0 +1,281 @@
+"""Operations of clients: they become events of the core, and are answered once the core has decided.
+
+What arrives in one burst is one instant: one pass decides it and one publication has it. Operations on one
+ARC stay in their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
+
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import Sender, check_name, client_of
+from zscout.mesh import IncomingQuery, Mesh, Refused
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Operation, Release
+from zscout.scheduling.core import Core
+from zscout.scheduling.effects import Dropped, Effect, Granted, Queued
+from zscout.scheduling.events import Cancelled, HandedOver, Released, Requested
+from zscout.scheduling.forecast import forecast
+from zscout.services.rcm import convert
+from zscout.services.rcm.admission import admit
+from zscout.services.rcm.history import ArcHistory
+from zscout.services.rcm.registry import RequestRegistry
+from zscout.types import SECOND, ArcId, ClientId
+
+Query: TypeAlias = IncomingQuery[Operation]
+
+REPLY_SLACK = 0.1
+"""Seconds after an overdue vote in which the first answer is given all the same."""
+MAX_BATCH = 64
+"""Operations that are decided together at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class FindClient:
+    """Is this client on the mesh? `then` is called with the answer."""
+
+    client: ClientId
+    then: Callable[[bool], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Renotify:
+    """The clients of these ARCs may have missed how they stand."""
+
+    arcs: tuple[ArcId, ...]
+
+
+class RequestHandler:
+    """Gathers operations, checks them, and keeps the queries that wait for their answer."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        core: Core,
+        registry: RequestRegistry,
+        history: ArcHistory,
+        supervisor: Supervisor,
+        emit: Callable[..., None],
+    ) -> None:
+        self.mesh, self.limits, self.core = mesh, fleet.limits, core
+        self._patience = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
+        self._registry, self._history, self._supervisor = registry, history, supervisor
+        self._flush_guarded = supervisor.guard(self.flush)
+        self._emit = emit
+        """Takes core events of one instant, FindClient and Renotify."""
+        self.waiting: dict[ArcId, list[Query]] = {}
+        """Operations that are not answered yet, by ARC."""
+        self.given_up: set[ArcId] = set()
+        """ARCs that end in this burst by their own client's will."""
+        self._batch: dict[ArcId, Requested | Cancelled | Released] = {}
+        """Operations of the present burst that are not decided yet."""
+        self._moving: set[Query] = set()
+        """Hand-overs that wait until it is known whether their new client is there."""
+
+    def close(self) -> None:
+        """Refuses what still waits: another RCM has to be asked."""
+        for query in (*self._moving, *(query for queries in self.waiting.values() for query in queries)):
+            query.refuse(Refused("not_leading", "this RCM stopped leading; ask again").problem)
+
+    # Operations
+
+    def on_operation(self, query: Query) -> None:
+        sender = self.mesh.keys.sender_of(query.key)
+        operation = query.message
+        check_name(operation.id, "id")
+        match operation:
+            case Ask():
+                self._ask(query, operation, sender)
+            case Cancel() | Release():
+                self._end(query, operation, sender)
+            case HandOver():
+                self._find_new_client(query, operation, str(sender))
+            case Foresee():
+                self._forecast(query, operation, sender)
+
+    def _ask(self, query: Query, ask: Ask, sender: Sender) -> None:
+        arc = convert.arc_id(str(sender), ask.id)
+        self._keep_order(arc)
+        if arc in self.waiting:
+            self.waiting[arc].append(query)
+        elif self.core.arc(arc) is not None:
+            self._registry.enter(arc, ask.arc, estimate=ask.estimate)
+            query.answer(self._registry.notice(arc))
+        elif self._registry.ended(arc):
+            query.answer(self._registry.notice(arc))
+        elif self._goes_on_elsewhere(ask):
+            query.answer(self._registry.handed_over(arc, ask.arc))
+        else:
+            self._check_room(str(sender))
+            request = admit(ask, sender, arc, self.core, self.limits)
+            self._registry.enter(arc, ask.arc, estimate=ask.estimate)
+            needs = ", ".join(sorted(ask.needs))
+            self._history.record(arc, ask.arc, f"asked for {needs} at priority {ask.priority}")
+            since = None if ask.place is None else self.mesh.now() - round(ask.waited * SECOND)
+            self._gather(query, arc, Requested(request, ask.place, since))
+
+    def _end(self, query: Query, operation: Cancel | Release, sender: Sender) -> None:
+        owner = client_of(operation.client) if operation.client is not None else sender
+        arc = convert.arc_id(str(owner), operation.id)
+        self._keep_order(arc)
+        if owner == sender:
+            self.given_up.add(arc)
+        event = Cancelled if isinstance(operation, Cancel) else Released
+        self._gather(query, arc, event(arc, "its client" if owner == sender else str(sender)))
+
+    def _goes_on_elsewhere(self, ask: Ask) -> bool:
+        """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
+        same_place = self.core.at_place(ask.place) if ask.place is not None else ()
+        return any(convert.request_id(arc) == ask.id for arc in same_place)
+
+    def _check_room(self, client: ClientId) -> None:
+        """Refuses what is too much at once; what this burst has brought already counts."""
+        coming = [event for event in self._batch.values() if isinstance(event, Requested)]
+        if self.core.waiting + len(coming) >= self.limits.max_queued:
+            raise Refused("queue_full", f"{self.limits.max_queued} ARCs wait already; ask again later")
+        most = self.limits.max_requests_per_client
+        if sum(event.request.client == client for event in coming) + len(self.core.arcs_of(client)) >= most:
+            raise Refused("too_many", f"{client} has {most} requests open already")
+
+    def _forecast(self, query: Query, asked: Foresee, sender: Sender) -> None:
+        self.flush()
+        arc = convert.arc_id(str(sender), asked.id)
+        if self.core.arc(arc) is not None:
+            raise Refused("bad_request", f"{asked.id} is a request already; ask how it stands")
+        now = self.mesh.now()
+        request = admit(asked, sender, arc, self.core, self.limits)
+        expected = forecast(self.core, now, request)
+        start = expected.starts.get(arc)
+        query.answer(
+            Foresight(
+                id=asked.id,
+                arc=asked.arc,
+                starts_in=None if start is None else (start - now) / SECOND,
+                preempts=[self._registry.name(victim) for victim in expected.preempts],
+                reason=str(expected.reason or ""),
+            )
+        )
+
+    # One burst, one instant
+
+    def _gather(self, query: Query, arc: ArcId, event: Requested | Cancelled | Released) -> None:
+        self.waiting.setdefault(arc, []).append(query)
+        if not self._batch:
+            self.mesh.after_burst(self._flush_guarded)
+        self._batch[arc] = event
+        if len(self._batch) >= MAX_BATCH:
+            self.flush()
+
+    def _keep_order(self, arc: ArcId) -> None:
+        """Operations on one ARC stay in their order: what was gathered of it goes first."""
+        if arc in self._batch:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hands over what was gathered, first what ends, then what was asked, and sees to the answers."""
+        batch, self._batch = self._batch, {}
+        if not batch:
+            return
+        asked = [event for event in batch.values() if isinstance(event, Requested)]
+        ended = [event for event in batch.values() if not isinstance(event, Requested)]
+        self._emit(*ended, *asked)
+        self.given_up.clear()
+        self._answer(event.arc for event in ended)
+        undecided = [event.request.arc for event in asked if event.request.arc in self.waiting]
+        if undecided:
+            # Votes are out: they decide the first answer, if they come.
+            self._supervisor.call_later(self._patience, self._answer, undecided)
+
+    def answer(self, effects: Iterable[Effect]) -> None:
+        """Answers the operations that an instant's effects have decided."""
+        for effect in effects:
+            match effect:
+                case Granted(arc=arc) | Dropped(arc=arc):
+                    self._answer([arc])
+                case Queued(arc=arc, settled=True) if self.core.is_queued(arc):
+                    self._answer([arc])
+                case _:
+                    pass
+
+    def _answer(self, arcs: Iterable[ArcId]) -> None:
+        for arc in arcs:
+            if queries := self.waiting.pop(arc, None):
+                notice = self._registry.notice(arc)
+                for query in queries:
+                    query.answer(notice)
+
+    # Handing over
+
+    def _find_new_client(self, query: Query, operation: HandOver, sender: ClientId) -> None:
+        to = str(client_of(operation.to))
+        for other in operation.others:
+            check_name(other, "id")
+        self.flush()
+        if sender == to or self.core.arc(convert.arc_id(sender, operation.id)) is None:
+            self._answer_handed_over(query, operation, sender, to)
+            return
+        if len(self._moving) >= MAX_BATCH:
+            raise Refused("busy", f"{MAX_BATCH} hand-overs wait here already; ask again")
+        self._moving.add(query)
+        self._emit(FindClient(to, partial(self._on_new_client, query, operation, sender, to)))
+
+    def _on_new_client(
+        self,
+        query: Query,
+        operation: HandOver,
+        sender: ClientId,
+        to: ClientId,
+        found: bool,
+    ) -> None:
+        try:
+            if not found:
+                raise Refused("unknown_client", f"{to} is not on the mesh")
+            self._hand_over(query, operation, sender, to)
+        except Refused as refused:
+            query.refuse(refused.problem)
+        self._moving.discard(query)
+
+    def _hand_over(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId) -> None:
+        """All in one batch of events, and so in one publication: nobody gets in between."""
+        self.flush()
+        moves = self._moves(operation, sender, to)
+        if not moves or moves[0].arc != convert.arc_id(sender, operation.id):
+            self._answer_handed_over(query, operation, sender, to)
+            return
+        room = self.limits.max_requests_per_client - len(self.core.arcs_of(to))
+        if len(moves) > room:
+            raise Refused("too_many", f"{to} has room for {max(0, room)} more requests, not for {len(moves)}")
+        for move in moves:
+            self._registry.enter(move.renamed, self._registry.name(move.arc))
+        self._emit(*moves)
+        self._emit(Renotify(tuple(move.renamed for move in moves if self.core.is_queued(move.renamed))))
+        query.answer(self._registry.notice(moves[0].renamed))
+
+    def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[HandedOver]:
+        """What a hand-over comes to: of the ARCs that it names, those that are open at the sender."""
+        moves = []
+        for request_id in dict.fromkeys((operation.id, *operation.others)):
+            arc = self.core.arc(convert.arc_id(sender, request_id))
+            if arc is None:
+                continue
+            renamed = convert.arc_id(to, request_id)
+            taken = self.core.arc(renamed)
+            if taken is not None and taken.place != arc.place:
+                raise Refused("bad_request", f"{to} has a request {request_id} already; ask under random ids")
+            moves.append(HandedOver(arc.id, to, renamed))
+        return moves
+
+    def _answer_handed_over(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId) -> None:
+        """Answers a hand-over that was done before. Raises Refused if it was not."""
+        goal = convert.arc_id(to, operation.id)
+        over = self._registry.ended(goal) and self._registry.ended(convert.arc_id(sender, operation.id))
+        if self.core.arc(goal) is None and not over:
+            raise Refused("not_running", f"{operation.id} is not open at {sender}")
+        # The new client may have missed it, where the RCM changed just then.
+        self._emit(Renotify(tuple(convert.arc_id(to, one) for one in (operation.id, *operation.others))))
+        query.answer(self._registry.notice(goal))

@@ -1,0 +1,5 @@
+"""The recorder's process: `python -m zscout.services.recorder`."""
+
+from zscout.services.recorder.run import main
+
+main()

@@ -1,0 +1,93 @@
+"""Colours of a recording, RGBA.
+
+`OPERATOR` is kept for an operator's takeover and for what was preempted. Of robots green is hidden, amber not
+yet, yellow an alert.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+OPERATOR: Final = 0xFF1463FF
+"""RGBA of operator takeovers and preemptions."""
+FAILED: Final = 0xFF3B1FFF
+"""RGBA of what was given up."""
+PALETTE: Final[tuple[int, ...]] = (
+    0x4E79A7FF,  # blue
+    0xF28E2BFF,  # orange
+    0x59A14FFF,  # green
+    0xB58ADBFF,  # lilac
+    0xEDC948FF,  # yellow
+    0x2FB5B5FF,  # teal
+    0x9C6B4FFF,  # brown
+    0xB9E36BFF,  # lime
+    0x6A45C9FF,  # violet
+    0x7CC4F0FF,  # sky
+    0x7A7A1EFF,  # olive
+    0xFFC9A0FF,  # peach
+    0x1F6E5AFF,  # pine
+    0xDCDCE4FF,  # pearl
+)
+"""RGBA of ARCs, in order of appearance; the fifteenth has the colour of the first."""
+OTHER: Final = 0x8A8A94FF
+"""RGBA of what has no colour of its own: a summary, or an ARC past the limit of names."""
+STATES: Final[dict[str, int]] = {
+    "waiting": 0x6E5A20FF,
+    "running": 0x2A7A46FF,
+    "preempted": OPERATOR,
+    "done": 0x2A2A31FF,
+}
+"""RGBA of what an ARC is doing; a state not named here gets `OTHER`."""
+LINES: Final[tuple[int, ...]] = (0x56C1FFFF, 0xFFB454FF, 0xB5E07BFF, 0xD6A6FFFF, 0xFFF08AFF, 0x5FE0CFFF)
+"""RGBA of the load curves, host by host; brighter than `PALETTE`, as a line is thin."""
+MARKS: Final[dict[str, tuple[int, rr.components.MarkerShape]]] = {
+    "placed": (0xFFFFFFFF, rr.components.MarkerShape.Up),
+    "restarted": (0xFFE14DFF, rr.components.MarkerShape.Circle),
+    "left": (0xC9A2FFFF, rr.components.MarkerShape.Left),
+    "came": (0xC9A2FFFF, rr.components.MarkerShape.Right),
+    "given_up": (FAILED, rr.components.MarkerShape.Cross),
+}
+"""RGBA and shape of what happened to a component, on the load curve of its host."""
+ALERT: Final = 0xFFE11AFF
+HIDDEN: Final = 0x35C76BFF
+IN_THE_OPEN: Final = 0xF59300FF
+CAMERA: Final = 0x4FC3FFFF
+"""RGBA of the field of view of a camera that is on."""
+PERSON: Final = 0xB46BFFFF
+PALE: Final = 0xD8DCE4FF
+"""RGBA of plain words."""
+DOING: Final[dict[str, int]] = {
+    "search": 0x2F6FD6FF,
+    "approach": 0x17A2B8FF,
+    "unstick": 0xB5541CFF,
+    "enter": 0x7A4FE0FF,
+    "turn": 0xD08BEBFF,
+    "hidden": HIDDEN,
+    "watch": 0xA6DB4EFF,
+    "wait": STATES["waiting"],
+    "alert": ALERT,
+    "blind": 0x6C7886FF,
+    "lost": 0xC3C7D0FF,
+    "operator": OPERATOR,
+}
+"""RGBA of what a behavior is doing; other words have that of what has none of its own."""
+
+
+def faded(colour: int, part: float) -> int:
+    """An RGBA colour, seen through by 1 - `part`."""
+    return colour & 0xFFFFFF00 | round(255 * part)
+
+
+def bright(colour: int) -> int:
+    """The colour of a text: halfway to white, for the viewer writes on what is half dark."""
+    return sum((((colour >> shift & 0xFF) + 0xFF) // 2) << shift for shift in (24, 16, 8)) | colour & 0xFF
+
+
+def rgba(colours: Sequence[int]) -> NDArray[np.uint32]:
+    """Colours as Rerun takes them: of a list of three or four it could not tell whether they are one."""
+    return np.array(colours, np.uint32)

@@ -1,0 +1,207 @@
+"""The recorder: what the mesh shows, written to the timeline.
+
+It only subscribes. The holders of each RC come from what the RCM publishes; why an ARC waits, from the
+notices to its client; hosts and RCs that come and go, from liveliness; what runs on which host, from the
+component placer; what robots do and see, from behaviors, framegrabbers and buildings. `rcm/state` is read at
+the start and where something was missed, so that a recorder may begin in the middle of things.
+
+As a program, `python -m zscout.services.recorder`, it gets its job as `process.RecorderJob` says.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Final
+
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import BadName, Role, Token, new_instance
+from zscout.mesh import Declaration, Mesh, Supervisor
+from zscout.messages import Grants, LoadReport, Notice, RcmState, RcState, StateAsk
+from zscout.services.recorder.host_pane import Use
+from zscout.services.recorder.placement_tracker import PlacementFollower
+from zscout.services.recorder.request_tracker import RequestTracker
+from zscout.services.recorder.robot_follower import RobotFollower
+from zscout.services.recorder.timeline import Timeline
+from zscout.types import SECOND
+
+log = logging.getLogger(__name__)
+
+READ_TIMEOUT: Final = 2.0
+PAUSE: Final = 0.1
+"""Seconds before a leader that did not answer is asked again."""
+DRAIN: Final = 0.5
+"""Seconds for what was published before the end and is still on its way."""
+CHECK_EVERY: Final = 1.0
+"""Seconds between two checks whether anything was dropped here."""
+DEPTH: Final = 8_192
+"""Publications of one kind that may wait here."""
+
+
+class RecorderFailed(RuntimeError):
+    """Part of a recorder raised; it was logged with its traceback."""
+
+
+class Recorder:
+    """Follows one fleet and writes it to `timeline`, in seconds since this object was made; of each camera at
+    most `frames` pictures a second, with 0 none."""
+
+    def __init__(self, mesh: Mesh, fleet: Fleet, timeline: Timeline, frames: float = 2.0) -> None:
+        self.mesh, self.timeline = mesh, timeline
+        self._zero = mesh.now()
+        self._over = asyncio.Event()
+        self._supervisor = Supervisor("the recorder", lambda _: self._over.set())
+        self._placements = PlacementFollower(mesh, timeline, self._now, self._supervisor)
+        self._robots = RobotFollower(mesh, timeline, self._now, frames, self._supervisor)
+        self._requests = RequestTracker(timeline, self._robots.tracker, fleet.operator_priority)
+        self._tokens: dict[tuple[str, str, str], set[str]] = {}
+        self._leaders: set[Token] = set()
+        self._declared: list[Declaration] = []
+        self._wanted = asyncio.Event()
+        self._missed = 0
+        self._caught_up = False
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Records until `stop`. Its liveliness token appears once it has read an RCM's whole state. Raises
+        RecorderFailed."""
+        keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
+        self._declared = [
+            mesh.subscribe(keys.grants, Grants, guard(self._on_grants), depth=DEPTH),
+            mesh.subscribe(keys.notice_any, Notice, guard(self._on_notice), depth=DEPTH),
+            mesh.subscribe(keys.rc_state_any, RcState, guard(self._on_rc_state), depth=DEPTH),
+            mesh.subscribe(keys.load_any, LoadReport, guard(self._on_load)),
+            self._placements.subscribe(),
+            mesh.watch(keys.alive_any(), guard(self._on_token)),
+        ]
+        # Apart: of what these miss, the RCM's state has nothing.
+        robots = self._robots.subscribe()
+        self._wanted.set()
+        for work in (
+            self._keep_reading(),
+            self._placements.keep_reading(),
+            self._robots.tick(),
+            self._end_at(stop),
+        ):
+            self._supervisor.spawn(work)
+        try:
+            await self._over.wait()
+            if self._supervisor.error is not None:
+                raise RecorderFailed from self._supervisor.error
+            await self._drain()
+        finally:
+            await self._supervisor.close()
+            for declared in [*robots, *reversed(self._declared)]:
+                declared.close()
+
+    async def _end_at(self, stop: asyncio.Event) -> None:
+        await stop.wait()
+        self._over.set()
+
+    async def _drain(self) -> None:
+        """`stop` may be quicker than what was published before. An answer of the RCM comes behind all that it
+        has published, on the same link; where nobody leads there is nothing to wait for."""
+        key = self.mesh.keys.rcm_state
+        await self.mesh.ask(key, StateAsk(), RcmState, timeout=DRAIN, enough=lambda _: True)
+
+    def _now(self) -> float:
+        return (self.mesh.now() - self._zero) / SECOND
+
+    def _on_grants(self, _key: str, grants: Grants) -> None:
+        if self._requests.grants(self._now(), grants):
+            self._wanted.set()
+
+    def _on_notice(self, key: str, notice: Notice) -> None:
+        try:
+            client = str(self.mesh.keys.sender_of(key))
+        except BadName:
+            return
+        if client == notice.client:
+            self._requests.notice(self._now(), notice)
+
+    def _on_rc_state(self, key: str, state: RcState) -> None:
+        """A hold that ended at the device has ended, whether an RCM is there to publish it or not."""
+        if self.mesh.keys.rc_of(key) != state.rc:
+            return
+        at = self._now()
+        if state.ended:
+            self._requests.dropped(at, state.rc, {ended.grant for ended in state.ended})
+        self._robots.tracker.state(at, state)
+
+    def _on_load(self, key: str, report: LoadReport) -> None:
+        host = self.mesh.keys.host_of(key)
+        if host == report.host:
+            at = self._now()
+            self.timeline.load(at, host, report.load_average[0], report.cpu / 100)
+            self.timeline.uses(
+                at, host, [Use(one.component, one.cpu, one.memory) for one in report.components]
+            )
+
+    def _on_token(self, token: Token, alive: bool) -> None:
+        instances = self._tokens.setdefault((token.host, token.role, token.name), set())
+        before = bool(instances)
+        (instances.add if alive else instances.discard)(token.instance)
+        if not instances:
+            del self._tokens[token.host, token.role, token.name]
+        if token.role == Role.RCM:
+            (self._leaders.add if alive else self._leaders.discard)(token)
+            if alive:
+                self._wanted.set()
+                self._placements.read_again()
+        if bool(instances) == before and token.role != Role.RCM:
+            return
+        self._robots.token(token, alive)
+        at = self._now()
+        event = _event_of(token, alive)
+        if event is not None:
+            self.timeline.event(at, *event)
+        # Before the state was read, nobody knows that a new RC is free.
+        if token.role == Role.RC and self._caught_up:
+            (self._requests.rc_joined if alive else self._requests.rc_left)(at, token.name)
+
+    # The whole state, where something was missed
+
+    async def _keep_reading(self) -> None:
+        while True:
+            try:
+                async with asyncio.timeout(CHECK_EVERY):
+                    await self._wanted.wait()
+            except TimeoutError:
+                missed = sum(declared.missed for declared in self._declared)
+                if missed == self._missed:
+                    continue
+                log.warning("%d publications were missed; the state is read", missed - self._missed)
+                self._missed = missed
+                self._placements.read_again()
+            self._wanted.clear()
+            if not await self._read() and self._leaders:
+                await asyncio.sleep(PAUSE)
+                self._wanted.set()
+
+    async def _read(self) -> bool:
+        """Whether the state is known now. Without a leader, the token of the next wakes `_keep_reading`."""
+        key, me = self.mesh.keys.rcm_state, self.mesh.me
+        replies = await self.mesh.ask(key, StateAsk(), RcmState, timeout=READ_TIMEOUT)
+        states = [reply.message for reply in replies if reply.message is not None]
+        newest = max(states, key=lambda state: (state.term, state.seq), default=None)
+        if newest is None or not self._requests.state(self._now(), newest):
+            return False
+        if not self._caught_up:
+            self._caught_up = True
+            self._declared.append(self.mesh.alive(Token(me.host, Role.RECORDER, me.client, new_instance())))
+        return True
+
+
+def _event_of(token: Token, alive: bool) -> tuple[str, str] | None:
+    """What happened, and how much people should look at it (INFO or WARN); None for what is of no use."""
+    level = "INFO" if alive else "WARN"
+    match token.role:
+        case Role.NODE:
+            return f"node {token.host} {'is there' if alive else 'is gone'}", level
+        case Role.RCM:
+            return f"{token.host} {'leads' if alive else 'does not lead any more'}", level
+        case Role.RC:
+            return f"{token.name} {'is offered by' if alive else 'is gone from'} {token.host}", level
+        case Role.CLIENT:
+            return f"client {token.host}/{token.name} {'joined' if alive else 'left'}", "INFO"
+        case _:
+            return None

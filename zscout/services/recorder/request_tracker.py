@@ -1,0 +1,209 @@
+"""Requests and holders of RCs as an RCM publishes them, put together for the timeline: pure; times are passed
+in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Final
+
+from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, Revocation, absurd
+from zscout.services.recorder.robot_tracker import RobotTracker, hold_of
+from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.types import NO_TERM, Grant, Term
+
+MAX_OPEN: Final = 20_000
+"""Requests followed at one time."""
+MAX_RCS: Final = 10_000
+MAX_HOLDERS: Final = 1_024
+
+Key = tuple[str, str]
+"""Client and id of a request."""
+
+
+@dataclass(slots=True)
+class _Request:
+    label: str
+    """The ARC's name; of several that are open at one time, a numbered one."""
+    state: str = ""
+    detail: str = ""
+    grant: Grant | None = None
+    last: tuple[Term, int] = field(default=(NO_TERM, 0))
+    """The newest notice."""
+
+
+class RequestTracker:
+    """Writes to `timeline` who holds what and what each ARC is doing; `robots` needs the holds as well."""
+
+    def __init__(self, timeline: Timeline, robots: RobotTracker, operator_priority: int) -> None:
+        self.timeline, self.robots = timeline, robots
+        self.operator_priority = operator_priority
+        self.term: Term = NO_TERM
+        self.seq = 0
+        """The newest publication; older ones are ignored."""
+        self._requests: dict[Key, _Request] = {}
+        self._labels: set[str] = set()
+        self._rcs: dict[str, dict[Grant, HolderRow]] = {}
+
+    def grants(self, at: float, grants: Grants) -> bool:
+        """What the RCM publishes; returns whether something before it was missed."""
+        if (grants.term, grants.seq) < (self.term, self.seq) or absurd(grants.term, self.term):
+            return False
+        missed = grants.term != self.term or grants.prev > self.seq
+        self.term, self.seq = grants.term, grants.seq
+        for revoked in grants.revoked:
+            self._revoked(at, revoked, grants)
+        for rc, holders in grants.rcs.items():
+            for holder in holders[:MAX_HOLDERS]:
+                self._runs(at, (holder.client, holder.id), holder, holder.rcs)
+            self._show(at, rc, [(self._label(holder), holder) for holder in holders[:MAX_HOLDERS]])
+        return missed
+
+    def notice(self, at: float, notice: Notice) -> None:
+        """How a request stands, as published to its client."""
+        if notice.term < self.term:
+            return
+        key = (notice.client, notice.id)
+        if notice.state == "ended":
+            self._ended(at, key, notice.outcome or "ended", notice.reason)
+            return
+        request = self._track(key, notice.arc)
+        if request is None or (notice.term, notice.step) <= request.last:
+            return
+        request.last = (notice.term, notice.step)
+        # That it runs is read from the publication. What was preempted stays so until it runs again.
+        if notice.state == "queued" and request.state not in ("preempted", "running"):
+            self._waits(at, request, notice.reason)
+
+    def state(self, at: float, state: RcmState) -> bool:
+        """The RCM's whole state; False if it is older than what was published."""
+        if (state.term, state.seq) < (self.term, self.seq):
+            return False
+        self.term, self.seq = state.term, state.seq
+        holders: dict[str, list[tuple[str, HoldView]]] = {view.rc: [] for view in state.rcs}
+        open_now: set[Key] = set()
+        for hold in state.holds:
+            key = (hold.client, hold.id)
+            open_now.add(key)
+            self._runs(at, key, hold, hold.needs)
+            for rc in hold.needs:
+                holders.setdefault(rc, []).append((self._label(hold), hold))
+        for wait in state.queue:
+            key = (wait.client, wait.id)
+            open_now.add(key)
+            request = self._track(key, wait.arc)
+            if request is None:
+                continue
+            if request.grant is not None or not request.state:
+                request.grant = None
+                if wait.preemptions:
+                    self._set(at, request, "preempted", wait.reason)
+            if request.state != "preempted":
+                self._waits(at, request, wait.reason)
+        for key in [key for key in self._requests if key not in open_now]:
+            # What the answer left out may still wait.
+            if not state.more or self._requests[key].grant is not None:
+                self._ended(at, key, "ended", "while nobody listened")
+        for rc in self._rcs.keys() - holders.keys():
+            self._show(at, rc, [])
+        for rc, held in holders.items():
+            self._show(at, rc, held)
+        return True
+
+    def rc_joined(self, at: float, rc: str) -> None:
+        """An RC that is not known yet is free."""
+        if rc not in self._rcs:
+            self._show(at, rc, [])
+
+    def rc_left(self, at: float, rc: str) -> None:
+        self._show(at, rc, [])
+
+    def dropped(self, at: float, rc: str, grants: set[Grant]) -> None:
+        """These holds of an RC are over, by the RCM's word or by the RC's own."""
+        held = self._rcs.get(rc, {})
+        if grants & held.keys():
+            self._rcs[rc] = {grant: holder for grant, holder in held.items() if grant not in grants}
+            self.robots.dropped(rc, grants)
+            self.timeline.holders(at, rc, list(self._rcs[rc].values()))
+
+    def _revoked(self, at: float, revoked: Revocation, grants: Grants) -> None:
+        for rc in revoked.rcs:
+            if rc not in grants.rcs:
+                self.dropped(at, rc, {revoked.grant})
+        request = self._requests.get((revoked.client, revoked.id))
+        if request is None or request.grant not in (None, revoked.grant):
+            return
+        request.grant = None
+        match revoked.outcome:
+            case "preempted":
+                party = revoked.why.by[0] if revoked.why is not None and revoked.why.by else None
+                by = f"by {party.arc}, priority {party.priority}" if party is not None else f"by {revoked.by}"
+                self._set(at, request, "preempted", by)
+                self.timeline.event(at, f"{request.label} is preempted {by}, and waits again", "WARN")
+            case "lost":
+                self._set(at, request, "waiting", revoked.reason)
+                self.timeline.event(at, f"{request.label} lost its hold: {revoked.reason}", "WARN")
+            case "handed_over":
+                self._move(at, revoked, grants)
+            case outcome:
+                self._ended(at, (revoked.client, revoked.id), outcome, revoked.reason)
+
+    def _move(self, at: float, revoked: Revocation, grants: Grants) -> None:
+        """The ARC goes on in another client: it keeps its lane."""
+        request = self._requests.pop((revoked.client, revoked.id))
+        self.timeline.event(at, f"{request.label} goes on elsewhere: {revoked.reason}")
+        for holder in (holder for rc in revoked.rcs for holder in grants.rcs.get(rc, [])):
+            if holder.id == revoked.id and holder.client != revoked.client and holder.arc == revoked.arc:
+                self._requests[holder.client, holder.id] = request
+                return
+        self._labels.discard(request.label)
+
+    def _runs(self, at: float, key: Key, hold: Holder | HoldView, rcs: Iterable[str]) -> None:
+        request = self._track(key, hold.arc)
+        if request is None or request.grant == hold.grant:
+            return
+        request.grant = hold.grant
+        self._set(at, request, "running", f"priority {hold.priority} · min {float(hold.min_runtime):g} s")
+        self.timeline.event(at, f"{request.label} runs on {', '.join(sorted(rcs))}")
+
+    def _waits(self, at: float, request: _Request, reason: str) -> None:
+        if (request.state, request.detail) != ("waiting", reason):
+            self._set(at, request, "waiting", reason)
+            self.timeline.event(at, f"{request.label} waits: {reason}")
+
+    def _ended(self, at: float, key: Key, outcome: str, reason: str) -> None:
+        request = self._requests.pop(key, None)
+        if request is None:
+            return
+        self._labels.discard(request.label)
+        self.timeline.arc(at, request.label, "done", "" if outcome == "completed" else outcome)
+        level = "WARN" if outcome == "client_lost" else "INFO"
+        self.timeline.event(at, f"{request.label} {outcome.replace('_', ' ')}: {reason}", level)
+
+    def _track(self, key: Key, name: str) -> _Request | None:
+        """The request, followed from now on; None where too many are open."""
+        request = self._requests.get(key)
+        if request is None and len(self._requests) < MAX_OPEN:
+            label, number = name, 1
+            while label in self._labels:
+                number += 1
+                label = f"{name}.{number}"
+            self._labels.add(label)
+            request = self._requests[key] = _Request(label)
+        return request
+
+    def _label(self, hold: Holder | HoldView) -> str:
+        request = self._requests.get((hold.client, hold.id))
+        return request.label if request is not None else hold.arc
+
+    def _set(self, at: float, request: _Request, state: str, detail: str) -> None:
+        request.state, request.detail = state, detail
+        self.timeline.arc(at, request.label, state, detail)
+
+    def _show(self, at: float, rc: str, holders: Iterable[tuple[str, Holder | HoldView]]) -> None:
+        if rc not in self._rcs and len(self._rcs) >= MAX_RCS:
+            return
+        operator, holders = self.operator_priority, list(holders)
+        self._rcs[rc] = {hold.grant: HolderRow(label, hold.priority >= operator) for label, hold in holders}
+        self.robots.held(rc, {hold.grant: hold_of(hold, operator) for _, hold in holders})
+        self.timeline.holders(at, rc, list(self._rcs[rc].values()))

@@ -1,1 +1,0 @@
-"""Closed loops under virtual time: the building, the mind and what stands between them, without a mesh."""
