@@ -40,6 +40,10 @@ Shape = dict[str, set[str]]
 """Values or types by the path of a field."""
 
 
+def _anything(_: str) -> bool:
+    return True
+
+
 class Story:
     """Two nodes, programs that ask for devices, an operator, and a component that moves."""
 
@@ -80,9 +84,12 @@ class Story:
         holder.until("granted")
         waiter = self._ask("waiter", "request", "robot/a", "radio/rf0:rate=1", "--json")
         waiter.until("waits")
-        for words in ("status", "why waiter", "why holder", "keys", "request robot/a --dry-run"):
+        for words in ("status", "why waiter", "why holder", "request robot/a --dry-run"):
             self.call(*words.split())
             self.look(*words.split())
+        # A command that has just joined hears of one host after the other.
+        self.call("keys", until=_whole)
+        self.look("keys", until=_whole)
         taker = self._ask("taker", "take", "robot/a", "--yes", "--json")
         taker.until("granted")
         holder.end(self)
@@ -135,14 +142,22 @@ class Story:
         self._stack.callback(limit.cancel)
         return Program(name, process)
 
-    def _say(self, *words: str) -> tuple[int, str]:
-        told = printed("zscout", scripts()["zscout"], ["--fleet", str(self.folder / "fleet.toml"), *words])
-        # What went wrong, where nothing was printed.
-        return int(told["exit"]), "\n".join(told.get("out", told.get("err", [])))
+    def _say(self, *words: str, until: Callable[[str], bool] = _anything) -> tuple[int, str]:
+        """Runs a command here until what it prints is so; returns its exit code and that."""
+        end = time.monotonic() + PATIENCE
+        while True:
+            told = printed(
+                "zscout", scripts()["zscout"], ["--fleet", str(self.folder / "fleet.toml"), *words]
+            )
+            # What went wrong, where nothing was printed.
+            code, out = int(told["exit"]), "\n".join(told.get("out", told.get("err", [])))
+            if until(out):
+                return code, out
+            assert time.monotonic() < end, f"{words} printed in vain; last {out}"
 
-    def call(self, *words: str) -> Any:
+    def call(self, *words: str, until: Callable[[str], bool] = _anything) -> Any:
         """Runs a command here and notes the JSON that it prints; returns it."""
-        code, out = self._say(*words, "--json")
+        code, out = self._say(*words, "--json", until=until)
         assert out.startswith("{"), f"{words} with exit code {code}: {out}"
         found = json.loads(out)
         # Which host is drained may differ.
@@ -151,9 +166,9 @@ class Story:
         )
         return found
 
-    def look(self, *words: str) -> None:
+    def look(self, *words: str, until: Callable[[str], bool] = _anything) -> None:
         """Notes the lines that a command prints for people."""
-        lines = self._say(*words)[1].splitlines()
+        lines = self._say(*words, until=until)[1].splitlines()
         self.shown[f"{' '.join(words)}{PEOPLE}"] = {masked(" ".join(line.split())): set() for line in lines}
 
     def note(self, name: str, printed: Sequence[Any], code: int) -> None:
@@ -165,12 +180,7 @@ class Story:
                 shape.setdefault(path, set()).add(leaf)
 
     def _until(self, come: Callable[[Any], bool]) -> None:
-        end = time.monotonic() + PATIENCE
-        while time.monotonic() < end:
-            code, out = self._say("status", "--json")
-            if code == 0 and come(json.loads(out)):
-                return
-        raise AssertionError(f"waited in vain; last seen {out}")
+        self._say("status", "--json", until=lambda out: out.startswith("{") and come(json.loads(out)))
 
 
 class Program:
@@ -206,6 +216,11 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 def _reported(state: Any) -> set[str]:
     return {host["host"] for host in state["hosts"] if host.get("load")}
+
+
+def _whole(keys: str) -> bool:
+    """Whether each host's keys are listed: those of its node, and of what reports its load."""
+    return all(f"host/{host}/{key}" in keys for host in ("anvil", "bellows") for key in ("component", "load"))
 
 
 def masked(text: str) -> str:
