@@ -28,7 +28,8 @@ import psutil
 
 from benchmarks.loop import run
 from benchmarks.stats import Row, Samples, table
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.live.placing import Placing
 from zscout.behaviors.client.client import Client
 from zscout.drivers.packets import DrivePacket, PacketDecoder
@@ -153,7 +154,7 @@ async def of_robots(folder: Path, robots: int, seconds: float) -> list[Row]:
                 params = {"robot": f"robot/scout{robot}", "command_rate": COMMAND_RATE}
                 await placing.place(f"place{robot}", "place_robot", params)
             pictures = Pictures(lab, client, robots)
-            async with asyncio.timeout(2 * START):
+            async with asyncio.timeout(2 * HANG):
                 while {robot for _, robot in tap.drives} < set(ids):  # noqa: ASYNC110 - in other processes
                     await asyncio.sleep(0.05)
             listed = await placing.get(ListComponents(), ComponentList, "lab")

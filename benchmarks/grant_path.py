@@ -16,7 +16,8 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.grant_trace import Call
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 
 RC = "robot/x"
 IDLE = 3.0
@@ -46,11 +47,11 @@ async def trace(folder: Path) -> dict[str, list[Call]]:
         await asyncio.sleep(IDLE)
         zscout = str(Path(sys.executable).with_name("zscout"))
         command = lab.spawn([zscout, "request", RC, "--", "true"], log="client.log")
-        code = await asyncio.to_thread(command.wait, START)
+        code = await asyncio.to_thread(command.wait, HANG)
         assert code == 0, lab.log("client")
         for node in sides.values():
             node.send_signal(signal.SIGTERM)
-            await asyncio.to_thread(node.wait, START)
+            await asyncio.to_thread(node.wait, HANG)
         sides = {"client": command, **sides}
         return {
             side: json.loads((traces / f"{process.pid}.json").read_text()) for side, process in sides.items()

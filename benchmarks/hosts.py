@@ -27,7 +27,8 @@ from benchmarks import bare
 from benchmarks.child import Child, child
 from benchmarks.loop import run
 from benchmarks.stats import Row, Samples
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout import messages
 from zscout.behaviors.client.client import Client
 from zscout.messages import HostRanking, RankAsk, RankedHost
@@ -110,7 +111,7 @@ async def rank(client: Client) -> HostRanking | None:
 
 async def ranked(client: Client, hosts: int) -> None:
     """Waits until all hosts are ranked."""
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while True:
             answer = await rank(client)
             if answer is not None and len(answer.hosts) + answer.more >= hosts:
@@ -240,7 +241,7 @@ def main() -> None:
             try:
                 found.append(run(measure(Path(name), hosts)))
             except TimeoutError:
-                print(f"{hosts:,} hosts were not all ranked within {START:.0f} s", file=sys.stderr)
+                print(f"{hosts:,} hosts were not all ranked within {HANG:.0f} s", file=sys.stderr)
                 break
         if args.hosts is not None or found[-1].ended or hosts == MAX_HOSTS:
             break

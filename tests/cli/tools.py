@@ -18,11 +18,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
+from tests.hang import HANG
 from zscout.cli.main import main
 
 COMMAND = (sys.executable, "-m", "zscout.cli.main")
-PATIENCE = 30.0
-"""Seconds within which anything that is waited for must have come true, on a busy machine."""
 # Makes the terminal that it has as stdin its controlling one: what a terminal window does for its shell.
 OWN_TERMINAL = (
     "import fcntl, os, sys, termios; os.setsid(); fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
@@ -36,7 +35,7 @@ def zscout(
 ) -> subprocess.CompletedProcess[str]:
     """Runs it in a pipe, to its end."""
     command = [*COMMAND, *map(str, args)]
-    return subprocess.run(command, env=env, input=stdin, capture_output=True, text=True, timeout=PATIENCE)
+    return subprocess.run(command, env=env, input=stdin, capture_output=True, text=True, timeout=HANG)
 
 
 def zscout_here(*args: object) -> int:
@@ -87,7 +86,7 @@ class Terminal:
 
     def until(self, words: str) -> str:
         """What was drawn since the last look, as soon as these words are among it."""
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + HANG
         while (at := self.text.find(words, self._looked)) < 0:
             assert time.monotonic() < deadline, f"waited in vain for {words!r}: {self.text}"
             ended = self.process.poll() is not None
@@ -100,7 +99,7 @@ class Terminal:
 
     def code(self) -> int:
         """Waits for its end; the exit code."""
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + HANG
         while self.process.poll() is None:
             assert time.monotonic() < deadline, f"never ended: {self.text}"
             self._read(0.1)
@@ -130,7 +129,7 @@ def end(process: subprocess.Popen[str]) -> None:
     if process.poll() is None:
         process.terminate()
         try:
-            process.wait(PATIENCE)
+            process.wait(HANG)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -159,9 +158,9 @@ def events(text: str) -> list[dict[str, Any]]:
 
 
 def gone(pid: int) -> bool:
-    """True as soon as a process is dead (a zombie is), False if it is not within PATIENCE."""
+    """True as soon as a process is dead (a zombie is), False if it is not within HANG."""
     before = time.monotonic()
-    while time.monotonic() - before < PATIENCE:
+    while time.monotonic() - before < HANG:
         try:
             if "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text():
                 return True

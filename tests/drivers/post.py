@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
 from zscout.drivers.driver import Driver
@@ -65,7 +66,7 @@ class Post:
         mesh = await self.mesh(host, client)
         key = mesh.keys.command(rc, mesh.me)
         reply = None
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while reply is None:  # a new session takes a moment to find the others
                 reply = await mesh.ask_one(key, Command(do=do, grant=grant), Done, timeout=1)
         return "done" if reply.problem is None else reply.problem.code

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.live.lab import START
+from tests.hang import HANG
 from zscout.drivers.packets import Packet, PacketDecoder
 from zscout.mesh import clock
 from zscout.types import SECOND, Ns
@@ -68,7 +68,7 @@ class PtyLine:
     async def until(self, found: Callable[[list[Packet]], Any], *, since: int = 0) -> Any:
         """Waits until `found` is true of the packets heard from number `since` on; returns what it says."""
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while not (result := found(self.packets[since:])):
                     self._news.clear()
                     await self._news.wait()

@@ -15,10 +15,8 @@ import numpy as np
 import pytest
 
 from tests.drivers.mjpeg import MjpegServer, jpeg, number_of, numbered
+from tests.hang import HANG
 from zscout.drivers.capture import Capture, CapturedFrame, kind_of, shown
-
-PATIENCE = 20.0
-"""Seconds within which anything that is waited for must have come true, on a busy machine."""
 
 
 @contextmanager
@@ -32,14 +30,14 @@ def capturing(source: str, **how: float) -> Iterator[Capture]:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + HANG
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)
 
 
 def picture_of(capture: Capture, after: int = 0) -> CapturedFrame:
-    captured = capture.wait(after, PATIENCE)
+    captured = capture.wait(after, HANG)
     assert captured is not None, capture.health
     return captured
 
@@ -150,7 +148,7 @@ def test_half_a_picture_is_no_picture(mode: str) -> None:
         seen = picture_of(capture)
         server.mode = mode
         accepted, halves = server.accepted, 0
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + HANG
         # Until it has opened the stream again after a half, and got whole ones.
         while not halves or number_of(seen.picture) <= twice * halves:
             if not halves and server.accepted > accepted:
@@ -243,7 +241,7 @@ def test_a_process_ends_whatever_its_captures_do(mode: str) -> None:
             [sys.executable, "-c", code, server.url], stdin=subprocess.PIPE, stderr=subprocess.PIPE
         )
         until(lambda: server.accepted == 1 and (mode == "stall" or server.sent > 5))
-        assert process.communicate(timeout=PATIENCE)[1] == b""
+        assert process.communicate(timeout=HANG)[1] == b""
         assert process.returncode == 0
 
 
@@ -254,7 +252,7 @@ def test_who_waits_is_let_go_by_stop() -> None:
         waiter = threading.Thread(target=lambda: got.append(capture.wait(10**9, 600)))
         waiter.start()
         capture.stop()
-        waiter.join(PATIENCE)
+        waiter.join(HANG)
         assert got == [None]
 
 

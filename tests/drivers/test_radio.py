@@ -10,8 +10,9 @@ import pytest
 
 from tests.drivers.post import GANG, RADIO, TURN, Post, held, is_in, robot
 from tests.drivers.ptys import PtyLine
+from tests.hang import HANG
 from tests.live.bench import answer, comes_to, until
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from zscout.behaviors.client.client import CommandRefused
 from zscout.drivers.packets import (
     CameraPacket,
@@ -196,4 +197,4 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             assert isinstance(line.packets[-1], HaltPacket | StopPacket | CameraPacket)
         line.unplug()
 
-    asyncio.run(asyncio.wait_for(story(), START))
+    asyncio.run(asyncio.wait_for(story(), HANG))

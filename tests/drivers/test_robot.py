@@ -12,8 +12,9 @@ import pytest
 
 from tests.drivers.post import GANG, TURN, held, is_in
 from tests.drivers.ptys import PtyLine
+from tests.hang import HANG
 from tests.live.bench import answer
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from zscout.drivers.packets import (
     CameraPacket,
     DrivePacket,
@@ -165,10 +166,10 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
         for how, wait in worst:
             print(f"{how}: {wait / 1e6:.1f} ms until the halt is through the line")
         # The hold lease and the mesh's are seconds; nothing here waits for the former.
-        assert max(wait for _, wait in worst) < START * SECOND
+        assert max(wait for _, wait in worst) < HANG * SECOND
         line.unplug()
 
-    asyncio.run(asyncio.wait_for(story(), START))
+    asyncio.run(asyncio.wait_for(story(), HANG))
 
 
 def line_time(line: PtyLine, kind: type[Packet], since: int) -> Ns:

@@ -13,8 +13,8 @@ import pytest
 import serial
 
 from tests.drivers.ptys import PtyLine
+from tests.hang import HANG
 from tests.live.bench import until
-from tests.live.lab import START
 from zscout.drivers.packets import DrivePacket, HaltPacket, encode
 from zscout.drivers.serial_line import DEPTH, SerialLine
 from zscout.mesh import clock
@@ -46,7 +46,7 @@ class Ear:
 
     async def until(self, true: Callable[[], Any]) -> None:
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while not true():
                     self._news.clear()
                     await self._news.wait()
@@ -187,7 +187,7 @@ def test_a_radio_on_another_machine(tmp_path: Path) -> None:
         line.start()
         await ear.until(lambda: ear.told == ["up"])
         line.write(encode(HaltPacket(9, 9)))
-        assert await asyncio.wait_for(arrived.get(), START) == encode(HaltPacket(9, 9))
+        assert await asyncio.wait_for(arrived.get(), HANG) == encode(HaltPacket(9, 9))
         # The other machine hangs up: that is noticed though nothing is sent.
         await ear.until(lambda: len(ear.told) > 1)
         server.close()
@@ -195,4 +195,4 @@ def test_a_radio_on_another_machine(tmp_path: Path) -> None:
 
     begun = clock.now()
     asyncio.run(run())
-    assert clock.now() - begun < START * SECOND
+    assert clock.now() - begun < HANG * SECOND

@@ -6,7 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.drivers.driver import Driver
@@ -105,7 +106,7 @@ async def comes_to(arc: OpenArc, state: str, reason: str = "") -> None:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while True:
             if condition():
                 return

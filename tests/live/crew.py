@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.behaviors.client.arc import Held, hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
@@ -44,7 +45,7 @@ class Body:
 
     async def entered(self) -> None:
         entered = asyncio.create_task(self._entered.wait())
-        await asyncio.wait({entered, self.task}, timeout=START, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({entered, self.task}, timeout=HANG, return_when=asyncio.FIRST_COMPLETED)
         entered.cancel()
         if self.task.done():
             self.task.result()
@@ -52,7 +53,7 @@ class Body:
 
     async def beats_on(self, after: Ns) -> None:
         """Waits until a command that was given after `after` has been obeyed. Raises what ended the body."""
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while not self.beats or self.beats[-1] <= after:
                 if self.task.done():
                     self.task.result()
@@ -61,7 +62,7 @@ class Body:
     async def finish(self) -> None:
         """Ends the body; raises if it was disturbed before."""
         self._stop.set()
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             await self.task
 
 

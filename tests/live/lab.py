@@ -14,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from tests.hang import HANG
 from zscout.behaviors.client.client import Client
 from zscout.config.fleet import Fleet, load_fleet
 from zscout.config.scheduling_policy import StrategyName
@@ -21,9 +22,6 @@ from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import clock
 from zscout.messages import RcAsk, RcmState, RcState
 from zscout.types import Ns
-
-START = 20.0
-"""Seconds within which anything that is waited for must have come true, on a busy machine."""
 
 
 class Lab:
@@ -96,7 +94,7 @@ class Lab:
 
     async def logged(self, host: str, text: str) -> None:
         """Waits until a node has written `text` to its log."""
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while True:
                 if text in self.log(host):
                     return
@@ -104,7 +102,7 @@ class Lab:
 
     async def living(self, client: Client, role: str, until: Callable[[list[str]], bool]) -> None:
         """Waits until the hosts that have a token of this role are as they should be."""
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while True:
                 tokens = await client.mesh.living(client.mesh.keys.alive_any(role), timeout=1)
                 if until([token.host for token in tokens]):
@@ -131,7 +129,7 @@ class Lab:
 
     async def rc(self, client: Client, name: str) -> RcState:
         """An RC's own word about itself."""
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while True:
                 reply = await client.mesh.ask_one(
                     client.mesh.keys.rc_state(name), RcAsk(), RcState, timeout=0.5
@@ -143,17 +141,17 @@ class Lab:
         """Waits until an RC names exactly these ARCs as its holders: it may hear of them after the client."""
         held: list[str] | None = None
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while held != sorted(arcs):
                     held = sorted(holder.arc for holder in (await self.rc(client, name)).holders)
         except TimeoutError:
             raise AssertionError(f"{name} is held by {held}, not by {sorted(arcs)}") from None
 
     async def state(self, client: Client, until: Callable[[RcmState], bool]) -> RcmState:
-        """The RCM's state as soon as `until` holds of it; fails after START seconds."""
+        """The RCM's state as soon as `until` holds of it; fails after HANG seconds."""
         seen: RcmState | None = None
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while True:
                     seen = await client.state(timeout=0.5) or seen
                     if seen is not None and until(seen):
@@ -207,7 +205,7 @@ class HolderProcess:
         assert self.process.stdout is not None
         skipped: list[dict[str, Any]] = []
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while line := await self.process.stdout.readline():
                     event: dict[str, Any] = json.loads(line)
                     if event["event"] in names:
@@ -242,7 +240,7 @@ class LeaderWatch:
 
     async def lost(self, host: str) -> Ns:
         """Waits until the token of a leader at `host` has gone; returns when it did."""
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while True:
                 self._news.clear()
                 for token, at in self.gone.items():

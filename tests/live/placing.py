@@ -13,7 +13,8 @@ from typing import Any, Self, TypeVar
 
 import msgspec
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.behaviors.client.arc import Revoked, holds
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.components.component import Component, ComponentContext
@@ -50,9 +51,9 @@ class Placing:
     async def ask(self, operation: msgspec.Struct, kind: type[R], host: str | None = None) -> R | Problem:
         keys = self.client.mesh.keys
         key = keys.placer if host is None else keys.component(host)
-        async with asyncio.timeout(2 * START):
+        async with asyncio.timeout(2 * HANG):
             while True:
-                reply = await self.client.mesh.ask_one(key, operation, kind, timeout=START)
+                reply = await self.client.mesh.ask_one(key, operation, kind, timeout=HANG)
                 answer = None if reply is None else reply.message or reply.problem
                 if isinstance(answer, Problem) and answer.code == "not_leading":
                     answer = None
@@ -82,7 +83,7 @@ class Placing:
         """The placement, as soon as `holds` is true of it."""
         seen: Placement | None = None
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while True:
                     listed = await self.get(ListPlacements(component), Placements)
                     seen = next(iter(listed.components), None)
@@ -94,7 +95,7 @@ class Placing:
 
     async def hosts(self, count: int) -> None:
         """Waits until the balancer ranks so many hosts."""
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while True:
                 reply = await self.client.mesh.ask_one(
                     self.client.mesh.keys.rank, RankAsk(), HostRanking, timeout=1
@@ -134,7 +135,7 @@ class Witness(ExclusiveDriver):
         """Waits until it was told so many more."""
         wanted = len(self.counts) + count
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while len(self.counts) < wanted:
                     self._told.clear()
                     await self._told.wait()

@@ -10,7 +10,8 @@ from typing import Any
 
 import zenoh
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.mesh import zenoh_config
 
 LIMITS = "[limits]\nmax_needs = 8\nmax_queued = 20\nmax_requests_per_client = 5\n"
@@ -74,7 +75,7 @@ class Stranger:
         )
 
     def await_(self, what: str, true: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + START
+        deadline = time.monotonic() + HANG
         while not true():
             assert time.monotonic() < deadline, f"waited in vain until {what}"
             time.sleep(0.02)

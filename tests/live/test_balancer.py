@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Role
 from zscout.messages import HostRanking, RankAsk
@@ -21,7 +22,7 @@ HOSTS = {"h1", "h2", "h3"}
 async def ranked(client: Client, asked: RankAsk, hosts: set[str]) -> HostRanking:
     """The answer, once it names exactly these hosts."""
     answer: HostRanking | None = None
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while answer is None or {one.host for one in answer.hosts} != hosts:
             reply = await client.mesh.ask_one(client.mesh.keys.rank, asked, HostRanking, timeout=1)
             answer = reply.message if reply is not None else None
@@ -51,7 +52,7 @@ async def _ranks(tmp_path: Path) -> None:
         none = await ranked(client, RankAsk(labels=["gpu"]), set())
         assert set(none.left_out.values()) == {"it has no label gpu"}
         reply = await client.mesh.ask_one(
-            client.mesh.keys.rank, RankAsk(at_most=1), HostRanking, timeout=START
+            client.mesh.keys.rank, RankAsk(at_most=1), HostRanking, timeout=HANG
         )
         assert reply is not None
         assert reply.message is not None

@@ -15,7 +15,7 @@ from tests.behaviors.components.kit import (
     counts_on,
     gone,
 )
-from tests.live.lab import START
+from tests.hang import HANG
 from zscout.behaviors.client.client import Client
 from zscout.messages import (
     MAX_CHECKPOINT,
@@ -210,7 +210,7 @@ def test_a_target_that_is_killed_while_it_is_moved_to_leaves_one_that_counts(tmp
             await ranked(client, "a", "b")
             spec = ComponentSpec("counter", QUICK | {"rc": "robot/x"}, hosts=["a", "b"])
             placed = await placer(client, PlaceComponent("c", spec))
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 # It may be seen to run before its node has told what it can.
                 while not (isinstance(placed, Placement) and placed.state == "running" and placed.movable):
                     await asyncio.sleep(0.05)
@@ -236,7 +236,7 @@ def test_a_target_that_is_killed_while_it_is_moved_to_leaves_one_that_counts(tmp
 
 async def ranked(client: Client, *hosts: str) -> None:
     """Waits until the balancer ranks these hosts: something can be placed there."""
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while True:
             ask = RankAsk(hosts=list(hosts))
             reply = await client.mesh.ask_one(client.mesh.keys.rank, ask, HostRanking, timeout=1)
@@ -246,7 +246,7 @@ async def ranked(client: Client, *hosts: str) -> None:
 
 
 async def placer(client: Client, operation: PlaceComponent | MigrateComponent) -> Placement | Problem:
-    reply = await client.mesh.ask_one(client.mesh.keys.placer, operation, Placement, timeout=2 * START)
+    reply = await client.mesh.ask_one(client.mesh.keys.placer, operation, Placement, timeout=2 * HANG)
     assert reply is not None
     answer = reply.message or reply.problem
     assert answer is not None

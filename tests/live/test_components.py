@@ -16,7 +16,7 @@ from tests.behaviors.components.kit import (
     lives,
 )
 from tests.behaviors.components.odd import TOO_LARGE
-from tests.live.lab import START
+from tests.hang import HANG
 from zscout.keyexpr import Role, Token
 from zscout.messages import (
     MAX_OUTPUT,
@@ -76,7 +76,7 @@ def test_a_component_is_started_once_listed_read_checkpointed_and_stopped(tmp_pa
             assert int(taken[1]) >= 5
             await hosts.output("a", "c", lambda text: f"\n{int(taken[1]) + 5}\n" in text)
 
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while not (load := await loads.get()).components:
                     pass
             assert [(use.component, use.kind, use.incarnation) for use in load.components] == [
@@ -268,7 +268,7 @@ def test_a_node_that_stops_ends_its_components_and_what_they_started(tmp_path: P
             pids = [view.pid for view in views if view.pid is not None]
             lab.signal("a", signal.SIGTERM)
             await gone(*pids, *map(int, text.split()))
-            await asyncio.to_thread(node.wait, START)
+            await asyncio.to_thread(node.wait, HANG)
             assert "count released" in lab.log("a")
             assert "Traceback" not in lab.log("a")
 

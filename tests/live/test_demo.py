@@ -14,6 +14,7 @@ from typing import IO
 import psutil
 import pytest
 
+from tests.hang import HANG
 from tests.services.recorder.paper_run import (
     RCS,
     TABLE2,
@@ -27,9 +28,6 @@ from zscout.services.recorder.timeline import OPERATOR_MARK
 from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
-
-PATIENCE = 60.0
-"""Seconds for what takes a few on a machine with nothing else to do."""
 
 
 def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
@@ -59,13 +57,13 @@ def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 
 def gone(processes: list[psutil.Process]) -> bool:
-    _, alive = psutil.wait_procs(processes, timeout=PATIENCE)
+    _, alive = psutil.wait_procs(processes, timeout=HANG)
     return not alive
 
 
 def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
     demo = start(tmp_path, "--json")
-    out, error = demo.communicate(timeout=PATIENCE)
+    out, error = demo.communicate(timeout=HANG)
     assert demo.returncode == 0, out + error
     result = json.loads(out)
     expected = {rc: row.split() for rc, row in TABLE2.items()}
@@ -107,7 +105,7 @@ def test_nothing_runs_on_when_it_is_stopped(tmp_path: Path, number: signal.Signa
     others = children(demo)
     assert len(others) == 3 + 1 + 5
     demo.send_signal(number)
-    _, error = demo.communicate(timeout=PATIENCE)
+    _, error = demo.communicate(timeout=HANG)
     assert gone(others)
     if number == signal.SIGKILL:
         assert demo.returncode == -signal.SIGKILL
@@ -124,7 +122,7 @@ def test_a_node_that_dies_ends_it_with_one_line(tmp_path: Path) -> None:
     others = children(demo)
     (bellows,) = (other for other in others if any("bellows.toml" in part for part in other.cmdline()))
     bellows.kill()
-    _, error = demo.communicate(timeout=PATIENCE)
+    _, error = demo.communicate(timeout=HANG)
     assert demo.returncode == 1
     assert gone(others)
     *_, line = error.strip().splitlines()
@@ -134,7 +132,7 @@ def test_a_node_that_dies_ends_it_with_one_line(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_one_line_at_once(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     demo = start(tmp_path, "--out", "file/demo.rrd")
-    _, error = demo.communicate(timeout=PATIENCE)
+    _, error = demo.communicate(timeout=HANG)
     assert (demo.returncode, error) == (
         2,
         "zscout: --out file/demo.rrd: can't be written (its folder is a file); give another file\n",

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from tests.drivers.mjpeg import MjpegServer, jpeg, number_of, numbered
+from tests.hang import HANG
 from tests.live.bench import Bench, SharedBench, Stand, answer, running, until
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.drivers import frame_pump, framegrabber
 from zscout.drivers.framegrabber import FramegrabberDriver
@@ -48,7 +49,7 @@ def picture_in(frame: Frame) -> Any:
 
 
 async def frame_of(watch: FrameWatch) -> Frame:
-    frame = await watch.next(START)
+    frame = await watch.next(HANG)
     assert frame is not None
     return frame
 
@@ -68,7 +69,7 @@ def refused(watch: FrameWatch, before: int) -> bool:
 
 async def until_there(put: Callable[[], None], there: Callable[[], bool]) -> None:
     """Publishes until it has arrived: on a busy machine a frame may be dropped, as frames are."""
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while True:
             put()
             for _ in range(100):
@@ -377,7 +378,7 @@ def test_a_source_that_falls_silent_loses_the_framegrabber_until_it_is_back(
             assert "no picture of video/ch1" in (await at.lab.rc(at.client, GRABBER)).health
             await until(lambda: at.driver._holder is None)
             at.one.open()
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 again = await at.client.granted(arc)
             assert again is not None
             assert again > grant

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
@@ -40,7 +41,7 @@ def test_a_holder_stopped_is_followed_and_refused_when_it_goes_on(tmp_path: Path
 
             frozen.signal(signal.SIGCONT)
             codes = [(await frozen.event("command"))["code"]]
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 # "unknown" is what it is told while it has no link: no RC has answered it then.
                 while codes[-1] == "unknown":
                     await frozen.order("command", rc="robot/x", do=ECHO)

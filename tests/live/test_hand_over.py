@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.hang import HANG
 from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, until
 from tests.live.handing_over import NEEDS, claimed, me, settle_down
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from tests.live.stranger import Stranger, beside_a_node, good_ask
 from tests.thorough import times
 from zscout.behaviors.client.client import Client
@@ -128,7 +129,7 @@ def test_all_goes_over_in_one_step_and_nobody_gets_in_between(tmp_path: Path) ->
             await asyncio.sleep(0)
             assert not new.expected_came.is_set()
             await old.hand_over_all(me(new))
-            await asyncio.wait_for(new.expected_came.wait(), START)
+            await asyncio.wait_for(new.expected_came.wait(), HANG)
             drive = await early
             after = {"drive": drive} | await claimed(new, ["talk", "later"])
 

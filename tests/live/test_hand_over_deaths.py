@@ -10,9 +10,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from tests.hang import HANG
 from tests.live.bench import ECHO, answer
 from tests.live.handing_over import NEEDS, claimed, holding, me, settle_down
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from zscout.keyexpr import Sender
 from zscout.types import Grant
 
@@ -79,8 +80,8 @@ def test_the_leader_dies_in_a_hand_over(tmp_path: Path, delay: float) -> None:
             await moving_
             after = await claimed(new, list(NEEDS))
             assert [arc.id for arc in after.values()] == [arc.id for arc in before.values()]
-            await asyncio.wait_for(new.granted(after["drive"]), START)
-            await asyncio.wait_for(new.granted(after["talk"]), START)
+            await asyncio.wait_for(new.granted(after["drive"]), HANG)
+            await asyncio.wait_for(new.granted(after["talk"]), HANG)
             state = await lab.state(
                 new, lambda state: state.host == "b" and len(state.holds) == 2 and len(state.queue) == 1
             )
@@ -111,10 +112,10 @@ def test_the_old_process_dies_right_after_it(tmp_path: Path) -> None:
                 assert heir.stdout is not None
                 old.pause()
                 heir.stdin.write(ENCODER.encode(old.open_requests()) + b"\n")
-                assert await asyncio.wait_for(heir.stdout.readline(), START) == b"ready\n"
+                assert await asyncio.wait_for(heir.stdout.readline(), HANG) == b"ready\n"
                 await old.hand_over_all(Sender("test", "new"))
                 await old.leave()
-                line = await asyncio.wait_for(heir.stdout.readline(), START)
+                line = await asyncio.wait_for(heir.stdout.readline(), HANG)
                 told = msgspec.json.decode(line, type=dict[str, Grant])
                 watcher = await lab.client("watcher")
                 await lab.living(watcher, "client", lambda hosts: len(hosts) == 2)

@@ -8,10 +8,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from tests.hang import HANG
 from tests.live.bench import running, until
 from tests.live.crew import Body
 from tests.live.handing_over import NEEDS, claimed, me
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from zscout.behaviors.client import handover
 from zscout.behaviors.client.arc import Held, holds
 from zscout.behaviors.client.client import RequestRefused
@@ -43,7 +44,7 @@ def test_bodies_go_on_after_a_hand_over_that_was_refused(tmp_path: Path) -> None
             assert not interrupted
             assert client.open_requests()[0].grant is None
             client.resume()
-            await asyncio.wait({body.task}, timeout=START)
+            await asyncio.wait({body.task}, timeout=HANG)
             assert "preempted by operator" in str(body.task.exception())
             await other.end(taker)
 
@@ -85,7 +86,7 @@ def test_what_was_handed_to_one_who_died_is_taken_back(tmp_path: Path) -> None:
             assert not {entered[1].arc.id, later.id} & set(ids)
             assert later.state == "queued"
             done.set()
-            await asyncio.wait_for(body, START)
+            await asyncio.wait_for(body, HANG)
             await until(lambda: later.state == "running")
 
     asyncio.run(story())

@@ -11,8 +11,9 @@ import msgspec
 import pytest
 import zenoh
 
+from tests.hang import HANG
 from tests.live.crew import Crew, Stand
-from tests.live.lab import START, Lab, LeaderWatch
+from tests.live.lab import Lab, LeaderWatch
 from tests.live.test_leader_killed import APART, RUNNING, WAITING, grant_of
 from zscout.behaviors.client.client import CommandRefused
 from zscout.keyexpr import Role, Sender
@@ -111,7 +112,7 @@ async def _forgeries_are_ignored(lab: Lab, crew: Crew, stood: Stand, newest: Ter
     )
     with zenoh.open(zenoh_config(lab.fleet.mesh)) as stranger:
         # Its links are there once it is answered.
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while not await asyncio.to_thread(_get, stranger, keys.rc_state(body.rc)):
                 pass
         for forged in (
@@ -121,7 +122,7 @@ async def _forgeries_are_ignored(lab: Lab, crew: Crew, stood: Stand, newest: Ter
             heard.clear()
             stranger.put(keys.grants, encode(forged))
             # The RC answers the outdated with its newer term: it has read the forgery by then.
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 await heard.wait()
             assert answers[-1].term == newest
             assert [holder.grant for holder in answers[-1].holders] == [real.grant]

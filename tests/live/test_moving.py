@@ -11,7 +11,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.live.placing import Placing, WitnessRc, register
 from tests.thorough import times
 from zscout.behaviors.client.client import Client
@@ -106,7 +107,7 @@ def test_the_target_dies_and_it_lives_in_exactly_one_place(tmp_path: Path) -> No
 
 
 async def appears(path: Path) -> None:
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while True:
             if there(path):
                 return
@@ -179,7 +180,7 @@ async def kill(lab: Lab, host: str, victim: str) -> None:
         lab.signal(host, signal.SIGKILL)
     for child in children:
         child.kill()
-    await asyncio.to_thread(psutil.wait_procs, children, START)
+    await asyncio.to_thread(psutil.wait_procs, children, HANG)
 
 
 async def at_starting(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
@@ -224,7 +225,7 @@ async def at_handed_over(lab: Lab, placing: Placing, folder: Path, target: str) 
     for child in psutil.Process(lab.nodes[target].pid).children(recursive=True):
         child.suspend()
     lab.signal("h0", signal.SIGCONT)
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         await given.wait()
     declared.close()
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
+from tests.hang import HANG
 from tests.live.bench import Bench, Stand, comes_to, running
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from tests.live.stranger import Stranger, beside_a_node, command, good_ask
 from tests.live.test_protocol import PlainProcess
 from zscout.behaviors.client import blocking
@@ -107,7 +108,7 @@ def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_a_loss
                 # What it lost is made up for by another that matches: it ranks first.
                 await rc.stop()
                 stand.rcs.remove(rc)
-                async with asyncio.timeout(START):
+                async with asyncio.timeout(HANG):
                     while arc.grant in (None, grant):
                         await client.changed(arc)
                 again = await client.granted(arc)

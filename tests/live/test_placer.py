@@ -10,7 +10,8 @@ import psutil
 import pytest
 
 from tests.behaviors.components.kit import ComponentLab, lives
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.live.placing import Placing, WitnessRc
 from zscout.keyexpr import Role
 from zscout.mesh import clock
@@ -52,7 +53,7 @@ async def host_dies(lab: Lab, host: str) -> int:
     at = lab.signal(host, signal.SIGKILL)
     for process in processes:
         process.kill()
-    await asyncio.to_thread(psutil.wait_procs, processes, START)
+    await asyncio.to_thread(psutil.wait_procs, processes, HANG)
     return at
 
 

@@ -17,7 +17,8 @@ import msgspec
 import pytest
 
 import zscout
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout import messages
 from zscout.behaviors.client.arc import hold
 from zscout.keyexpr import Keys, Role, Sender
@@ -126,7 +127,7 @@ class PlainProcess:
         """Waits for the next event `what` whose fields are as given; events before it are passed over."""
         assert self.process.stdout is not None
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while line := await self.process.stdout.readline():
                     event: dict[str, Any] = json.loads(line)
                     self.told.append(event)
@@ -144,7 +145,7 @@ class PlainProcess:
     async def end(self) -> int:
         assert self.process.stdin is not None
         self.process.stdin.close()
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             return await self.process.wait()
 
     def kill(self) -> None:

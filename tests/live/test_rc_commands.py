@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 import zenoh
 
+from tests.hang import HANG
 from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, running, until
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from zscout.behaviors.client.arc import Revoked, hold
 from zscout.behaviors.client.client import Client
 from zscout.drivers.resource_controller import COMMAND_QUEUE, MAX_TTL
@@ -61,11 +62,11 @@ def test_every_refusal(tmp_path: Path) -> None:
                 await _malformed(lab, client, grant)
 
                 # While one command takes its time, those behind it grow stale, and too many are refused.
-                slow = asyncio.create_task(client.command("robot/bench", grant, WAIT, timeout=START))
+                slow = asyncio.create_task(client.command("robot/bench", grant, WAIT, timeout=HANG))
                 await bench.waiting.wait()
-                stale = asyncio.create_task(echo(grant, ttl=0.05, timeout=START))
+                stale = asyncio.create_task(echo(grant, ttl=0.05, timeout=HANG))
                 many = [
-                    asyncio.create_task(echo(grant, ttl=60, timeout=START)) for _ in range(COMMAND_QUEUE - 1)
+                    asyncio.create_task(echo(grant, ttl=60, timeout=HANG)) for _ in range(COMMAND_QUEUE - 1)
                 ]
                 await until(lambda: rc.queue.commands == COMMAND_QUEUE)
                 assert await answer(echo(grant)) == "busy"
@@ -135,7 +136,7 @@ def test_what_piles_up_while_a_node_stands_still_is_refused(tmp_path: Path) -> N
             lab.signal("c", signal.SIGSTOP)
             sent = clock.now()
             old = [
-                asyncio.create_task(client.command("robot/x", grant, ECHO, ttl=0.3, timeout=START))
+                asyncio.create_task(client.command("robot/x", grant, ECHO, ttl=0.3, timeout=HANG))
                 for _ in range(5)
             ]
             await until(lambda: clock.now() - sent > 0.8 * SECOND)
@@ -201,7 +202,7 @@ def test_one_of_two_holders_ends_and_the_device_serves_the_other(tmp_path: Path)
                 await stand.rc("radio/bench", bench)
                 await lab.ready(client, "radio/bench")
                 _, first = await running(client, "first", "radio/bench")
-                async with asyncio.timeout(START):
+                async with asyncio.timeout(HANG):
                     while await answer(client.command("radio/bench", first, ECHO)) == "warming":
                         pass
                 arc, second = await running(client, "second", "radio/bench")
@@ -240,11 +241,11 @@ def test_holds_end_at_rc_and_client_when_no_rcm_is_heard_for_the_hold_lease(tmp_
                     ) as held:
                         grants.append(held.grant)
                         killed = lab.signal("a", signal.SIGKILL)
-                        async with asyncio.timeout(START):
+                        async with asyncio.timeout(HANG):
                             await asyncio.Event().wait()
                 assert revoked.value.outcome == "lost"
                 # The last word may have been half a second old when the RCM died.
-                assert 0.9 < (clock.now() - killed) / SECOND < START
+                assert 0.9 < (clock.now() - killed) / SECOND < HANG
                 await until(lambda: set(ended) == {"robot/x", "robot/y", "robot/bench"})
                 assert {(hold.why, hold.grant) for holds in ended.values() for hold in holds} == {
                     ("lease", grants[0]),

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.hang import HANG
 from tests.live.bench import ECHO, Bench, Stand, answer, until
-from tests.live.lab import START, Lab
+from tests.live.lab import Lab
 from zscout.drivers import resource_controller
 from zscout.keyexpr import Role, Token
 from zscout.mesh import IncomingQuery
@@ -44,7 +45,7 @@ def said(seq: int, prev: int) -> Grants:
 
 
 def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", START)
+    monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", HANG)
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:

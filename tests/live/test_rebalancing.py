@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.live.placing import Placing
 from zscout.messages import ListPlacements, Placement, Placements
 
@@ -36,7 +37,7 @@ async def _spreads(tmp_path: Path) -> None:
         lab.node("h2", extra='load = "tree"')
         await placing.hosts(2)
         hosts: set[str | None] = set()
-        async with asyncio.timeout(3 * START):
+        async with asyncio.timeout(3 * HANG):
             while hosts != {"h1", "h2"}:
                 hosts = {one.host for one in await running(placing)}
                 await asyncio.sleep(0.1)

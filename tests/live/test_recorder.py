@@ -19,7 +19,8 @@ import msgspec
 import psutil
 import pytest
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.services.recorder.paper_run import (
     colours,
     events,
@@ -60,7 +61,7 @@ async def recording(lab: Lab) -> None:
     there = asyncio.Event()
     mesh = lab.clients[0].mesh
     watch = mesh.watch(mesh.keys.alive_any(Role.RECORDER), lambda _token, _alive: there.set())
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         await there.wait()
     watch.close()
 
@@ -76,14 +77,14 @@ async def reported(lab: Lab, *hosts: str) -> None:
 
     mesh = lab.clients[0].mesh
     subscription = mesh.subscribe(mesh.keys.load_any, LoadReport, heard)
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         await done.wait()
     subscription.close()
 
 
 async def until(ask: Callable[[], bool]) -> None:
     """Waits for what no event tells of."""
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while True:
             if ask():
                 return
@@ -93,7 +94,7 @@ async def until(ask: Callable[[], bool]) -> None:
 async def ended(lab: Lab, host: str) -> None:
     """Ends a node in order; its recorder's file is finished then."""
     lab.nodes[host].terminate()
-    assert await asyncio.to_thread(lab.nodes[host].wait, START) == 0
+    assert await asyncio.to_thread(lab.nodes[host].wait, HANG) == 0
 
 
 def the_file(folder: Path) -> Path:
@@ -253,7 +254,7 @@ def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path: Path
 
             subscription = client.mesh.subscribe(client.mesh.keys.rc_state("robot/b"), RcState, heard)
             lab.nodes["a"].kill()
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 await over.wait()
             subscription.close()
             # The recorder heard it when this client did, or so: a later word from the same host tells.
@@ -281,7 +282,7 @@ def test_a_recorder_that_dies_is_started_again(tmp_path: Path) -> None:
 
             watch = client.mesh.watch(client.mesh.keys.alive_any(Role.RECORDER), seen)
             child.kill()
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 await again.wait()
             watch.close()
             assert len(list((tmp_path / "runs").iterdir())) == 2
@@ -329,7 +330,7 @@ def test_the_program_says_where_it_records_and_ends_in_order(
                 process.stdin.close()
             else:
                 process.send_signal(number)
-            assert await asyncio.to_thread(process.wait, START) == 0
+            assert await asyncio.to_thread(process.wait, HANG) == 0
             assert Path(told.file) == the_file(tmp_path / "new" / "runs")
 
     asyncio.run(story())
@@ -355,7 +356,7 @@ def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
                 }
                 for line, job in jobs.items():
                     process = run_recorder(lab, job)
-                    _, error = await asyncio.to_thread(process.communicate, None, START)
+                    _, error = await asyncio.to_thread(process.communicate, None, HANG)
                     assert process.returncode == 2
                     assert line in error.decode()
                     assert len(error.decode().strip().splitlines()) == 1

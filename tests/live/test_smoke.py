@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.behaviors.client.arc import Revoked, hold
 from zscout.messages import LoadReport
 
@@ -95,7 +96,7 @@ def test_a_node_tells_its_load_once_a_second_with_its_labels(tmp_path: Path) -> 
 
             client.mesh.subscribe(keys.load_any, LoadReport, on_load)
             lab.node("a", extra='labels = ["gpu", "lab-3"]')
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 told = [await heard.get() for _ in range(4)]
             reports = [report for _, report in told]
             first = reports[0].number

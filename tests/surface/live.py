@@ -24,6 +24,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
+from tests.hang import HANG
 from tests.surface.commands import plain, printed, scripts
 from tests.surface.compare import SEPARATOR, Difference
 from tests.surface.record import text as as_text
@@ -31,8 +32,6 @@ from tests.surface.tree import PROJECT
 
 RECORDED: Final = Path(__file__).with_name("live.json")
 RUNS: Final = 10
-PATIENCE: Final = 40.0
-"""Seconds within which anything that is waited for must have come true, on a busy machine."""
 SECTION: Final = "live"
 PEOPLE: Final = ", for people"
 
@@ -137,14 +136,14 @@ class Story:
         line = ("--fleet", str(self.folder / "fleet.toml"), command, "--name", name, *words)
         process = self.start("zscout", *line, out=subprocess.PIPE)
         # Nothing that it waits for takes so long: its end is seen where its lines are read.
-        limit = threading.Timer(2 * PATIENCE, process.kill)
+        limit = threading.Timer(2 * HANG, process.kill)
         limit.start()
         self._stack.callback(limit.cancel)
         return Program(name, process)
 
     def _say(self, *words: str, until: Callable[[str], bool] = _anything) -> tuple[int, str]:
         """Runs a command here until what it prints is so; returns its exit code and that."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + HANG
         while True:
             told = printed(
                 "zscout", scripts()["zscout"], ["--fleet", str(self.folder / "fleet.toml"), *words]
@@ -202,7 +201,7 @@ class Program:
     def end(self, story: Story) -> None:
         """Reads what comes until it ends."""
         self._lines += map(json.loads, self._out)
-        story.note(self._name, self._lines, self._process.wait(PATIENCE))
+        story.note(self._name, self._lines, self._process.wait(HANG))
 
 
 def _end(process: subprocess.Popen[str]) -> None:

@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 import msgspec
 import psutil
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.messages import (
     ComponentList,
@@ -71,9 +72,9 @@ class Hosts:
     async def ask(self, host: str, operation: msgspec.Struct, kind: type[R]) -> R | Problem:
         """The answer of a host, which must come."""
         key = self.client.mesh.keys.component(host)
-        async with asyncio.timeout(2 * START):
+        async with asyncio.timeout(2 * HANG):
             while True:
-                reply = await self.client.mesh.ask_one(key, operation, kind, timeout=START)
+                reply = await self.client.mesh.ask_one(key, operation, kind, timeout=HANG)
                 if reply is not None:
                     answer = reply.message or reply.problem
                     assert answer is not None
@@ -114,7 +115,7 @@ class Hosts:
 
     async def ended(self, host: str, component: str) -> ComponentView:
         """A component as it is once it has ended."""
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             while True:
                 listed = await self.get(host, ListComponents(component), ComponentList)
                 if listed.components and listed.components[0].phase == "ended":
@@ -125,7 +126,7 @@ class Hosts:
         """What a component wrote and is kept, as soon as `until` holds of it."""
         text = ""
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 while True:
                     text = (await self.get(host, ReadOutput(component), Output)).text
                     if until(text):
@@ -144,7 +145,7 @@ async def counts(hosts: Hosts, host: str) -> list[int]:
 async def counts_on(hosts: Hosts, host: str) -> None:
     """Waits until it goes on counting there."""
     last = max(await counts(hosts, host), default=0)
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while max(await counts(hosts, host), default=0) <= last + 2:  # noqa: ASYNC110 - asked each time
             await asyncio.sleep(0.02)
 
@@ -152,7 +153,7 @@ async def counts_on(hosts: Hosts, host: str) -> None:
 async def gone(*pids: int) -> None:
     """Waits until these processes are no more."""
     try:
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             for pid in pids:
                 while lives(pid):  # noqa: ASYNC110 - they are no children of ours
                     await asyncio.sleep(0.02)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
+from tests.hang import HANG
 from zscout.behaviors.components.component import SafePointGate
-
-PATIENCE = 5.0
 
 
 def test_who_is_not_wanted_goes_on_and_gives_the_loop_a_turn() -> None:
@@ -33,13 +32,13 @@ def test_who_comes_is_held_until_released() -> None:
 
         running = asyncio.create_task(run())
         for _ in range(3):
-            assert await gate.hold(PATIENCE)
+            assert await gate.hold(HANG)
             held = steps
             for _ in range(10):
                 await asyncio.sleep(0)
             assert steps == held
             gate.release()
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(HANG):
                 while steps == held:  # noqa: ASYNC110 - the loop has its turns, nothing else
                     await asyncio.sleep(0)
         running.cancel()
@@ -51,7 +50,7 @@ def test_who_does_not_come_is_not_held_later() -> None:
     async def story() -> None:
         gate = SafePointGate()
         assert not await gate.hold(0.01)
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(HANG):
             await gate.come()
 
     asyncio.run(story())
@@ -61,7 +60,7 @@ def test_who_is_cancelled_at_the_gate_is_not_held_any_more() -> None:
     async def story() -> None:
         gate = SafePointGate()
         comes = asyncio.create_task(gate.come())
-        held = [await gate.hold(PATIENCE), gate.holds]
+        held = [await gate.hold(HANG), gate.holds]
         comes.cancel()
         await asyncio.gather(comes, return_exceptions=True)
         held += [gate.holds, await gate.hold(0.01)]

@@ -15,8 +15,8 @@ import pytest
 
 from tests.behaviors.components.kit import ROOT
 from tests.cli.cli_fleet import CliFleet
-from tests.cli.tools import PATIENCE, end, out_of, read_until
-from tests.live.lab import START
+from tests.cli.tools import end, out_of, read_until
+from tests.hang import HANG
 
 pytestmark = pytest.mark.live
 OTHER = {"anvil": "bellows", "bellows": "anvil"}
@@ -67,7 +67,7 @@ def stop(fleet: CliFleet, *names: str) -> None:
 def follow(fleet: CliFleet, name: str, *args: str) -> subprocess.Popen[str]:
     """`logs --follow`, which does not outlast what these tests wait for: a reader of it is not for ever."""
     process = fleet.start("logs", name, "--follow", *args)
-    limit = threading.Timer(4 * PATIENCE, process.kill)
+    limit = threading.Timer(4 * HANG, process.kill)
     limit.daemon = True
     limit.start()
     return process
@@ -93,11 +93,11 @@ def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFlee
     lines = read_until(follower, f"-- wanderer goes on on {there}")
     back = told(fleet.zscout("migrate", "wanderer", "--json"))
     assert (back["from"], back["host"], back["moves"]) == (there, here, 2)
-    assert 0 < back["dead"] < START
+    assert 0 < back["dead"] < HANG
     lines += read_until(follower, f"-- wanderer goes on on {here}")
 
     stop(fleet, "wanderer")
-    assert follower.wait(START) == 0
+    assert follower.wait(HANG) == 0
     lines += out_of(follower).read().splitlines()
     assert lines[-1].startswith("-- wanderer has ended")
     counts = [int(line) for line in lines if line.isdigit()]
@@ -173,7 +173,7 @@ def test_logs_of_what_runs_and_of_what_has_ended(fleet: CliFleet) -> None:
     follower = follow(fleet, "speaker", "--lines", "0")
     read_until(follower, "50")
     stop(fleet, "speaker")
-    assert follower.wait(START) == 0
+    assert follower.wait(HANG) == 0
     every = fleet.zscout("logs", "speaker")
     assert every.returncode == 0, every.stderr
     counts = [int(line) for line in every.stdout.splitlines()]
@@ -201,11 +201,11 @@ def test_followed_output_begins_when_the_component_does(fleet: CliFleet) -> None
     try:
         read_until(follower, "1")
         stop(fleet, "later")
-        assert follower.wait(START) == 0
+        assert follower.wait(HANG) == 0
     finally:
         end(follower)
         clamp.terminate()
-        clamp.wait(START)
+        clamp.wait(HANG)
 
 
 def test_followed_output_goes_over_when_a_host_dies(fleet: CliFleet) -> None:
@@ -225,4 +225,4 @@ def test_followed_output_goes_over_when_a_host_dies(fleet: CliFleet) -> None:
     # What it still wrote there, if that was read before its host died.
     assert all(int(line) > 20 for line in lines[:-1])
     stop(fleet, "survivor")
-    assert follower.wait(START) == 0
+    assert follower.wait(HANG) == 0

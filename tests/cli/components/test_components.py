@@ -13,7 +13,7 @@ import pytest
 from tests.behaviors.components.kit import ROOT, register_odd_kinds
 from tests.cli.cli_fleet import CliFleet
 from tests.cli.tools import read_until, zscout
-from tests.live.lab import START
+from tests.hang import HANG
 
 pytestmark = pytest.mark.live
 
@@ -54,7 +54,7 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
     )
     assert one["spec"]["kind"] == "counter"
     assert one["spec"]["params"] == {"period": 0.1, "rc": "robot/a"}
-    assert 0 < one["uptime"] < START
+    assert 0 < one["uptime"] < HANG
     assert one["memory"] > 1_000_000
 
     plain = fleet.zscout("components")
@@ -152,7 +152,7 @@ def test_waiting_for_a_host_says_why_and_stays_placed(fleet: CliFleet) -> None:
     read_until(waiting, "picky waits for a host")
     waiting.send_signal(signal.SIGINT)
     read_until(waiting, "picky stays placed; to end it: zscout stop picky")
-    assert waiting.wait(START) == 130
+    assert waiting.wait(HANG) == 130
     assert listed(fleet, "picky")[0]["state"] == "waiting"
     assert fleet.zscout("stop", "picky").returncode == 0
 

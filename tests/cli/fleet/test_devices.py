@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.cli.fleet.test_status import section
-from tests.cli.tools import COMMAND, PATIENCE, zscout_soon
+from tests.cli.tools import COMMAND, zscout_soon
+from tests.hang import HANG
 from tests.live.bench import Bench, Stand, until
 from tests.live.lab import Lab
 from zscout.cli.fleet.devices import figures_text
@@ -47,7 +48,7 @@ def test_health_and_figures_of_devices(tmp_path: Path) -> None:
                 assert stdout is not None
 
                 async def line_with(words: str) -> None:
-                    async with asyncio.timeout(PATIENCE):
+                    async with asyncio.timeout(HANG):
                         while True:
                             line = (await stdout.readline()).decode()
                             assert line

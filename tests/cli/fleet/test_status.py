@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.cli.tools import COMMAND, PATIENCE, Terminal, zscout_soon
+from tests.cli.tools import COMMAND, Terminal, zscout_soon
+from tests.hang import HANG
 from tests.live.lab import Lab
 
 pytestmark = pytest.mark.live
@@ -133,7 +134,7 @@ def test_watching_in_a_pipe_prints_a_block_when_something_happens(tmp_path: Path
 
             async def block_with(*words: str) -> str:
                 text = ""
-                async with asyncio.timeout(PATIENCE):
+                async with asyncio.timeout(HANG):
                     while True:
                         line = (await stdout.readline()).decode()
                         assert line
@@ -173,7 +174,7 @@ def test_watching_as_json_prints_a_line_each_time(tmp_path: Path) -> None:
             assert stdout is not None
 
             async def holders() -> Any:
-                async with asyncio.timeout(PATIENCE):
+                async with asyncio.timeout(HANG):
                     return json.loads(await stdout.readline())["rcs"][0]["holders"]
 
             assert await holders() == []
@@ -225,7 +226,7 @@ def test_without_an_rcm_it_shows_what_is_there_and_says_so(tmp_path: Path) -> No
             client = await lab.client("program")
             there = asyncio.Event()
             client.mesh.watch(client.mesh.keys.alive_any("load"), lambda _token, _alive: there.set())
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(HANG):
                 await there.wait()
             shown = await zscout_soon("status", env=lab.env)
             assert shown.returncode == 3

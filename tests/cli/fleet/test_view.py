@@ -21,7 +21,8 @@ from urllib.parse import parse_qs, urlsplit
 import psutil
 import pytest
 
-from tests.cli.tools import COMMAND, PATIENCE, zscout_here
+from tests.cli.tools import COMMAND, zscout_here
+from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.services.recorder.paper_run import (
     RCS,
@@ -57,11 +58,11 @@ def viewing(
     finally:
         if process.poll() is None:
             process.terminate()
-            process.wait(PATIENCE)
+            process.wait(HANG)
 
 
 def until(true: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + HANG
     while not true():
         assert time.monotonic() < deadline, what
         time.sleep(0.05)
@@ -95,7 +96,7 @@ def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Pa
     with viewing(tmp_path, recording, "--web") as process:
         url, stream = page(tmp_path, process)
         assert urlsplit(url).hostname == "127.0.0.1"
-        with urllib.request.urlopen(url, timeout=PATIENCE) as answer:  # noqa: S310 - our own page
+        with urllib.request.urlopen(url, timeout=HANG) as answer:  # noqa: S310 - our own page
             assert b"Rerun" in answer.read()
         # Another viewer gets the whole recording from where the page would.
         got = tmp_path / "got.rrd"
@@ -108,7 +109,7 @@ def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Pa
         children = descendants(process)
         assert [child.name() for child in children] == ["rerun"]
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 130
+        assert process.wait(HANG) == 130
         assert not any(child.is_running() for child in children)
         assert not listens(url)
         assert not listens(stream)
@@ -129,10 +130,10 @@ def test_as_json_it_says_once_where_all_is(recording: Path, tmp_path: Path) -> N
     with viewing(tmp_path, recording, "--web", "--json") as process:
         said = said_as_json(tmp_path, process)
         assert (said["file"], said["live"]) == (str(recording), None)
-        with urllib.request.urlopen(said["url"], timeout=PATIENCE) as answer:  # noqa: S310 - our own page
+        with urllib.request.urlopen(said["url"], timeout=HANG) as answer:  # noqa: S310 - our own page
             assert b"Rerun" in answer.read()
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 130
+        assert process.wait(HANG) == 130
     assert (tmp_path / "view.log").read_text().count("\n") == 1
 
 
@@ -165,7 +166,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
             with viewing(tmp_path, "--web", "--out", tmp_path / "out", env=lab.env) as process:
                 url, stream = await asyncio.to_thread(page, tmp_path, process)
                 assert listens(stream)
-                async with asyncio.timeout(PATIENCE):
+                async with asyncio.timeout(HANG):
                     await recorded.wait()
                 arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
                 await lab.state(client, lambda state: len(state.holds) == 1)
@@ -173,7 +174,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
                 children = descendants(process)
                 assert len(children) == 2
                 process.send_signal(signal.SIGINT)
-                assert await asyncio.to_thread(process.wait, PATIENCE) == 130
+                assert await asyncio.to_thread(process.wait, HANG) == 130
                 assert not any(child.is_running() for child in children)
                 assert not listens(url)
             (file,) = (tmp_path / "out").glob("*.rrd")
@@ -192,7 +193,7 @@ def test_a_live_view_as_json(tmp_path: Path) -> None:
         assert listens(said["url"])
         assert listens(said["live"])
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 130
+        assert process.wait(HANG) == 130
     assert [Path(said["file"])] == list((tmp_path / "out").glob("*.rrd"))
 
 
@@ -211,7 +212,7 @@ def test_without_a_display_it_names_web(
 def test_a_display_that_does_not_answer_is_one_line(recording: Path, tmp_path: Path) -> None:
     env = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
     with viewing(tmp_path, recording, env=env | {"DISPLAY": "127.0.0.1:4711"}) as process:
-        assert process.wait(PATIENCE) == 1
+        assert process.wait(HANG) == 1
     text = (tmp_path / "view.log").read_text()
     assert text.startswith("zscout: the viewer ended (code 1): ")
     assert len(text.splitlines()) == 1
@@ -243,7 +244,7 @@ def test_a_live_stream_on_a_taken_port_is_one_line_and_code_2(tmp_path: Path) ->
         port = taken.getsockname()[1]
         env = os.environ | {"DISPLAY": ":0", "ZSCOUT_FLEET": ""}
         with viewing(tmp_path, "--port", port, "--out", tmp_path / "out", env=env) as process:
-            assert process.wait(PATIENCE) == 2
+            assert process.wait(HANG) == 2
     text = (tmp_path / "view.log").read_text()
     assert len(text.splitlines()) == 1
     assert f"port {port}" in text

@@ -15,8 +15,9 @@ from urllib.request import urlopen
 
 import pytest
 
-from tests.cli.tools import COMMAND, PATIENCE, Terminal, zscout_here
-from tests.live.lab import START, Lab
+from tests.cli.tools import COMMAND, Terminal, zscout_here
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.config.devices import FramegrabberRc, RadioRc, RobotRc, VideoRc
 from zscout.config.node import load_node
 from zscout.lab.building.plan_file import plan_named
@@ -89,7 +90,7 @@ def test_it_serves_what_it_tells_and_leaves_nothing_behind(closet: Path, tmp_pat
         assert [robot["id"] for robot in told["robots"]] == [33, 35]
         assert str(link.readlink()).startswith("/dev/pts/")
         for channel in told["channels"]:
-            with urlopen(channel["url"] + ".jpg", timeout=PATIENCE) as answer:  # noqa: S310
+            with urlopen(channel["url"] + ".jpg", timeout=HANG) as answer:  # noqa: S310
                 assert answer.read(2) == b"\xff\xd8"
 
         devices = {rc.name: rc for rc in load_node(file).rcs}
@@ -107,7 +108,7 @@ def test_it_serves_what_it_tells_and_leaves_nothing_behind(closet: Path, tmp_pat
         assert len(devices) == 1 + 2 + 2 + 3
 
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 130
+        assert process.wait(HANG) == 130
     assert not link.is_symlink()
 
 
@@ -140,7 +141,7 @@ def test_the_mesh_hears_who_is_where(closet: Path, tmp_path: Path) -> None:
                 keys.building_poses_any, BuildingPoses, lambda key, told: news.put_nowait((key, told))
             )
             lab.spawn([*COMMAND, "simulate", str(closet), "--mesh", "--speed", "3"], log="building.log")
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(HANG):
                 key, first = await news.get()
                 _, second = await news.get()
             assert {robot.name for robot in first.robots} == {"scout33", "scout35"}
@@ -150,7 +151,7 @@ def test_the_mesh_hears_who_is_where(closet: Path, tmp_path: Path) -> None:
                 keys.building_plan(keys.sender_of(key)),
                 PlanAsk(),
                 BuildingPlan,
-                timeout=START,
+                timeout=HANG,
                 enough=lambda _: True,
                 limit=MAX_PLAN,
             )

@@ -19,7 +19,8 @@ import psutil
 import pytest
 from rerun.chunk import RrdReader
 
-from tests.cli.tools import COMMAND, PATIENCE, Terminal, zscout, zscout_here
+from tests.cli.tools import COMMAND, Terminal, zscout, zscout_here
+from tests.hang import HANG
 from tests.thorough import times
 from zscout.cli.common import Failed
 from zscout.cli.lab.study_options import MAX_SEED, parse_seeds
@@ -94,7 +95,7 @@ def test_ctrl_c_at_a_terminal_says_nothing(left: str) -> None:
 
 def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
     """Its two processes and the one that tracks their semaphores, once they are there."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + HANG
     while time.monotonic() < deadline:
         found = psutil.Process(process.pid).children(recursive=True)
         # A process that has worked has started for good.
@@ -120,15 +121,15 @@ def test_a_signal_ends_all_of_it_without_a_word(number: signal.Signals) -> None:
     with study() as process:
         children = workers(process)
         process.send_signal(number)
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=HANG)
         assert (process.returncode, out, err) == (128 + number, "", "")
-        _, alive = psutil.wait_procs(children, timeout=PATIENCE)
+        _, alive = psutil.wait_procs(children, timeout=HANG)
         assert alive == []
 
 
 def session_is_empty(session: int) -> bool:
     """True as soon as no process of a session runs (a zombie does not), False if that takes too long."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + HANG
     while time.monotonic() < deadline:
         running = []
         for process in psutil.process_iter():
@@ -153,7 +154,7 @@ def test_interrupted_at_any_time_it_ends_and_leaves_nothing(seed: int) -> None:
         time.sleep(chance.uniform(0, 2))
         # As from a terminal: all its processes get it.
         os.killpg(process.pid, number)
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=HANG)
         assert (process.returncode, out, err) == (128 + number, "", "")
         assert session_is_empty(process.pid)
 
@@ -162,7 +163,7 @@ def test_killed_it_leaves_nothing_either() -> None:
     with study() as process:
         children = workers(process)
         process.kill()
-        _, alive = psutil.wait_procs(children, timeout=PATIENCE)
+        _, alive = psutil.wait_procs(children, timeout=HANG)
         assert alive == []
 
 
@@ -170,7 +171,7 @@ def test_a_process_that_dies_is_one_line() -> None:
     with study() as process:
         children = workers(process)
         max(children, key=lambda child: child.cpu_times().user).kill()
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=HANG)
         assert (process.returncode, out) == (Failed.exit_code, "")
         assert (
             err
@@ -181,7 +182,7 @@ def test_a_process_that_dies_is_one_line() -> None:
 def test_processes_that_can_not_start_are_one_line() -> None:
     few = ("sh", "-c", 'ulimit -n 40; exec "$@"', "sh")
     done = subprocess.run(
-        [*few, *COMMAND, *LONG, "--jobs", "200"], capture_output=True, text=True, timeout=PATIENCE
+        [*few, *COMMAND, *LONG, "--jobs", "200"], capture_output=True, text=True, timeout=HANG
     )
     assert (done.returncode, done.stdout) == (Failed.exit_code, "")
     line = "zscout: a process can't be started (Too many open files); use fewer with --jobs 1\n"

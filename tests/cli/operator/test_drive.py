@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import pytest
 
+from tests.hang import HANG
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.piloting import Pilot
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
@@ -36,7 +37,6 @@ from zscout.mesh import clock
 from zscout.types import SECOND
 
 ZSCOUT = str(Path(sys.executable).with_name("zscout"))
-PATIENCE = 20.0
 
 
 def teleop_of(**how: Any) -> Teleop:
@@ -46,7 +46,7 @@ def teleop_of(**how: Any) -> Teleop:
 
 
 async def comes_true(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(HANG):
         while not condition():  # noqa: ASYNC110 - it comes from a descriptor
             await asyncio.sleep(0.005)
 
@@ -119,7 +119,7 @@ def test_a_terminal_gives_its_keys_one_by_one_and_is_as_before(monkeypatch: pyte
         # The terminal goes: that is told, and there is nothing to be set back.
         with typed_keys(pressed.append, ended.set):
             os.close(master)
-            await asyncio.wait_for(ended.wait(), PATIENCE)
+            await asyncio.wait_for(ended.wait(), HANG)
         terminal.close()
 
     asyncio.run(story())

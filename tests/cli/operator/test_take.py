@@ -10,7 +10,7 @@ import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import COMMAND, Terminal, end, events, out_of, read_until
-from tests.live.lab import START
+from tests.hang import HANG
 
 pytestmark = pytest.mark.live
 
@@ -33,7 +33,7 @@ def test_a_yes_at_the_terminal_takes_and_ctrl_c_gives_back(fleet: CliFleet) -> N
         assert [(hold.arc, hold.priority, hold.keep) for hold in state.holds] == [("operator", 10, True)]
         terminal.press("\x03")
         assert terminal.code() == 130
-    assert survey.wait(START) == 1
+    assert survey.wait(HANG) == 1
     assert "survey lost its grant: preempted by operator, priority 10" in out_of(survey).read()
     assert fleet.idle("robot/a")
 
@@ -61,7 +61,7 @@ def test_without_a_terminal_it_needs_yes(fleet: CliFleet) -> None:
     preview, granted, ended = events(taken.stdout)
     assert [(hold["arc"], hold["priority"]) for hold in preview["preempts"]] == [("survey", 0)]
     assert (granted["event"], granted["keep"], ended["outcome"]) == ("granted", False, "completed")
-    assert survey.wait(START) == 1
+    assert survey.wait(HANG) == 1
 
 
 def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(
@@ -82,7 +82,7 @@ def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(
         terminal.press("\x03")
         assert terminal.code() == 130
     assert [event["event"] for event in events(out.read_text())] == ["preview", "granted", "ended"]
-    assert survey.wait(START) == 1
+    assert survey.wait(HANG) == 1
 
 
 def test_what_is_free_is_taken_without_a_question(fleet: CliFleet) -> None:
@@ -114,4 +114,4 @@ def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
     assert any("operator waits for peer (priority 10, " in line for line in lines)
     end(peer)
     read_until(taker, "operator holds robot/b")
-    assert taker.wait(START) == 0
+    assert taker.wait(HANG) == 0

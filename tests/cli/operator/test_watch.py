@@ -16,8 +16,9 @@ from click.testing import CliRunner
 from rerun.chunk import RrdReader
 
 from tests.behaviors.perception.scenes import Scene, box_of, overlap
-from tests.cli.tools import COMMAND, PATIENCE, Terminal, end, zscout_here
+from tests.cli.tools import COMMAND, Terminal, end, zscout_here
 from tests.drivers.mjpeg import MjpegServer, jpeg
+from tests.hang import HANG
 from zscout.cli.operator.watch import watch as command
 
 RATE = 10.0
@@ -152,7 +153,7 @@ def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary
     try:
         events = [json.loads(process.stdout.readline()) for _ in range(2)]
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=PATIENCE)
+        _, told = process.communicate(timeout=HANG)
     finally:
         process.kill()
         process.wait()
@@ -173,7 +174,7 @@ def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -
             assert process.poll() is None
             threading.Event().wait(0.02)
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 130
+        assert process.wait(HANG) == 130
     finally:
         end(process)
 

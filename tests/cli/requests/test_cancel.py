@@ -9,7 +9,7 @@ import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, out_of, read_until
-from tests.live.lab import START
+from tests.hang import HANG
 
 pytestmark = pytest.mark.live
 
@@ -29,7 +29,7 @@ def test_release_ends_a_hold_and_its_command(fleet: CliFleet) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("survey (")
     assert done.stdout.endswith("was running: released\n")
-    assert running.wait(START) == 75
+    assert running.wait(HANG) == 75
     assert "survey lost its grant: released by " in out_of(running).read()
     assert fleet.idle("robot/a")
 
@@ -47,7 +47,7 @@ def test_cancel_ends_a_wait_by_id(fleet: CliFleet) -> None:
     (arc,) = json.loads(done.stdout)["arcs"]
     assert (arc["arc"], arc["id"], arc["client"]) == ("survey", view.id, view.client)
     assert (arc["was"], arc["state"], arc["outcome"]) == ("queued", "ended", "cancelled")
-    assert waiting.wait(START) == 1
+    assert waiting.wait(HANG) == 1
     assert "survey was not granted: cancelled by " in out_of(waiting).read()
     end(blocker)
 
@@ -67,7 +67,7 @@ def test_a_name_of_several_is_refused_with_the_list(fleet: CliFleet) -> None:
     again = fleet.holder("twin", min(holds[0].needs))
     assert fleet.zscout("cancel", "twin", "--all").stdout.count("was running: cancelled") == 2
     assert fleet.idle("robot/a", "robot/b")
-    assert [twin.wait(START) for twin in (*twins, again)] == [1, 1, 1]
+    assert [twin.wait(HANG) for twin in (*twins, again)] == [1, 1, 1]
 
 
 def test_an_unknown_arc_is_one_line(fleet: CliFleet) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, events, out_of, read_until, zscout_here
-from tests.live.lab import START
+from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
 from zscout.cli.requests.contention import contention_of
 from zscout.cli.requests.options import HoldOptions
@@ -77,7 +77,7 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     granted, ended = events(out_of(waiting).read())
     assert (granted["event"], granted["rcs"], granted["bound"]) == ("granted", [F2], {ANY: F2})
     assert (ended["event"], ended["outcome"]) == ("ended", "completed")
-    assert waiting.wait(START) == 0
+    assert waiting.wait(HANG) == 0
     end(first)
     assert fleet.idle(F1, F2, ANY)
 
@@ -162,7 +162,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     assert (preview["preempts"], preview["waits_for"], preview["absent"]) == ([], [], [])
     assert [hold["arc"] for hold in preview["may_preempt"]] == ["low", "high"]
     assert granted["bound"] == {ANY: F1}
-    assert low.wait(START) == 1
+    assert low.wait(HANG) == 1
     assert high.poll() is None
     # Now one of them is free: nobody has to be asked.
     fleet.state(lambda state: len(state.holds) == 1)

@@ -14,7 +14,7 @@ import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, events, gone, out_of, read_until
-from tests.live.lab import START
+from tests.hang import HANG
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
 from zscout.cli.requests.waiting import REFRESH, Report
 from zscout.mesh import clock
@@ -72,7 +72,7 @@ def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> 
     assert line.endswith(" left")
     end(blocker)
     read_until(waiting, "next holds robot/a")
-    assert waiting.wait(START) == 0
+    assert waiting.wait(HANG) == 0
 
 
 def test_a_start_that_nobody_can_foretell_is_said_to_be_so(fleet: CliFleet) -> None:
@@ -126,7 +126,7 @@ def test_a_command_is_ended_when_its_grant_is_taken(fleet: CliFleet) -> None:
     taker = fleet.zscout("request", "robot/a", "--priority", "5", "--name", "boss", "--", "true")
     assert taker.returncode == 0
     lines = out_of(victim).read()
-    assert victim.wait(START) == 75
+    assert victim.wait(HANG) == 75
     assert "told" in lines
     assert "victim lost its grant: preempted by boss, priority 5" in lines
     assert fleet.idle("robot/a")
@@ -144,7 +144,7 @@ def test_what_ignores_sigterm_is_killed_after_the_grace_with_its_children(fleet:
     victim = fleet.start("request", "robot/a", *options, "--", "sh", "-c", STUBBORN)
     pids = [int(pid) for pid in read_until(victim, "pid")[-1].split()[1:]]
     assert fleet.zscout("release", "victim").returncode == 0
-    assert victim.wait(START) == 75
+    assert victim.wait(HANG) == 75
     assert len(pids) == 2
     assert all(gone(pid) for pid in pids)
 
@@ -157,13 +157,13 @@ def test_again_runs_the_command_again_after_a_preemption(fleet: CliFleet, tmp_pa
     lines = read_until(victim, "run")
     assert any("waiting again" in line for line in lines)
     assert lines[-1] != first
-    assert victim.wait(START) == 4
+    assert victim.wait(HANG) == 4
 
 
 def test_what_a_command_leaves_running_is_ended(fleet: CliFleet) -> None:
     left = fleet.start("request", "robot/a", "--", "sh", "-c", "sleep 1000 & echo pid $!")
     pid = int(read_until(left, "pid")[-1].split()[1])
-    assert left.wait(START) == 0
+    assert left.wait(HANG) == 0
     assert gone(pid)
 
 
@@ -174,7 +174,7 @@ def test_a_signal_while_it_waits_leaves_nothing(fleet: CliFleet, number: signal.
     read_until(waiting, "waiting waits")
     waiting.send_signal(number)
     assert "Traceback" not in out_of(waiting).read()
-    assert waiting.wait(START) == 128 + number
+    assert waiting.wait(HANG) == 128 + number
     fleet.state(lambda state: not state.queue)
     end(blocker)
 
@@ -183,7 +183,7 @@ def test_a_signal_ends_the_command_and_gives_back(fleet: CliFleet) -> None:
     running = fleet.start("request", "robot/a", "--", "sh", "-c", "echo pid $$; sleep 1000")
     pid = int(read_until(running, "pid")[-1].split()[1])
     running.send_signal(signal.SIGTERM)
-    assert running.wait(START) == 143
+    assert running.wait(HANG) == 143
     assert gone(pid)
     assert fleet.idle("robot/a")
 
@@ -196,7 +196,7 @@ def test_a_second_signal_does_not_wait_for_a_stubborn_command(fleet: CliFleet) -
     running.send_signal(signal.SIGINT)
     read_until(running, "no")
     running.send_signal(signal.SIGINT)
-    assert running.wait(START) == 130
+    assert running.wait(HANG) == 130
     assert all(gone(pid) for pid in pids)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import serial
 
+from tests.hang import HANG
 from zscout.config.strict import BadInput
 from zscout.drivers.packets import (
     DrivePacket,
@@ -24,8 +25,6 @@ from zscout.lab.building.radio_line import (
     RadioLine,
 )
 
-PATIENCE = 20.0
-"""Seconds within which anything that is waited for must have come true, on a busy machine."""
 DRIVE = DrivePacket(33, 0, 0.5, -0.5, 1.0)
 
 
@@ -44,14 +43,14 @@ class Ear:
 
 
 async def until(true: Callable[[], bool]) -> None:
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(HANG):
         while True:
             if true():
                 return
             await asyncio.sleep(0.005)
 
 
-def opened(port: str | Path | None, baud: int, *, write_timeout: float = PATIENCE) -> serial.Serial:
+def opened(port: str | Path | None, baud: int, *, write_timeout: float = HANG) -> serial.Serial:
     assert port is not None
     return serial.Serial(str(port), baud, timeout=1, exclusive=True, write_timeout=write_timeout)
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import serial
 
+from tests.hang import HANG
 from tests.lab.building.test_radio_line import until
 from zscout.config.strict import BadInput
 from zscout.drivers.packets import (
@@ -36,8 +37,6 @@ from zscout.lab.building.plan import (
 from zscout.lab.building.serve import Served
 from zscout.lab.building.view import building_plan
 
-PATIENCE = 20.0
-"""Seconds within which anything that is waited for must have come true, on a busy machine."""
 BAUD = 9600
 PLAN = Plan(
     name="closet",
@@ -52,7 +51,7 @@ PLAN = Plan(
 
 def play(script: Callable[[Served], Coroutine[Any, Any, None]], plan: Plan = PLAN, **how: Any) -> None:
     async def run() -> None:
-        async with asyncio.timeout(2 * PATIENCE), Served(plan, **{"speed": 8.0, **how}) as served:
+        async with asyncio.timeout(2 * HANG), Served(plan, **{"speed": 8.0, **how}) as served:
             await script(served)
 
     asyncio.run(run())
@@ -63,7 +62,7 @@ class Driver:
 
     def __init__(self, served: Served) -> None:
         assert served.radio.port is not None
-        self._port = serial.Serial(served.radio.port, BAUD, timeout=1, write_timeout=PATIENCE, exclusive=True)
+        self._port = serial.Serial(served.radio.port, BAUD, timeout=1, write_timeout=HANG, exclusive=True)
         self._numbers = itertools.cycle(range(256))
 
     def send(self, kind: Callable[..., Packet], robot: int, *arguments: float) -> None:
@@ -81,7 +80,7 @@ async def picture_of(served: Served, channel: int) -> Picture:
     url = served.video.url(served.channels[channel - 1]) + ".jpg"
 
     def read() -> bytes:
-        with urlopen(url, timeout=PATIENCE) as answer:  # noqa: S310 - our own address
+        with urlopen(url, timeout=HANG) as answer:  # noqa: S310 - our own address
             return bytes(answer.read())
 
     raw = np.frombuffer(await asyncio.to_thread(read), np.uint8)

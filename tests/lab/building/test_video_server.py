@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.hang import HANG
 from zscout.config.strict import BadInput
 from zscout.lab.building import video_server
 from zscout.lab.building.video_server import MAX_CLIENTS, MAX_REQUEST, VideoServer
 
-PATIENCE = 20.0
-"""Seconds within which anything that is waited for must have come true, on a busy machine."""
 TIMEOUTS = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 20_000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 20_000]
 Picture = NDArray[np.uint8]
 
@@ -29,7 +28,7 @@ def jpeg(grey: int) -> bytes:
 
 
 async def until(true: Callable[[], bool]) -> None:
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(HANG):
         while True:
             if true():
                 return
@@ -38,7 +37,7 @@ async def until(true: Callable[[], bool]) -> None:
 
 def play(script: Callable[[VideoServer], Coroutine[Any, Any, None]]) -> None:
     async def run() -> None:
-        async with asyncio.timeout(2 * PATIENCE), VideoServer(["ch1", "ch2"]) as server:
+        async with asyncio.timeout(2 * HANG), VideoServer(["ch1", "ch2"]) as server:
             await script(server)
 
     asyncio.run(run())
@@ -90,7 +89,7 @@ async def asked(server: VideoServer, request: bytes, *, ends: bool = False) -> b
             await writer.drain()
         if ends:
             writer.write_eof()
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(HANG):
             return await reader.read()
     finally:
         writer.close()
@@ -187,7 +186,7 @@ def test_who_does_not_read_holds_up_nobody_and_gets_the_newest_in_the_end() -> N
             assert len(pictures) == 20
             # The last one shown is the one it gets when it reads on, after what the kernel had taken.
             server.show("ch1", b"the newest")
-            slow.settimeout(PATIENCE)
+            slow.settimeout(HANG)
             got = b""
             while b"the newest" not in got:
                 more = await asyncio.to_thread(slow.recv, 65_536)
@@ -213,7 +212,7 @@ def test_who_reads_nothing_for_long_is_cut_off(monkeypatch: pytest.MonkeyPatch) 
             async with Showing(server, "ch1", lambda: bytes(500_000)):
                 await until(lambda: server.watched == () and server.clients == 0)
             # What was left of the frame is not kept for it.
-            deaf.settimeout(PATIENCE)
+            deaf.settimeout(HANG)
             got = 0
             while more := await asyncio.to_thread(deaf.recv, 65_536):
                 got += len(more)
@@ -299,4 +298,4 @@ def test_the_server_ends_with_clients_that_stay() -> None:
         assert server.clients == 0
         writer.close()
 
-    asyncio.run(asyncio.wait_for(run(), PATIENCE))
+    asyncio.run(asyncio.wait_for(run(), HANG))

@@ -11,7 +11,8 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from tests.behaviors.components.kit import ROOT
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.tree import BehaviorContext, BehaviorStatus
 from zscout.drivers.packets import DrivePacket, HaltPacket, Packet
@@ -170,7 +171,7 @@ class RobotLab(Lab):
         await self._stack.aclose()
 
 
-async def comes_true(condition: Callable[[], bool], what: str, *, within: float = 2 * START) -> None:
+async def comes_true(condition: Callable[[], bool], what: str, *, within: float = 2 * HANG) -> None:
     """Waits for it, however busy the machine is."""
     try:
         async with asyncio.timeout(within):

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.live.lab import START
+from tests.hang import HANG
 from tests.live.robots.driving import LASTS, LEFT, RIGHT, Turning
 from tests.live.robots.lab import RobotLab, comes_true
 from zscout.behaviors.client.client import Client
@@ -136,7 +136,7 @@ class Losses:
         mesh = self.client.mesh
         watch = mesh.subscribe(mesh.keys.rc_state(ROBOT), RcState, on_state)
         self.lab.signal("lead", signal.SIGKILL)
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             await self.lose("no RCM for the hold lease", free.wait)
         watch.close()
         await turning.end()

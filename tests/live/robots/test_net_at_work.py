@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.live.lab import START
+from tests.hang import HANG
 from tests.live.placing import Placing
 from tests.live.robots.lab import RobotLab, comes_true
 from zscout.behaviors.components.sensor_net import PlaceSensorNetComponent
@@ -49,7 +49,7 @@ FIRST = "place_sensor_net-scout33"
 
 async def ended(placing: Placing, host: str) -> None:
     """Waits until no component is left there."""
-    async with asyncio.timeout(START):
+    async with asyncio.timeout(HANG):
         while True:
             listed = await placing.get(ListComponents(), ComponentList, host)
             if all(view.phase == "ended" for view in listed.components):

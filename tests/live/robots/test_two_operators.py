@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.behaviors.piloting import Pilot
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
@@ -15,7 +16,6 @@ from zscout.behaviors.teleop import Teleop
 pytestmark = pytest.mark.live
 
 RCS = ("robot/scout33", "radio/rf0", "video/ch1", "framegrabber/fgrab1")
-PATIENCE = 20.0
 AFTER_A_SLOT = 2.5
 """Seconds: an operator's hold may be displaced by another's after one."""
 
@@ -36,7 +36,7 @@ class Operator:
         await asyncio.gather(self.running, return_exceptions=True)
 
     async def comes_to(self, state: str, why: str = "") -> None:
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(HANG):
             while self.teleop.state != state or why not in self.teleop.why:
                 self.told.clear()
                 await self.told.wait()

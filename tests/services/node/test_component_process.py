@@ -11,6 +11,7 @@ import msgspec
 import pytest
 
 from tests.behaviors.components.kit import ROOT, gone
+from tests.hang import HANG
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import new_instance
 from zscout.mesh import Refused, Supervisor
@@ -18,8 +19,6 @@ from zscout.messages import ComponentSpec, StartComponent
 from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.types import SECOND
-
-START = 20.0
 
 
 def play(
@@ -45,7 +44,7 @@ def play(
             "h", rules, ControlGroups(folder), start, f"tests.behaviors.components.odd:{kind}", ends.append
         )
         process.begin(Supervisor("test", failures.append))
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             await process.settled.wait()
             pid = process.pid
             await story(process)

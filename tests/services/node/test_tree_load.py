@@ -11,7 +11,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.services.node.test_load_reporter import (
     PARENT,
     Proc,
@@ -166,7 +167,7 @@ async def _each_its_own(folder: Path) -> None:
         file = folder / "busy.toml"
         file.write_text('[node]\nhost = "busy"\nfleet = "fleet.toml"\nload = "tree"\n')
         lab.spawn([sys.executable, "-c", BUSY_NODE, str(file)], log="busy.log")
-        async with asyncio.timeout(START):
+        async with asyncio.timeout(HANG):
             await settled.wait()
         busy, calm = heard["busy"], heard["calm"]
         assert busy.cpu * busy.cores > 25

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import rerun as rr
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.services.recorder.paper_run import (
     colours,
     events,
@@ -241,7 +242,7 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
                     follower.tracker.timeline = Watched(timeline, there)  # type: ignore[assignment]
                     heard = follower.subscribe()
                     reading = asyncio.create_task(follower.keep_reading())
-                    async with asyncio.timeout(START):
+                    async with asyncio.timeout(HANG):
                         await asked.wait()
                         await there.wait()
                         there.clear()

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import rerun as rr
 
-from tests.live.lab import START, Lab
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.live.test_recorder import recording, run_recorder
 from tests.services.recorder.paper_run import events, rows
 from tests.services.recorder.robot_run import (
@@ -90,7 +91,7 @@ def test_who_takes_no_pictures_does_not_look(tmp_path: Path) -> None:
                     # What blind has asked for so far is known to the speaker once a question of it is.
                     said = speaker.publisher(speaker.keys.behavior(speaker.me), BehaviorSaid)
                     blind.tracker.behavior = lambda *_: heard.set()  # type: ignore[method-assign]
-                    async with asyncio.timeout(START):
+                    async with asyncio.timeout(HANG):
                         while not heard.is_set():
                             said.put(BehaviorSaid("net", "search"))
                             await asyncio.sleep(0.02)
@@ -136,7 +137,7 @@ def test_a_recorder_sees_what_robots_do(tmp_path: Path) -> None:
             assert not frames.watched
             assert blind.stdin is not None
             blind.stdin.close()
-            assert await asyncio.to_thread(blind.wait, START) == 0
+            assert await asyncio.to_thread(blind.wait, HANG) == 0
             async with await ZenohMesh.open(
                 lab.fleet.name, Sender("here", "recorder"), lab.fleet.mesh
             ) as ears:
@@ -145,7 +146,7 @@ def test_a_recorder_sees_what_robots_do(tmp_path: Path) -> None:
                     running = asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop))
                     await recording(lab)
                     needs: dict[str, dict[str, float]] = {"robot/scout33": {}, CAMERA: {}}
-                    async with asyncio.timeout(START), hold(client, "hide", needs, keep=True) as held:
+                    async with asyncio.timeout(HANG), hold(client, "hide", needs, keep=True) as held:
                         await looked.wait()
                         number = 0
                         # Until a plan and a picture have been shown.
