@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from tests.cli import tools
+from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.cli.common import plain_table, span
 from zscout.cli.main import COMMANDS, main
@@ -34,7 +35,7 @@ def test_help_loads_nothing_heavy_and_lists_all() -> None:
         "try: main(['--help'])\n"
         f"finally: sys.stderr.write(' '.join(name for name in {HEAVY} if name in sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=30)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG)
     assert (done.returncode, done.stderr) == (0, "")
     assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
 
@@ -104,7 +105,7 @@ def test_a_closed_pipe_is_quiet() -> None:
         [*tools.COMMAND, "completion", "fish"], stdout=write, stderr=subprocess.PIPE, text=True
     )
     os.close(write)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=HANG)
     assert (process.returncode, errors) == (1, "")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any, cast
 
+from tests.hang import HANG
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.work_queue import EARLY_PER_HOST, CommandQuery, WorkQueue
 
@@ -15,7 +16,7 @@ def query(name: str) -> CommandQuery:
 
 def drained(queue: WorkQueue, count: int) -> list[Any]:
     async def take() -> list[Any]:
-        return [await asyncio.wait_for(queue.get(), 5) for _ in range(count)]
+        return [await asyncio.wait_for(queue.get(), HANG) for _ in range(count)]
 
     return asyncio.run(take())
 
@@ -56,6 +57,6 @@ def test_who_waits_is_woken() -> None:
         await asyncio.sleep(0)
         assert not waiting.done()
         queue.resume(lambda _command: True)
-        assert await asyncio.wait_for(waiting, 5) == query("early")
+        assert await asyncio.wait_for(waiting, HANG) == query("early")
 
     asyncio.run(story())

@@ -12,6 +12,7 @@ import pytest
 
 from tests.cli import tools
 from tests.cli.cli_fleet import CliFleet, fleet_of
+from tests.hang import HANG
 from zscout.config.fleet import load_fleet
 from zscout.config.node import load_node
 
@@ -31,7 +32,9 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
 )
 def test_a_program_holds_and_commands(fleet: CliFleet, program: str, words: list[str]) -> None:
     command = [sys.executable, str(EXAMPLES / program)]
-    done = subprocess.run(command, env=fleet.lab.env, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(
+        command, env=fleet.lab.env, capture_output=True, text=True, check=False, timeout=HANG
+    )
     assert done.returncode == 0, done.stderr
     for word in words:
         assert word in done.stdout

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.messages import Cancel, Grants, Notice
 
@@ -31,7 +32,7 @@ def test_what_is_asked_and_given_up_in_one_burst_is_gone(tmp_path: Path) -> None
             # Each waiting request, asked again and cancelled without waiting for the answer in between.
             pairs = [operation for arc in arcs for operation in (arc.ask(0), Cancel(id=arc.id))]
             answers = await asyncio.gather(
-                *(client.mesh.ask_one(key, operation, Notice, timeout=5) for operation in pairs)
+                *(client.mesh.ask_one(key, operation, Notice, timeout=HANG) for operation in pairs)
             )
             assert all(answer is not None and answer.message is not None for answer in answers)
             last = [answer.message.state for answer in answers[1::2] if answer and answer.message]
@@ -54,14 +55,14 @@ def test_those_who_subscribe_alike_hear_alike_until_each_leaves(tmp_path: Path) 
             one = client.mesh.subscribe(grants, Grants, lambda _, said: first.put_nowait(said.seq))
             two = client.mesh.subscribe(grants, Grants, lambda _, said: second.put_nowait(said.seq))
             await client.request("x", {"robot/a": {}}, min_runtime=60)
-            async with asyncio.timeout(5):
+            async with asyncio.timeout(HANG):
                 heard = await first.get()
                 while await second.get() != heard:
                     pass
             one.close()
             while not first.empty():
                 first.get_nowait()
-            async with asyncio.timeout(5):
+            async with asyncio.timeout(HANG):
                 await second.get()
                 await second.get()
             assert first.empty()

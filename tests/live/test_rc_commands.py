@@ -115,7 +115,7 @@ async def _malformed(lab: Lab, client: Client, grant: Grant) -> None:
             for payload in payloads:
                 got: list[zenoh.Reply] = []
                 while not got:
-                    got = list(session.get(key, payload=payload, timeout=2))
+                    got = list(session.get(key, payload=payload, timeout=HANG))
                 (reply,) = got
                 assert reply.err is not None
                 problem: Problem = decode(reply.err.payload.to_bytes(), Problem)

@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager
 import pytest
 import uvloop
 
+from tests.hang import HANG
 from zscout.keyexpr import BadName
 from zscout.mesh import supervision
 from zscout.mesh.exchange import Refused
@@ -32,7 +33,7 @@ class Owner:
 async def owned() -> AsyncIterator[Owner]:
     owner = Owner()
     try:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(HANG):
             yield owner
     finally:
         await owner.supervisor.close()
@@ -184,7 +185,7 @@ def test_an_owner_that_fails_to_handle_a_failure_is_logged_and_its_tasks_end(
         supervisor = Supervisor("owner", on_failure)
         sibling = supervisor.spawn(forever())
         supervisor.spawn(explode())
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(HANG):
             with pytest.raises(asyncio.CancelledError):
                 await sibling
 

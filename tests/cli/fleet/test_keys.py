@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.tools import Terminal, zscout_soon
+from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.messages import (
     ComponentList,
@@ -50,18 +51,20 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
             assert rcm["token"] == f"{base}/alive/anvil/rcm/node/{state.term.rcm}"
             queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
             assert queries[:2] == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
-            assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=2) is not None
+            assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=HANG) is not None
             assert queries[2:] == [f"{base}/balancer/rank", f"{base}/placer/component"]
-            assert await client.mesh.ask_one(queries[2], RankAsk(), HostRanking, timeout=2) is not None
-            assert await client.mesh.ask_one(queries[3], ListPlacements(), Placements, timeout=2) is not None
+            assert await client.mesh.ask_one(queries[2], RankAsk(), HostRanking, timeout=HANG) is not None
+            assert (
+                await client.mesh.ask_one(queries[3], ListPlacements(), Placements, timeout=HANG) is not None
+            )
             (host,) = [key["key"] for key in alive["anvil", "node", "node"]["keys"]]
-            assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=2) is not None
+            assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=HANG) is not None
             for rc in ("robot/a", "radio/rf0"):
                 served = {key["key"] for key in alive["anvil", "rc", rc]["keys"] if key["how"] == "query"}
                 assert (f"{base}/rc/{rc}/vote" in served) == (rc == "radio/rf0")
                 key = f"{base}/rc/{rc}/state"
                 assert key in served
-                assert await client.mesh.ask_one(key, RcAsk(), RcState, timeout=2) is not None
+                assert await client.mesh.ask_one(key, RcAsk(), RcState, timeout=HANG) is not None
 
             plain = await zscout_soon("keys", env=lab.env)
             assert plain.returncode == 0

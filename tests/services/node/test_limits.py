@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.hang import HANG
 from zscout.services.node.limits import LEAF, PREFIX, ControlGroups
 
 MEGABYTE = 1_000_000
@@ -36,7 +37,7 @@ def test_who_uses_more_than_the_limit_is_killed_and_it_is_known_why(waiting: sub
         assert (group.memory_set, group.missing, group.each) == (True, "", 0)
         group.enter(waiting.pid)
         assert not group.overdrawn()
-        waiting.communicate(b"\n", timeout=30)
+        waiting.communicate(b"\n", timeout=HANG)
         assert waiting.returncode == -9
         assert group.overdrawn()
     finally:
@@ -78,7 +79,7 @@ def test_a_process_gets_the_share_of_a_core_that_it_may_have() -> None:
     try:
         group.enter(process.pid)
         group.settle()
-        used, _ = process.communicate(timeout=30)
+        used, _ = process.communicate(timeout=HANG)
     finally:
         process.kill()
         group.close()
@@ -169,7 +170,7 @@ def test_memory_is_limited_by_the_process_itself_where_no_group_does_it() -> Non
         "except MemoryError:\n    print('refused')\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=HANG
     )
     assert done.stdout == "refused\n"
 
@@ -184,7 +185,7 @@ def test_a_family_is_killed_whatever_groups_it_is_in() -> None:
     other = subprocess.Popen(["sleep", "60"], env=os.environ | {"ZSCOUT_COMPONENT": "t-11"})
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=30
+            [sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=HANG
         )
         assert done.stdout == "2 0\n"
         assert [process.wait(10) for process in family] == [-9, -9]
