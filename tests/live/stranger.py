@@ -47,7 +47,7 @@ class Stranger:
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             congestion_control=zenoh.CongestionControl.BLOCK,
             express=True,
-            timeout=HANG,
+            timeout=5.0,
         ):
             if reply.ok is not None:
                 found.append(("ok", json.loads(reply.ok.payload.to_bytes())))
