@@ -20,9 +20,20 @@ from random import Random
 from benchmarks.stats import Samples
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Propose, WakeAt
-from zscout.scheduling.events import Event, RcJoined, Released, Requested, Tick, Vote
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import (
+    ArcRequest,
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    Propose,
+    RcJoined,
+    Released,
+    Requested,
+    Tick,
+    Vote,
+    WakeAt,
+)
 from zscout.scheduling.priority import FullPriority
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import excess

@@ -18,11 +18,9 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from zscout.scheduling import cpsat
+from zscout.scheduling import optimal
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import WakeAt
-from zscout.scheduling.events import Event, RcJoined, Requested, Tick
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import ArcRequest, Event, RcJoined, Requested, Tick, WakeAt
 from zscout.scheduling.packing import PackingItem, PackingProblem, numbers, pack
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import SECOND
@@ -149,9 +147,9 @@ def border(seeds: int) -> list[dict[str, Any]]:
             branch.append((time.process_time() - begin) * 1e3)
             nodes.append(packing.nodes)
             exact += packing.exact
-            if cpsat.available():
+            if optimal.solver_available():
                 begin = time.process_time()
-                cpsat.improve(case, case.complete(), 2.0)
+                optimal.improve(case, case.complete(), 2.0)
                 solver.append((time.process_time() - begin) * 1e3)
         found.append(
             {
@@ -208,7 +206,7 @@ def main() -> None:
     names = tuple(STRATEGIES)
     best = [float(pack(problem(experiment(seed, 10, 20))).value) for seed in range(args.seeds)]
     measured = rows(10, 20, args.seeds, best, names, paper=True)
-    if cpsat.available():
+    if optimal.solver_available():
         for rcs, arcs, seconds in ((50, 100, 20.0), (300, 600, args.solver)):
             print(f"{rcs}x{arcs}: CP-SAT, up to {seconds:g} s for each of {args.large}", file=sys.stderr)
             best = solved(rcs, arcs, args.large, min(seconds, args.solver))
@@ -231,7 +229,7 @@ def main() -> None:
         "best`: the mean in the paper's experiment, else the median, of the best that CP-SAT found in its "
         f"time.\nA loop of a million additions took {loop:.0f} ms; some 50 on a quiet machine."
     )
-    if not cpsat.available():
+    if not optimal.solver_available():
         print("Without OR-tools (the extra `optimal`) nothing says what is possible at larger sizes.")
 
 

@@ -11,8 +11,7 @@ from tests.scheduling.oracle import Contender, Oracle
 from tests.scheduling.validate import validate
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.model import Arc, ArcRequest
+from zscout.scheduling.model import Arc, ArcRequest, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.workload import WorkloadRc, excess
 from zscout.types import (
     NO_TERM,

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from zscout.scheduling.effects import Outcome
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.replay import HoldRecord, Replay
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc, excess
 from zscout.types import Ns, RcName

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import heapq
 
-from zscout.scheduling.admission_check import Admissible, AdmissionCheck, Inadmissible, VotesNeeded
-from zscout.scheduling.priority import VOTING, Priority
+from zscout.scheduling.priority import VOTING, Admissible, AdmissionCheck, Inadmissible, Priority, VotesNeeded
 from zscout.scheduling.reason import ReasonCode, of_rcs
-from zscout.scheduling.state import SchedulerState
-from zscout.scheduling.strategy import Actions
+from zscout.scheduling.state import Actions, SchedulerState
 
 
 class PlainPriority(Priority):

@@ -18,9 +18,23 @@ from tests.thorough import times
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.adaptive import MAX_SLICES, SLICE, Adaptive, steps_for
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Propose, Queued, WakeAt
-from zscout.scheduling.events import Cancelled, Event, RcJoined, Released, Requested, Tick, Vote, VoteOverdue
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import (
+    ArcRequest,
+    Cancelled,
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    Propose,
+    Queued,
+    RcJoined,
+    Released,
+    Requested,
+    Tick,
+    Vote,
+    VoteOverdue,
+    WakeAt,
+)
 from zscout.scheduling.priority import Priority
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES

@@ -11,12 +11,11 @@ from tests.scheduling.test_patterns import workload as with_patterns
 from tests.scheduling.test_waiting import workload as with_one_priority
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
-from zscout.scheduling.candidates import candidates
+from zscout.scheduling.conflict_groups import candidates
 from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.replay import replay
-from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.scheduling.strategy import Actions, Strategy
 from zscout.scheduling.votes import Votes
 from zscout.scheduling.workload import Arrival, Workload
 from zscout.types import SECOND, Ns

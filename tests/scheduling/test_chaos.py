@@ -14,12 +14,13 @@ from tests.scheduling.workloads import capacity, rcs, requests
 from tests.thorough import times
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Propose, WakeAt
-from zscout.scheduling.events import (
+from zscout.scheduling.model import (
+    Arc,
     Cancelled,
     ClientLost,
     Event,
     HandedOver,
+    Propose,
     RcJoined,
     RcLost,
     RcReported,
@@ -28,8 +29,8 @@ from zscout.scheduling.events import (
     Tick,
     Vote,
     VoteOverdue,
+    WakeAt,
 )
-from zscout.scheduling.model import Arc
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import WorkloadRc, excess
 from zscout.types import (

@@ -10,10 +10,17 @@ import pytest
 
 from tests.scheduling.validate import validate
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Propose, Queued, WakeAt
-from zscout.scheduling.events import (
+from zscout.scheduling.model import (
+    QUANTUM,
+    ArcRequest,
     Cancelled,
+    Effect,
+    Granted,
+    HoldEnded,
     LeadTaken,
+    Outcome,
+    Propose,
+    Queued,
     RcJoined,
     RcLost,
     RcReported,
@@ -24,8 +31,8 @@ from zscout.scheduling.events import (
     Tick,
     Vote,
     VoteOverdue,
+    WakeAt,
 )
-from zscout.scheduling.model import QUANTUM, ArcRequest
 from zscout.types import (
     SECOND,
     Grant,

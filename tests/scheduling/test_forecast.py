@@ -7,10 +7,20 @@ from hypothesis import given, settings
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Propose
-from zscout.scheduling.events import Event, RcJoined, Requested, Tick, Vote
 from zscout.scheduling.forecast import forecast
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import (
+    ArcRequest,
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    Outcome,
+    Propose,
+    RcJoined,
+    Requested,
+    Tick,
+    Vote,
+)
 from zscout.scheduling.workload import Workload, excess
 from zscout.types import SECOND, ArcId, Ns
 

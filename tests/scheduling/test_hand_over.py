@@ -8,10 +8,12 @@ import pytest
 
 from tests.scheduling.test_core import core_with, granted, only, question, request
 from tests.scheduling.validate import validate
-from zscout.scheduling.effects import HoldEnded, Outcome, Propose
-from zscout.scheduling.events import (
+from zscout.scheduling.model import (
     HandedOver,
+    HoldEnded,
     LeadTaken,
+    Outcome,
+    Propose,
     RecoveredHold,
     RecoveredRequest,
     Released,

@@ -12,9 +12,20 @@ from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.scheduling import optimal
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Propose
-from zscout.scheduling.events import Event, RcJoined, Requested, Tick, Vote, VoteOverdue
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import (
+    ArcRequest,
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    Outcome,
+    Propose,
+    RcJoined,
+    Requested,
+    Tick,
+    Vote,
+    VoteOverdue,
+)
 from zscout.scheduling.packing import PackingItem
 from zscout.scheduling.replay import replay
 from zscout.scheduling.workload import Workload, WorkloadRc, excess

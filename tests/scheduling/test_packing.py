@@ -6,7 +6,7 @@ import random
 
 from tests.scheduling.exhaustive import best_set, may_end, vector
 from tests.thorough import times
-from zscout.scheduling import cpsat
+from zscout.scheduling import optimal
 from zscout.scheduling.adaptive import steps_for
 from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.optimal import best
@@ -73,7 +73,7 @@ def test_cpsat_finds_the_very_set_as_well() -> None:
     for seed in range(times(30)):
         items, vetoes = case(seed, most=7)
         asked = problem((items, vetoes))
-        found = cpsat.improve(asked, asked.complete(), budget=5)
+        found = optimal.improve(asked, asked.complete(), budget=5)
         assert frozenset(numbers(found)) == best_set(items, vetoes), seed
 
 
@@ -139,4 +139,4 @@ def test_cpsat_begins_with_what_it_is_given() -> None:
     asked = large(3, 120, 240)
     search = LocalSearch(asked, 0)
     search.run(500)
-    assert asked.key(cpsat.improve(asked, search.best, budget=0.01)) >= search.best_key
+    assert asked.key(optimal.improve(asked, search.best, budget=0.01)) >= search.best_key

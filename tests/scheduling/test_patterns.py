@@ -15,10 +15,14 @@ from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, Propose
-from zscout.scheduling.events import (
+from zscout.scheduling.model import (
+    Arc,
+    ArcRequest,
+    Effect,
     Event,
+    Granted,
     LeadTaken,
+    Propose,
     RcJoined,
     RcLost,
     RecoveredHold,
@@ -28,7 +32,6 @@ from zscout.scheduling.events import (
     Vote,
     VoteOverdue,
 )
-from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.patterns import check_patterns
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES

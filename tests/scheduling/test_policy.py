@@ -13,9 +13,19 @@ from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName, owner_of
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome
-from zscout.scheduling.events import LeadTaken, RcJoined, RecoveredHold, Released, Requested, Tick
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import (
+    ArcRequest,
+    Effect,
+    Granted,
+    HoldEnded,
+    LeadTaken,
+    Outcome,
+    RcJoined,
+    RecoveredHold,
+    Released,
+    Requested,
+    Tick,
+)
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc

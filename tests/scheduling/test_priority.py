@@ -12,8 +12,18 @@ from tests.scheduling.invariants import Ledger, check_settled
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Propose
-from zscout.scheduling.events import Event, RcJoined, Released, Requested, Tick, Vote
+from zscout.scheduling.model import (
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    Propose,
+    RcJoined,
+    Released,
+    Requested,
+    Tick,
+    Vote,
+)
 from zscout.scheduling.replay import HoldRecord, Replay, replay
 from zscout.scheduling.workload import Workload, excess
 from zscout.types import ArcId, Ns

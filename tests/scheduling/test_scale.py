@@ -13,14 +13,21 @@ from tests.scheduling.plain_pass import PlainPriority
 from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.scheduling import priority
-from zscout.scheduling.admission_check import AdmissionCheck
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Propose, Queued
-from zscout.scheduling.events import (
+from zscout.scheduling.model import (
+    Arc,
+    ArcRequest,
+    ArcState,
+    ArcStatus,
     Cancelled,
     ClientLost,
+    Effect,
     Event,
+    Granted,
     HandedOver,
+    HoldEnded,
+    Propose,
+    Queued,
     RcJoined,
     RcLost,
     RcReported,
@@ -30,9 +37,8 @@ from zscout.scheduling.events import (
     Vote,
     VoteOverdue,
 )
-from zscout.scheduling.model import Arc, ArcRequest, ArcState
+from zscout.scheduling.priority import AdmissionCheck
 from zscout.scheduling.state import SchedulerState
-from zscout.scheduling.status import ArcStatus
 from zscout.scheduling.workload import excess
 from zscout.types import SECOND, Params
 

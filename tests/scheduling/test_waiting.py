@@ -12,9 +12,7 @@ from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect
-from zscout.scheduling.events import LeadTaken, RcJoined, RecoveredRequest, Requested, Tick
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import ArcRequest, Effect, LeadTaken, RcJoined, RecoveredRequest, Requested, Tick
 from zscout.scheduling.replay import Replay, replay
 from zscout.scheduling.reservations import MAX_STARVING
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc

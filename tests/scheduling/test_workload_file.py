@@ -15,8 +15,15 @@ from tests.thorough import times
 from zscout.config.strict import BadInput
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.replay import replay
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
-from zscout.scheduling.workload_file import MAX_ARCS, MAX_NEEDS, MAX_RCS, parse_workload
+from zscout.scheduling.workload import (
+    MAX_ARCS,
+    MAX_NEEDS,
+    MAX_RCS,
+    Arrival,
+    Workload,
+    WorkloadRc,
+    parse_workload,
+)
 
 RC = '[[rc]]\nname = "robot/a"\n'
 RADIO = '[[rc]]\nname = "radio/r"\nsharable = true\n'

@@ -21,13 +21,19 @@ from fractions import Fraction
 from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Dropped, Effect, Granted, HoldEnded, Propose, Queued, WakeAt
-from zscout.scheduling.events import (
+from zscout.scheduling.model import (
+    ArcRequest,
     Cancelled,
     ClientLost,
+    Dropped,
+    Effect,
     Event,
+    Granted,
     HandedOver,
+    HoldEnded,
     LeadTaken,
+    Propose,
+    Queued,
     RcJoined,
     RcLost,
     RcReported,
@@ -38,8 +44,8 @@ from zscout.scheduling.events import (
     Tick,
     Vote,
     VoteOverdue,
+    WakeAt,
 )
-from zscout.scheduling.model import ArcRequest
 from zscout.types import (
     Grant,
     Ns,

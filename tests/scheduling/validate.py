@@ -8,8 +8,7 @@ from zscout.config.scheduling_policy import owner_of
 from zscout.keyexpr import matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcState
-from zscout.scheduling.queue_index import QueueIndex
-from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.state import QueueIndex, SchedulerState
 
 QUEUED = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.WATCHING, ArcState.PARKED)
 

@@ -30,7 +30,7 @@ from tests.surface.tree import find
 from tests.surface.workloads import SEEDS, workload
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.scheduling.workload_file import parse_workload
+from zscout.scheduling.workload import parse_workload
 
 StrategyName: TypeAlias = Literal["priority", "optimal", "adaptive"]
 

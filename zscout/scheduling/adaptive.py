@@ -32,8 +32,7 @@ from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.packing import PackingItem, PackingProblem, numbers, pack
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.reservations import Reservations, reservations
-from zscout.scheduling.state import SchedulerState
-from zscout.scheduling.strategy import Actions
+from zscout.scheduling.state import Actions, SchedulerState
 from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Ns, RcName
 

@@ -2,7 +2,7 @@
 
 Every decision of the RCM is made in this room, and this is its door; there is no clock, thread, socket or
 log inside. This module applies events and carries out what is decided; who starts, and who is preempted for
-it, is decided by the strategy's pass (`priority.py` has its steps), ARC by ARC (`admission_check.py`), by the
+it, is decided by the strategy's pass (`priority.py` has its steps), ARC by ARC, by the
 rule of `Arc.preemptible_by`; what RCs voted stands in `votes.py`, who holds what in `state.py`. The RCM
 service, `zscout replay`, the study and the forecast drive this one class:
 
@@ -19,25 +19,29 @@ from dataclasses import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.keyexpr import is_pattern
-from zscout.scheduling import events as on
-from zscout.scheduling.admission_check import AdmissionCheck
-from zscout.scheduling.effects import (
+from zscout.scheduling import model as on
+from zscout.scheduling.model import (
+    QUANTUM,
+    Arc,
+    ArcRequest,
+    ArcState,
+    ArcStatus,
     Dropped,
     Effect,
     Granted,
+    Hold,
     HoldEnded,
     Outcome,
     Propose,
     Queued,
+    Rc,
+    RcStatus,
+    Status,
     WakeAt,
 )
-from zscout.scheduling.expiry import ExpiryQueue
-from zscout.scheduling.model import QUANTUM, Arc, ArcRequest, ArcState, Hold, Rc
-from zscout.scheduling.priority import Priority
+from zscout.scheduling.priority import AdmissionCheck, Priority
 from zscout.scheduling.reason import Reason, ReasonCode
-from zscout.scheduling.state import SchedulerState
-from zscout.scheduling.status import ArcStatus, RcStatus, Status
-from zscout.scheduling.strategy import Strategy
+from zscout.scheduling.state import ExpiryQueue, SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
 

@@ -10,11 +10,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Granted, HoldEnded, Outcome, Propose
-from zscout.scheduling.events import Event, Requested, Tick, Vote
-from zscout.scheduling.instant import play_instant
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import (
+    ArcRequest,
+    Event,
+    Granted,
+    HoldEnded,
+    Outcome,
+    Propose,
+    Requested,
+    Tick,
+    Vote,
+)
 from zscout.scheduling.reason import Reason
+from zscout.scheduling.replay import play_instant
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import ArcId, Ns, Term
 

@@ -1,4 +1,5 @@
-"""What the scheduling core knows: requests, resource controllers (RCs) and what stands between them.
+"""What the scheduling core takes, keeps and gives: requests and resource controllers (RCs); events that
+it is given, its effects, in the order in which they must be done, and how things stand.
 
 Times are whole nanoseconds on one clock of the caller's choice; nothing here reads a clock. Bandwidth
 parameters are `Fraction`, so that sums are exact (0.1 + 0.2 is 0.3).
@@ -9,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
+from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.reason import Party, Reason
-from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName
+from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
 QUANTUM: Ns = SECOND
 """The paper's quantum: while anything waits, a pass runs at least this often."""
@@ -62,7 +64,7 @@ class Hold:
 
 
 class ArcState(StrEnum):
-    """Where an ARC stands. All between NEW and RUNNING are queued; `queue_index.py` says what follows."""
+    """Where an ARC stands. All between NEW and RUNNING are queued; `QueueIndex` says what follows."""
 
     NEW = "new"
     READY = "ready"
@@ -178,4 +180,289 @@ class Rc:
     demand: int = 0
     """How many of the queued ARCs name it."""
     watchers: list[Rank] = field(default_factory=list)
-    """Ranks of the queued ARCs that watch this RC (`queue_index.py`), best first."""
+    """Ranks of the queued ARCs that watch this RC (`QueueIndex`), best first."""
+
+
+# Events: each carries everything the core may know about it
+
+
+@dataclass(frozen=True, slots=True)
+class Requested:
+    """A program requests an ARC. `place` is set when it had one under an earlier RCM; `since` is then when it
+    was last queued, on the core's clock, if that is known."""
+
+    request: ArcRequest
+    place: Place | None = None
+    since: Ns | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cancelled:
+    """The ARC is not wanted any more, whether it waits or runs."""
+
+    arc: ArcId
+    by: str = "its client"
+
+
+@dataclass(frozen=True, slots=True)
+class Released:
+    """A running ARC gives back what it holds; a waiting one leaves the queue."""
+
+    arc: ArcId
+    by: str = "its client"
+
+
+@dataclass(frozen=True, slots=True)
+class Vote:
+    """A sharable RC's answer to a proposal."""
+
+    proposal: int
+    accept: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class VoteOverdue:
+    """No answer to a proposal in time, or the question could not be delivered."""
+
+    proposal: int
+
+
+@dataclass(frozen=True, slots=True)
+class RcJoined:
+    """An RC is there and can be granted."""
+
+    rc: RcName
+    sharable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class RcReported:
+    """An RC reports that holds ended there, or that the rules it votes by have changed."""
+
+    rc: RcName
+    ended: tuple[ArcId, ...] = ()
+    rules_changed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RcLost:
+    """An RC is gone, or can't carry its holders any longer."""
+
+    rc: RcName
+    reason: str = "it left the mesh"
+
+
+@dataclass(frozen=True, slots=True)
+class ClientLost:
+    """A program is gone: what it holds is free and what it asked for is forgotten."""
+
+    client: ClientId
+    reason: str = "its client left the mesh"
+
+
+@dataclass(frozen=True, slots=True)
+class HandedOver:
+    """An ARC goes on in another client (migration), by the name `renamed`: same place; if it runs, same RCs,
+    same end, new grant."""
+
+    arc: ArcId
+    to: ClientId
+    renamed: ArcId
+
+
+@dataclass(frozen=True, slots=True)
+class RecoveredHold:
+    """A hold that stood when an RCM took the lead: its grant is kept, `end` is on the core's clock."""
+
+    request: ArcRequest
+    place: Place
+    grant: Grant
+    start: Ns
+    end: Ns
+    bound: Mapping[Need, RcName] = field(default_factory=dict)
+    """By each pattern of its needs: the RC that it holds."""
+
+    def __post_init__(self) -> None:
+        patterns = {need for need in self.request.needs if is_pattern(need)}
+        if patterns != self.bound.keys() or not all(matcher(need)(rc) for need, rc in self.bound.items()):
+            raise ValueError(f"what ARC {self.request.arc} holds for its patterns is not told, or told wrong")
+
+
+class RecoveredRequest(NamedTuple):
+    """A request that waited when an RCM took the lead; `since` as in `Requested`."""
+
+    request: ArcRequest
+    place: Place
+    since: Ns | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LeadTaken:
+    """This RCM leads from now on, in `term`, over the holds and the queue that stood."""
+
+    term: Term
+    standing: tuple[RecoveredHold, ...] = ()
+    waiting: tuple[RecoveredRequest, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time has passed: holds may be over, the quantum may be."""
+
+
+Event: TypeAlias = (
+    Requested
+    | Cancelled
+    | Released
+    | Vote
+    | VoteOverdue
+    | RcJoined
+    | RcReported
+    | RcLost
+    | ClientLost
+    | HandedOver
+    | LeadTaken
+    | Tick
+)
+
+
+# Effects
+
+
+class Outcome(StrEnum):
+    """How a hold, or the wait for one, came to its end."""
+
+    COMPLETED = "completed"
+    """It had its minimum runtime."""
+    PREEMPTED = "preempted"
+    """Taken away by a higher priority; queued again with its place."""
+    RELEASED = "released"
+    """Given back by its client before the time."""
+    CANCELLED = "cancelled"
+    LOST = "lost"
+    """An RC of the gang went away; queued again with its place."""
+    CLIENT_LOST = "client_lost"
+    HANDED_OVER = "handed_over"
+    """It goes on in another client, under a new grant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Propose:
+    """Ask a sharable RC whether it would carry exactly these holders, by ARC, with their parameters."""
+
+    proposal: int
+    rc: RcName
+    holders: Mapping[ArcId, Params]
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """All of `rcs` are the ARC's until `end`; None where it may keep them past its minimum runtime."""
+
+    arc: ArcId
+    client: ClientId
+    grant: Grant
+    rcs: tuple[RcName, ...]
+    start: Ns
+    end: Ns | None
+
+
+@dataclass(frozen=True, slots=True)
+class HoldEnded:
+    """A hold is over. `requeued` says whether its ARC waits again; `by` is the ARC it was taken for."""
+
+    arc: ArcId
+    client: ClientId
+    grant: Grant
+    rcs: tuple[RcName, ...]
+    outcome: Outcome
+    reason: Reason
+    requeued: bool
+    by: ArcId | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Queued:
+    """The ARC waits, for this reason; sent at the first wait and when the reason changes.
+
+    `settled` is False while the RCM itself is still asking votes, so that the answer is near."""
+
+    arc: ArcId
+    client: ClientId
+    reason: Reason
+    settled: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Dropped:
+    """A waiting ARC left the queue without having run."""
+
+    arc: ArcId
+    client: ClientId
+    outcome: Outcome
+    reason: Reason
+
+
+@dataclass(frozen=True, slots=True)
+class WakeAt:
+    """Send a `Tick` at this time, or earlier; a later effect replaces it. None: nothing to wait for."""
+
+    at: Ns | None
+
+
+Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | WakeAt
+
+
+# How things stand after the last batch of events
+
+
+@dataclass(frozen=True, slots=True)
+class ArcStatus:
+    """One ARC that is queued (`hold is None`) or runs."""
+
+    request: ArcRequest
+    place: Place
+    hold: Hold | None
+    needs: Mapping[RcName, Params]
+    """By RC: what it holds, or would hold as its patterns are bound at present."""
+    bound: Mapping[Need, RcName]
+    """The RC that each pattern of its needs is bound to."""
+    since: Ns
+    """When it was last queued or granted."""
+    preemptions: int
+    ahead: int | None
+    """How many of the queued rank above it; None while it runs."""
+    reason: Reason | None
+    """Why it is queued, with all that is in its way; None while it runs."""
+    reported: Reason | None
+    """The reason of its latest `Queued` effect: not every change of holders far ahead of it is one."""
+
+    @property
+    def id(self) -> ArcId:
+        return self.request.arc
+
+    @property
+    def name(self) -> str:
+        return self.request.name
+
+
+@dataclass(frozen=True, slots=True)
+class RcStatus:
+    """One RC; `holders` in the order in which they came to hold it."""
+
+    name: RcName
+    present: bool
+    sharable: bool
+    holders: tuple[ArcId, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """The whole fleet: who runs, in the order in which they started; who is queued, best rank first and
+    perhaps not all of the `waiting`; the RCs by name."""
+
+    running: tuple[ArcStatus, ...]
+    queued: tuple[ArcStatus, ...]
+    waiting: int
+    rcs: tuple[RcStatus, ...]

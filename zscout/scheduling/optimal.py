@@ -11,19 +11,135 @@ A pass:
 5. Run a pass of `priority` over the rest: it starts nobody, and reports what they wait for.
 
 The set's value is the vector of (ARC, RC) pairs in use by priority, highest first (`packing.py`).
+
+OR-tools is imported at the first use, because it is large. The solver runs on its deterministic clock, with
+one worker: the same problem gives the same set everywhere, as the rest of the core does.
 """
 
 from __future__ import annotations
 
-from typing import Final
+import functools
+import importlib.util
+from typing import TYPE_CHECKING, Any, Final
 
 from zscout.config.scheduling_policy import StrategyName
-from zscout.scheduling import cpsat, priority
+from zscout.scheduling import priority
 from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups
 from zscout.scheduling.local_search import LocalSearch
-from zscout.scheduling.packing import PackingProblem, pack
-from zscout.scheduling.state import SchedulerState
-from zscout.scheduling.strategy import Actions
+from zscout.scheduling.packing import PackingProblem, numbers, pack
+from zscout.scheduling.state import Actions, SchedulerState
+
+if TYPE_CHECKING:
+    from ortools.sat.python import cp_model
+
+SOLVER_BUDGET: Final = 0.3
+"""Deterministic time of all stages together; about half a second. Stages that prove their answer leave the
+rest to the next."""
+LEAST: Final = 0.01
+CHUNK: Final = 40
+"""Items whose ranks are weighed in one stage: their weights are powers of two."""
+
+
+@functools.cache
+def solver_available() -> bool:
+    """Whether OR-tools is installed."""
+    return importlib.util.find_spec("ortools") is not None
+
+
+def improve(problem: PackingProblem, start: int, budget: float = SOLVER_BUDGET) -> int:
+    """A lawful set that is at least as good as `start`, which is lawful; the best one, if time allows."""
+    found = _Solver(problem, start, budget).solve()
+    best = max((problem.complete(found), found), key=problem.key)
+    # Only a proof tells sets of equal worth apart; otherwise the start stays.
+    return best if problem.key(best) > problem.key(start) or best == found else start
+
+
+class _Solver:
+    def __init__(self, problem: PackingProblem, start: int, budget: float) -> None:
+        from ortools.sat.python import cp_model  # large: only who needs it loads it
+
+        self.problem, self.found, self.left = problem, start, budget
+        self.cp = cp_model
+        self.model = cp_model.CpModel()
+        self.takes = [self.model.new_bool_var(f"x{number}") for number in range(len(problem.items))]
+        self._exclusive()
+        self._vetoes()
+        self._keep_running()
+
+    def solve(self) -> int:
+        """The best set found, stage by stage: pairs by level, preemptions, ranks."""
+        problem, takes = self.problem, self.takes
+        for level in range(problem.levels):
+            pairs = sum(
+                item.width * take
+                for item, take in zip(problem.items, takes, strict=True)
+                if item.level == level and not item.past_min_runtime
+            )
+            if not isinstance(pairs, int) and not self._stage(pairs):
+                return self.found
+        kept = sum(take for item, take in zip(problem.items, takes, strict=True) if item.in_min_runtime)
+        if not isinstance(kept, int) and not self._stage(kept):
+            return self.found
+        for begin in range(0, len(takes), CHUNK):
+            chunk = takes[begin : begin + CHUNK]
+            ranks = sum((1 << len(chunk) - 1 - at) * take for at, take in enumerate(chunk))
+            if not self._stage(ranks):
+                return self.found
+        return self.found
+
+    def _stage(self, goal: Any) -> bool:
+        """Maximises `goal` and holds on to what was reached; False if the best is not proven."""
+        if self.left < LEAST:
+            return False
+        self.model.clear_hints()  # type: ignore[no-untyped-call]
+        for number, take in enumerate(self.takes):
+            self.model.add_hint(take, self.found >> number & 1)
+        self.model.maximize(goal)
+        solver = self.cp.CpSolver()
+        solver.parameters.num_workers = 1
+        solver.parameters.max_deterministic_time = self.left
+        status = solver.solve(self.model)
+        if status in (self.cp.OPTIMAL, self.cp.FEASIBLE):
+            found = sum(1 << number for number, take in enumerate(self.takes) if solver.value(take))
+            if status == self.cp.OPTIMAL or self.problem.key(found) > self.problem.key(self.found):
+                self.found = found
+        self.left -= solver.response_proto.deterministic_time
+        if status != self.cp.OPTIMAL:
+            return False
+        self.model.add(goal == round(solver.objective_value))
+        return True
+
+    def _exclusive(self) -> None:
+        covers: dict[int, list[cp_model.IntVar]] = {}
+        for mask, take in zip(self.problem.masks, self.takes, strict=True):
+            for rc in numbers(mask):
+                covers.setdefault(rc, []).append(take)
+        for cover in covers.values():
+            if len(cover) > 1:
+                self.model.add_at_most_one(cover)
+
+    def _vetoes(self) -> None:
+        for nogood in {nogood for nogoods in self.problem.nogoods for nogood in nogoods}:
+            self.model.add_bool_or(~self.takes[number] for number in numbers(nogood))
+
+    def _keep_running(self) -> None:
+        """Who runs stays, unless one that goes before is in the way, or all others of a veto are."""
+        problem = self.problem
+        for running in problem.running:
+            mask = problem.masks[running]
+            excuses = [
+                take
+                for other, take in enumerate(self.takes)
+                if other != running and problem.masks[other] & mask and problem.outranks(other, running)
+            ]
+            for nogood in problem.nogoods[running]:
+                others = [other for other in numbers(nogood) if other != running]
+                if all(problem.outranks(other, running) for other in others):
+                    vetoed = self.model.new_bool_var("")
+                    self.model.add_bool_and(self.takes[other] for other in others).only_enforce_if(vetoed)
+                    excuses.append(vetoed)
+            self.model.add_bool_or([self.takes[running], *excuses])
+
 
 WORK: Final = 200_000
 """Steps of branch and bound, times items, before a group counts as large: some 20 ms. What is not proven by
@@ -83,4 +199,4 @@ def best(problem: PackingProblem) -> int:
     search = LocalSearch(problem, packing.chosen)
     search.run(STEPS)
     found = max(packing.chosen, search.best, key=problem.key)
-    return cpsat.improve(problem, found) if cpsat.available() else found
+    return improve(problem, found) if solver_available() else found

@@ -3,17 +3,41 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Propose
-from zscout.scheduling.events import Event, RcJoined, Released, Requested, Tick, Vote
-from zscout.scheduling.instant import play_instant
-from zscout.scheduling.strategy import Strategy
+from zscout.scheduling.model import (
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    Outcome,
+    Propose,
+    RcJoined,
+    Released,
+    Requested,
+    Tick,
+    Vote,
+    WakeAt,
+)
+from zscout.scheduling.state import Strategy
 from zscout.scheduling.workload import Workload, excess
 from zscout.types import ArcId, Ns, RcName
+
+
+def play_instant(
+    core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], Vote]
+) -> Iterator[list[Effect]]:
+    """One instant, with every vote and every further pass that it takes; yields the effects of each batch."""
+    batch = list(events)
+    while batch:
+        effects = core.handle(now, *batch)
+        yield effects
+        batch = [vote(effect) for effect in effects if isinstance(effect, Propose)]
+        if not batch and any(isinstance(effect, WakeAt) and effect.at == now for effect in effects):
+            batch = [Tick()]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.optimal import Optimal
 from zscout.scheduling.priority import Priority
-from zscout.scheduling.strategy import Strategy
+from zscout.scheduling.state import Strategy
 
 STRATEGIES: Final[Mapping[StrategyName, Callable[[], Strategy]]] = {
     "priority": Priority,

@@ -1,12 +1,43 @@
-"""A workload: RCs, and the ARCs that come to ask for them. What replay and study feed the core."""
+"""A workload: RCs, and the ARCs that come to ask for them; and the file of it that `zscout replay` reads.
+
+    [[rc]]
+    name = "radio/rf0"
+    sharable = true                      # several holders at once; exclusive without it
+    capacity = { command_rate = 10.0 }   # vetoes any set of holders whose sum is greater
+
+    [[arc]]
+    name = "arc0"
+    at = 0.0                             # seconds
+    priority = 1                         # the larger wins
+    min_runtime = 5.0                    # seconds, more than 0
+    [arc.needs]
+    "radio/rf0" = { command_rate = 5.0 } # a parameter left out counts 0
+
+Names are free texts here, since nothing goes onto a mesh. An ARC may need an RC that the file does not have:
+it then never runs, and ends among the unserved.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from decimal import Decimal
 from fractions import Fraction
+from typing import Annotated, Final
 
+from msgspec import Meta, Struct
+
+from zscout.config.strict import (
+    Where,
+    amounts,
+    check_unique,
+    parse_toml,
+    quoted,
+    seconds_to_ns,
+)
+from zscout.keyexpr import is_pattern
 from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.patterns import check_patterns
 from zscout.types import (
     ArcId,
     Ns,
@@ -54,3 +85,94 @@ def excess(capacity: Mapping[str, Fraction], holders: Iterable[tuple[ArcId, Para
         if totals.get(parameter, 0) > bound
     ]
     return ", ".join(over)
+
+
+MAX_BYTES: Final = 64_000_000
+"""Largest workload file that is worth reading; for whoever opens it."""
+MAX_ARCS: Final = 100_000
+MAX_RCS: Final = 10_000
+MAX_NEEDS: Final = 1_000
+"""RCs that one ARC may need."""
+MAX_PARAMETERS: Final = 64
+"""Bandwidth parameters that an ARC may give to one RC, and capacities that one RC may have."""
+MAX_PRIORITY: Final = 1_000_000_000
+_MAX_NAME: Final = 130
+
+_Amounts = Annotated[dict[str, Decimal], Meta(max_length=MAX_PARAMETERS)]
+
+
+class _Rc(Struct, frozen=True, forbid_unknown_fields=True):
+    name: str
+    sharable: bool = False
+    capacity: _Amounts | None = None
+
+
+class _Arc(Struct, frozen=True, forbid_unknown_fields=True):
+    name: str
+    at: Decimal
+    priority: Annotated[int, Meta(ge=0, le=MAX_PRIORITY)]
+    min_runtime: Decimal
+    needs: Annotated[dict[str, _Amounts], Meta(max_length=MAX_NEEDS)]
+
+
+class _File(Struct, frozen=True, forbid_unknown_fields=True):
+    rc: Annotated[list[_Rc], Meta(max_length=MAX_RCS)] = []
+    arc: Annotated[list[_Arc], Meta(max_length=MAX_ARCS)] = []
+
+
+def parse_workload(text: str, source: str) -> Workload:
+    """The workload that `text` describes: times in whole ns, amounts exact, RCs and ARCs in the file's order.
+
+    `source` names the file in errors. Raises BadInput at the first thing that is wrong."""
+    file = parse_toml(text, source, _File)
+    top = Where(source)
+    check_unique((rc.name for rc in file.rc), top / "rc", "name")
+    check_unique((arc.name for arc in file.arc), top / "arc", "name")
+    rcs = tuple(_rc(rc, (top / "rc").item(number, rc.name)) for number, rc in enumerate(file.rc))
+    arcs = (top / "arc").item
+    arrivals = tuple(_arrival(arc, arcs(number, arc.name)) for number, arc in enumerate(file.arc))
+    return Workload(rcs, arrivals)
+
+
+def _rc(rc: _Rc, where: Where) -> WorkloadRc:
+    _check_text(rc.name, where / "name")
+    if is_pattern(rc.name):
+        raise (where / "name").bad(
+            f"{quoted(rc.name)} is a pattern", "leave out the *; only needs may have it"
+        )
+    if rc.capacity is None:
+        return WorkloadRc(rc.name, rc.sharable)
+    if not rc.sharable:
+        raise (where / "capacity").bad(
+            "an exclusive RC has one holder and no capacity", "add sharable = true, or remove it"
+        )
+    _check_texts(rc.capacity, where / "capacity")
+    return WorkloadRc(rc.name, rc.sharable, amounts(rc.capacity, where / "capacity"))
+
+
+def _arrival(arc: _Arc, where: Where) -> Arrival:
+    _check_text(arc.name, where / "name")
+    at = seconds_to_ns(arc.at, where / "at")
+    min_runtime = seconds_to_ns(arc.min_runtime, where / "min_runtime", low=Decimal("0.000000001"))
+    if not arc.needs:
+        raise (where / "needs").bad("an ARC needs at least one RC", "name one, with {} for no parameters")
+    needs: dict[RcName, Params] = {}
+    for rc, parameters in arc.needs.items():
+        _check_text(rc, where / "needs")
+        _check_texts(parameters, where / "needs" / rc)
+        needs[rc] = amounts(parameters, where / "needs" / rc)
+    try:
+        check_patterns(needs)
+    except ValueError as error:
+        raise (where / "needs").bad(str(error), "see zscout request --help") from None
+    return Arrival(at, ArcRequest(arc.name, arc.name, needs, arc.priority, min_runtime))
+
+
+def _check_texts(names: Iterable[str], where: Where) -> None:
+    for name in names:
+        _check_text(name, where)
+
+
+def _check_text(name: str, where: Where) -> None:
+    if not (0 < len(name) <= _MAX_NAME and name.isprintable()):
+        raise where.bad(f"{quoted(name)} is not a name", f"write 1 to {_MAX_NAME} printable characters")

@@ -37,8 +37,7 @@ from zscout.lab.study.scheduling.trial import (
     play,
     run,
 )
-from zscout.scheduling.effects import Outcome
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.replay import HoldRecord, Replay, replay
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from zscout.messages import RcState
 from zscout.scheduling.core import Core
-from zscout.scheduling.events import HandedOver, LeadTaken, RcJoined, Requested
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined, Requested
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rcm import convert
 from zscout.services.rcm.membership import discrepancies

@@ -10,7 +10,7 @@ import pytest
 from zscout.drivers.holds import HoldTable
 from zscout.messages import ClientRequests, Holder, HoldView, OpenRequest, RcmState, RcState
 from zscout.scheduling.core import Core
-from zscout.scheduling.events import LeadTaken, RcJoined
+from zscout.scheduling.model import LeadTaken, RcJoined
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rcm.recovery import RecoveredState, recover
 from zscout.types import (

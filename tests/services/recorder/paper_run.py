@@ -9,8 +9,7 @@ from typing import Any
 
 from rerun.chunk import RrdReader
 
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import ArcRequest, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.replay import Replay, replay
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.services.recorder.blueprint import TIME

@@ -17,12 +17,11 @@ import click
 from zscout.config.scheduling_policy import StrategyName
 from zscout.config.strict import BadInput, read_text
 from zscout.lab.plots.gantt import columns_of, rows_of, short_names
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Queued
+from zscout.scheduling.model import Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.replay import Replay
 from zscout.scheduling.replay import replay as play
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.scheduling.workload import Workload
-from zscout.scheduling.workload_file import MAX_BYTES, parse_workload
+from zscout.scheduling.workload import MAX_BYTES, Workload, parse_workload
 from zscout.types import (
     SECOND,
     ArcId,

@@ -8,8 +8,7 @@ from importlib import resources
 from typing import NamedTuple, TypeAlias
 
 from zscout.messages import LoadReport
-from zscout.scheduling.workload import Workload
-from zscout.scheduling.workload_file import parse_workload
+from zscout.scheduling.workload import Workload, parse_workload
 from zscout.types import SECOND, Ns
 
 Table: TypeAlias = dict[str, list[str]]

@@ -6,7 +6,7 @@ from typing import Final
 
 from zscout.config.fleet import default_fleet
 from zscout.config.strict import BadInput
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Queued
+from zscout.scheduling.model import Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.replay import HoldRecord, Replay
 from zscout.scheduling.workload import Workload
 from zscout.services.recorder.timeline import HolderRow, Timeline

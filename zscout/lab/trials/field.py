@@ -28,9 +28,21 @@ from zscout.lab.building.world import MAX_STEP, World
 from zscout.lab.trials.field_figures import Judge, Outcomes
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded, Outcome, Propose, WakeAt
-from zscout.scheduling.events import Event, RcJoined, Released, Requested, Tick, Vote
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import (
+    ArcRequest,
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    Outcome,
+    Propose,
+    RcJoined,
+    Released,
+    Requested,
+    Tick,
+    Vote,
+    WakeAt,
+)
 from zscout.types import SECOND, ArcId, Ns
 
 MAX_CHANNELS: Final = 16

@@ -17,10 +17,8 @@ from zscout.messages import (
     Revocation,
     WaitView,
 )
-from zscout.scheduling.effects import HoldEnded
-from zscout.scheduling.model import Hold
+from zscout.scheduling.model import ArcStatus, Hold, HoldEnded, RcStatus
 from zscout.scheduling.reason import Reason
-from zscout.scheduling.status import ArcStatus, RcStatus
 from zscout.types import SECOND, ArcId, ClientId, Ns, Params
 
 

@@ -16,8 +16,7 @@ from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import RcAsk, RcState
-from zscout.scheduling.events import ClientLost, Event, RcJoined, RcLost, RcReported
-from zscout.scheduling.status import ArcStatus
+from zscout.scheduling.model import ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.types import SECOND, ArcId, ClientId, Grant, Ns, RcName, Term
 
 log = logging.getLogger(__name__)

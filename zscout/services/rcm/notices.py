@@ -10,7 +10,7 @@ from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Notice
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Dropped, Effect, Granted, HoldEnded, Queued
+from zscout.scheduling.model import Dropped, Effect, Granted, HoldEnded, Queued
 from zscout.services.rcm.history import ArcHistory
 from zscout.services.rcm.registry import RequestRegistry
 from zscout.types import ArcId

@@ -9,7 +9,7 @@ from zscout.config.fleet import Fleet
 from zscout.mesh import Mesh
 from zscout.messages import Grants, Holder, Revocation
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Granted, HoldEnded
+from zscout.scheduling.model import Effect, Granted, HoldEnded
 from zscout.services.rcm import convert
 from zscout.services.rcm.registry import RequestRegistry
 from zscout.types import SECOND, Ns, RcName

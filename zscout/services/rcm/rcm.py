@@ -20,8 +20,16 @@ from zscout.mesh import Declaration, IncomingQuery, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Operation, RcmState, RcState, StateAsk
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import WakeAt
-from zscout.scheduling.events import ClientLost, Event, HandedOver, LeadTaken, RcReported, Requested, Tick
+from zscout.scheduling.model import (
+    ClientLost,
+    Event,
+    HandedOver,
+    LeadTaken,
+    RcReported,
+    Requested,
+    Tick,
+    WakeAt,
+)
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rcm import convert
 from zscout.services.rcm.history import ArcHistory

@@ -14,8 +14,7 @@ from decimal import Decimal
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState
-from zscout.scheduling.events import RecoveredHold, RecoveredRequest
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import ArcRequest, RecoveredHold, RecoveredRequest
 from zscout.scheduling.patterns import check_patterns
 from zscout.services.rcm import convert
 from zscout.types import SECOND, Grant, Need, Ns, RcName, duration, exact_amounts

@@ -11,8 +11,7 @@ from zscout.keyexpr import is_pattern
 from zscout.mesh import Mesh
 from zscout.messages import Notice, State
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Dropped, HoldEnded, Outcome
-from zscout.scheduling.status import ArcStatus
+from zscout.scheduling.model import ArcStatus, Dropped, HoldEnded, Outcome
 from zscout.services.rcm import convert
 from zscout.services.rcm.forecasts import Forecasts
 from zscout.types import SECOND, ArcId, Ns, Term

@@ -17,9 +17,17 @@ from zscout.mesh import IncomingQuery, Mesh, Refused
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Operation, Release
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Dropped, Effect, Granted, Queued
-from zscout.scheduling.events import Cancelled, HandedOver, Released, Requested
 from zscout.scheduling.forecast import forecast
+from zscout.scheduling.model import (
+    Cancelled,
+    Dropped,
+    Effect,
+    Granted,
+    HandedOver,
+    Queued,
+    Released,
+    Requested,
+)
 from zscout.services.rcm import convert
 from zscout.services.rcm.admission import admit
 from zscout.services.rcm.history import ArcHistory

@@ -12,8 +12,7 @@ from zscout.mesh import Mesh, MeshError, Reply
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Ballot, Proposal
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Effect, Propose
-from zscout.scheduling.events import Vote, VoteOverdue
+from zscout.scheduling.model import Effect, Propose, Vote, VoteOverdue
 from zscout.services.rcm import convert
 from zscout.types import SECOND, RcName
 

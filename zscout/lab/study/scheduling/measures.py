@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from zscout.scheduling.effects import Outcome
+from zscout.scheduling.model import Outcome
 from zscout.scheduling.replay import HoldRecord, Replay
 from zscout.scheduling.workload import Workload
 from zscout.types import ArcId, Ns, RcName

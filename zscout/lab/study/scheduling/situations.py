@@ -16,13 +16,18 @@ from dataclasses import dataclass
 from typing import Final
 
 from zscout.scheduling.core import Core
-from zscout.scheduling.effects import Propose
-from zscout.scheduling.events import LeadTaken, RcJoined, RecoveredHold, RecoveredRequest, Vote
-from zscout.scheduling.instant import play_instant
-from zscout.scheduling.model import Arc
-from zscout.scheduling.state import SchedulerState
-from zscout.scheduling.status import ArcStatus
-from zscout.scheduling.strategy import Strategy
+from zscout.scheduling.model import (
+    Arc,
+    ArcStatus,
+    LeadTaken,
+    Propose,
+    RcJoined,
+    RecoveredHold,
+    RecoveredRequest,
+    Vote,
+)
+from zscout.scheduling.replay import play_instant
+from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.workload import WorkloadRc, excess
 from zscout.types import Ns, Term
 

@@ -17,8 +17,7 @@ from zscout.lab.study.scheduling.measures import (
 from zscout.lab.study.scheduling.situations import Observer, Situation
 from zscout.scheduling import strategies
 from zscout.scheduling.replay import replay
-from zscout.scheduling.state import SchedulerState
-from zscout.scheduling.strategy import Actions, Strategy
+from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.workload import Workload
 from zscout.types import Ns
 
