@@ -359,6 +359,15 @@ def test_a_packet_whose_hold_is_over_does_not_go_out() -> None:
     assert queue.waiting == 0
 
 
+def test_a_robot_is_halted_at_the_end_of_the_hold_under_which_it_was_last_driven() -> None:
+    queue = TransmitQueue(line_rate(9600))
+    fill(queue, 2)
+    queue.offer(place(1), grant(1), RadioCamera(0, 0), 0)  # which leaves the wheels as they are
+    queue.offer(place(0), grant(0), drive(1), 0)
+    assert queue.leave(place(1)) == {0}
+    assert queue.leave(place(0)) == {0, 1}
+
+
 def test_what_a_share_has_no_room_for_is_refused_in_words() -> None:
     queue = TransmitQueue(line_rate(9600))
     queue.join(place(1), Share(Fraction(0), Fraction(10)), 0)

@@ -157,6 +157,10 @@ class TransmitQueue:
                 f"ask for packet_size = {MAX_PACKET}"
             )
         self._release(now)
+        if isinstance(order, RadioDrive):
+            # Driven under a newer hold: the end of an older one that is learned of late halts it no more.
+            for other in self._members.values():
+                other.robots.discard(order.robot)
         member.robots.add(order.robot)
         for queued in self._queue:
             if queued.place == place and _same(queued.order, order):
