@@ -17,10 +17,10 @@ from click.testing import CliRunner
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.cli.common import plain_table, span
 from zscout.cli.main import COMMANDS, main
 from zscout.cli.requests.arguments import gather_needs, parse_duration, parse_need
 from zscout.config.strict import BadInput
+from zscout.terminal import plain_table, span
 
 HEAVY = ("zenoh", "rich", "rerun", "msgspec", "numpy", "cv2")
 

@@ -1,4 +1,4 @@
-"""What the subcommands share: running, joining the mesh, output for people and programs.
+"""What the subcommands share: running, joining the mesh, options.
 
 Zenoh and Rich are imported by the functions that need them: most of a short command's time is imports.
 """
@@ -8,15 +8,13 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import sys
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
 from decimal import Decimal
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
-import msgspec
 
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
 from zscout.config.strict import BadInput, quoted
@@ -24,8 +22,6 @@ from zscout.keyexpr import Role, Token, new_instance
 from zscout.messages import RcmState
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from zscout.behaviors.client.client import Client
 
 LOOK_FOR_RCM: Final = 2.0
@@ -35,8 +31,6 @@ LOOK_FOR_TAKEOVER: Final = 5.0
 STATE_TRIES: Final = 3
 MAX_NAME: Final = 200
 """Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
-NARROW: Final = 110
-"""Columns of a terminal below which tables leave out what matters least."""
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
@@ -192,94 +186,7 @@ async def _within(seconds: float, event: asyncio.Event) -> bool:
     return True
 
 
-# Output
-
-_JSON: Final = msgspec.json.Encoder(decimal_format="number")
-
-
-def print_json(value: Any, stream: IO[str] | None = None) -> None:
-    """One JSON value (structs and Decimals included) on one line, at once."""
-    print_line(_JSON.encode(value).decode(), stream)
-
-
-def print_line(text: str, stream: IO[str] | None = None) -> None:
-    """One plain line, at once, so that a reader of the pipe sees it."""
-    stream = stream or sys.stdout
-    stream.write(text + "\n")
-    stream.flush()
-
-
-def at_terminal(stream: IO[str] | None = None) -> bool:
-    """Whether people look at the stream (default stdout) and it can be drawn on."""
-    return (stream or sys.stdout).isatty() and os.environ.get("TERM") != "dumb"
-
-
-def console(*, stderr: bool = False) -> Console:
-    """A Rich console without guesses: no markup, no highlighting; texts come from other hosts."""
-    from rich.console import Console
-
-    return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
-
-
-def narrow() -> bool:
-    """Whether the terminal has so few columns that tables leave out what matters least."""
-    return console().width < NARROW
-
-
-def print_table(
-    columns: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", stream: IO[str] | None = None
-) -> None:
-    """A table: coloured at a terminal, aligned plain lines elsewhere. Cells are made safe to print."""
-    stream = stream or sys.stdout
-    cells = [[clean(cell) for cell in row] for row in rows]
-    if not at_terminal(stream):
-        for line in plain_table(columns, cells, title):
-            print_line(line, stream)
-        return
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(
-        title=title or None, title_justify="left", box=None, header_style="bold", padding=(0, 2, 0, 0)
-    )
-    for column in columns:
-        # A name or key that is cut short can't be copied.
-        table.add_column(column, overflow="fold")
-    for row in cells:
-        table.add_row(*(Text(cell) for cell in row))
-    console(stderr=stream is sys.stderr).print(table)
-
-
-def plain_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> list[str]:
-    """The lines of a table without colours: two spaces between columns."""
-    widths = [max(len(line[at]) for line in (columns, *rows)) for at in range(len(columns))]
-    lines = [title] if title else []
-    for row in (columns, *rows):
-        padded = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        lines += ["  ".join(padded).rstrip()]
-    return lines
-
-
-def clean(text: str) -> str:
-    """Words from another host, on one line, unable to draw on the terminal."""
-    return "".join(char if char.isprintable() else " " for char in text)
-
-
-def span(seconds: float) -> str:
-    """A span of time as people read it: `0.4 s`, `12 s`, `3 min 5 s`, `2 h 4 min`, `3 d 2 h`."""
-    seconds = max(0.0, seconds)
-    if seconds < 9.95:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    for big, small, big_unit, small_unit in (
-        (86_400, 3600, "d", "h"),
-        (3600, 60, "h", "min"),
-        (60, 1, "min", "s"),
-    ):
-        if whole >= big:
-            rest = whole % big // small
-            return f"{whole // big} {big_unit}" + (f" {rest} {small_unit}" if rest else "")
-    return f"{whole} s"
+# Options and words
 
 
 def json_option(help: str = "Print JSON.") -> Callable[[F], F]:  # noqa: A002 - click's word
@@ -290,3 +197,20 @@ def json_option(help: str = "Print JSON.") -> Callable[[F], F]:  # noqa: A002 - 
 def amount_text(params: Mapping[str, Decimal]) -> str:
     """Bandwidth parameters as people write them: `command_rate=5,other=1`."""
     return ",".join(f"{name}={value.normalize():f}" for name, value in sorted(params.items()))
+
+
+def check_recording(option: str, path: Path | None) -> None:
+    """That a recording can be written there, before anything is done for it. Raises BadInput."""
+    if path is None:
+        return
+    if path.suffix != ".rrd":
+        raise BadInput(f"{option} {path}: viewers know a recording by its name; let it end in .rrd")
+    there = path.exists()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()
+    except OSError as error:
+        why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise BadInput(f"{option} {path}: can't be written ({why}); give another file") from None
+    if not there:
+        path.unlink()

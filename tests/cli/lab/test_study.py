@@ -23,7 +23,7 @@ from tests.cli.tools import COMMAND, Terminal, zscout, zscout_here
 from tests.hang import HANG
 from tests.thorough import times
 from zscout.cli.common import Failed
-from zscout.cli.lab.study_options import MAX_SEED, parse_seeds
+from zscout.cli.lab.options import MAX_SEED, parse_seeds
 from zscout.config.strict import BadInput
 from zscout.lab.plots.recording import VIRTUAL_TIME
 from zscout.lab.study.process_pool import answers

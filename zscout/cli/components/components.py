@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from zscout import terminal
 from zscout.cli import common, completions
 from zscout.cli.components.placing import (
     component_named,
@@ -118,7 +119,7 @@ class Listing:
                     one.spec.kind,
                     one.state.replace("_", " "),
                     f"{one.host or '-'} > {one.to}" if one.to is not None else one.host or "-",
-                    "-" if up is None else common.span(up),
+                    "-" if up is None else terminal.span(up),
                     str(one.restarts),
                     str(one.moves) + (f" ({one.dead * 1000:.0f} ms)" if one.dead is not None else ""),
                     "-" if use is None else f"{use.cpu:.2f}",
@@ -190,9 +191,9 @@ async def _once(name: str | None, *, as_json: bool) -> int:
             await listing.find()
         show_once(listing, as_json=as_json)
         if name is not None and not as_json and (tail := tail_of(listing.placer.placements[name])):
-            common.print_line("\nThe end of its output:")
+            terminal.print_line("\nThe end of its output:")
             for line in tail:
-                common.print_line(line)
+                terminal.print_line(line)
     return 0
 
 
@@ -235,7 +236,7 @@ async def _kinds(*, as_json: bool) -> int:
         )
     if as_json:
         hosts = [{"host": one.host, "kinds": sorted(one.kinds)} for one in nodes]
-        common.print_json({"fleet": fleet, "hosts": hosts})
+        terminal.print_json({"fleet": fleet, "hosts": hosts})
         return 0
     kinds = sorted({kind for one in nodes for kind in one.kinds})
     rows = [(kind, ", ".join(one.host for one in nodes if kind in one.kinds)) for kind in kinds]

@@ -7,6 +7,7 @@ from decimal import Decimal
 
 import click
 
+from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.cli import common, completions
 from zscout.cli.components.placing import (
@@ -62,7 +63,7 @@ async def _drain(host: str, timeout: float | None, *, as_json: bool) -> int:
             at_first = {one.component for one in _there(placer, host)}
 
             def late() -> str:
-                left = common.span(timeout or 0)
+                left = terminal.span(timeout or 0)
                 return f"{host} is not empty after {left}: {_words(_there(placer, host))}; {cordoned}"
 
             async with shown.within(timeout, late, cordoned):
@@ -73,7 +74,7 @@ async def _drain(host: str, timeout: float | None, *, as_json: bool) -> int:
             stay = _there(placer, host)
             moved = [placer.placements[name] for name in sorted(at_first) if _elsewhere(placer, name, host)]
     if as_json:
-        common.print_json(
+        terminal.print_json(
             {
                 "host": host,
                 "moved": [placement_object(one) for one in moved],
@@ -85,7 +86,7 @@ async def _drain(host: str, timeout: float | None, *, as_json: bool) -> int:
         shown.say(f"{one.component} went to {one.host}{took}")
     if stay:
         raise common.Failed(
-            common.clean(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
+            terminal.clean(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
         )
     shown.say(f"{host} is empty; {cordoned}")
     return 0
@@ -95,9 +96,9 @@ async def _uncordon(host: str, *, as_json: bool) -> int:
     async with common.connected("uncordon") as client:
         uncordoned = await placer_of(client).request(UncordonHost(host), Placements)
     if as_json:
-        common.print_json({"host": host, "components": list(map(placement_object, uncordoned.components))})
+        terminal.print_json({"host": host, "components": list(map(placement_object, uncordoned.components))})
     else:
-        common.print_line(f"{host} is used again")
+        terminal.print_line(f"{host} is used again")
     return 0
 
 

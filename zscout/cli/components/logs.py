@@ -9,6 +9,7 @@ from typing import Final
 
 import click
 
+from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.cli import common, completions
@@ -70,7 +71,7 @@ async def _logs(name: str, *, follow: bool, lines: int | None, host: str | None)
             reader.write(last(output.text, lines))
             if follow:
                 await reader.follow(output)
-            elif common.at_terminal() and output.text and not output.text.endswith("\n"):
+            elif terminal.at_terminal() and output.text and not output.text.endswith("\n"):
                 reader.write("\n")
     return 0
 
@@ -212,7 +213,7 @@ class Reader:
             )
         if self._record is not None:
             return common.Failed(
-                common.clean(f"no host knows any output of {self._name}: it {standing(self._record)}")
+                terminal.clean(f"no host knows any output of {self._name}: it {standing(self._record)}")
             )
         with placer_of(self._client) as everyone:
             await everyone.refresh()
@@ -220,13 +221,13 @@ class Reader:
 
     def write(self, text: str) -> None:
         """To stdout, as it is; at a terminal without what could draw on it."""
-        if common.at_terminal():
+        if terminal.at_terminal():
             text = "".join(char if char.isprintable() or char in "\n\t" else " " for char in text)
         sys.stdout.write(text)
         sys.stdout.flush()
 
     def _tell(self, text: str) -> None:
-        common.print_line(common.clean(f"-- {text}"), sys.stderr)
+        terminal.print_line(terminal.clean(f"-- {text}"), sys.stderr)
 
 
 def last(text: str, lines: int | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common, completions
@@ -55,7 +56,7 @@ async def _migrate(name: str, to: str | None, *, as_json: bool) -> int:
                 after = await _moved(placer, shown, before, to)
     dead = after.dead if after.moves > before.moves else None
     if as_json:
-        common.print_json(placement_object(after) | {"from": before.host, "dead": dead})
+        terminal.print_json(placement_object(after) | {"from": before.host, "dead": dead})
     if after.host == before.host:
         shown.say(f"{name} is on {after.host} already")
     else:
@@ -80,16 +81,16 @@ async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: s
     if not begun(record):
         if to == record.host:
             return record
-        raise common.Failed(common.clean(f"{name} was not moved: it {standing(record)}"))
+        raise common.Failed(terminal.clean(f"{name} was not moved: it {standing(record)}"))
     while True:
         if record.state == "running":
             if record.host != before.host:
                 return record
             raise common.Failed(
-                common.clean(f"{name} was not moved, it goes on on {record.host}: {record.reason}")
+                terminal.clean(f"{name} was not moved, it goes on on {record.host}: {record.reason}")
             )
         if record.state in OVER:
-            raise common.Failed(common.clean(f"{name} was not moved: it {standing(record)}"))
+            raise common.Failed(terminal.clean(f"{name} was not moved: it {standing(record)}"))
         shown.update(f"{name} {standing(record)}")
         await placer.wait_changed()
         record = placer.placements.get(name, record)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from msgspec import structs
 
+from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.cli import common
 from zscout.config.strict import BadInput, quoted
@@ -40,7 +41,7 @@ class Progress:
 
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
-        self._watched = not quiet and common.at_terminal()
+        self._watched = not quiet and terminal.at_terminal()
         self._live: Live | None = None
         self._said = ""
 
@@ -54,18 +55,18 @@ class Progress:
 
     def update(self, text: str) -> None:
         """How it stands now."""
-        text = common.clean(text)
+        text = terminal.clean(text)
         if self._watched:
             self._draw(text)
         elif text != self._said and not self._quiet:
-            common.print_line(text)
+            terminal.print_line(text)
         self._said = text
 
     def say(self, text: str) -> None:
         """What has come of it, to stay on the screen."""
         self.hide()
         if not self._quiet:
-            common.print_line(common.clean(text))
+            terminal.print_line(terminal.clean(text))
 
     def hide(self) -> None:
         """Takes the live line away."""
@@ -83,10 +84,10 @@ class Progress:
             async with asyncio.timeout(seconds):
                 yield
         except TimeoutError:
-            raise common.Failed(common.clean(late())) from None
+            raise common.Failed(terminal.clean(late())) from None
         except asyncio.CancelledError:
             self.hide()
-            common.print_line(interrupted, sys.stderr)
+            terminal.print_line(interrupted, sys.stderr)
             raise
 
     def _draw(self, text: str) -> None:
@@ -95,7 +96,7 @@ class Progress:
 
         picture = Text(text, overflow="ellipsis", no_wrap=True)
         if self._live is None:
-            self._live = Live(picture, console=common.console(), transient=True, auto_refresh=False)
+            self._live = Live(picture, console=terminal.console(), transient=True, auto_refresh=False)
             self._live.start()
         self._live.update(picture, refresh=True)
 
@@ -140,7 +141,7 @@ def unknown(name: str, known: Iterable[str]) -> common.Failed:
 
 def tail_of(placement: Placement) -> list[str]:
     """The last lines that a component wrote, unable to draw on the terminal."""
-    return [common.clean(line.expandtabs()) for line in placement.tail.splitlines()]
+    return [terminal.clean(line.expandtabs()) for line in placement.tail.splitlines()]
 
 
 def placement_object(placement: Placement) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any, Final
 import click
 import msgspec
 
+from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common, completions
@@ -231,7 +232,7 @@ async def _start(name: str, spec: ComponentSpec, *, wait: bool, timeout: float |
             def late() -> str:
                 record = placer.placements.get(name)
                 now = f" {standing(record)};" if record is not None else ""
-                return f"{name} does not run after {common.span(timeout or 0)}:{now} {stays}"
+                return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
 
             await placer.refresh()
             before = placer.placements.get(name)
@@ -240,10 +241,10 @@ async def _start(name: str, spec: ComponentSpec, *, wait: bool, timeout: float |
                 async with shown.within(timeout, late, stays):
                     placement = await _until_settled(placer, shown, name, spec)
     if as_json:
-        common.print_json(placement_object(placement))
+        terminal.print_json(placement_object(placement))
     if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
         for line in tail_of(placement):
-            common.print_line(line, sys.stderr)
+            terminal.print_line(line, sys.stderr)
         raise common.Failed(f"{name} {standing(placement)}")
     ran = before is not None and before.state == placement.state == "running"
     if placement.state == "running" or not wait:
@@ -315,7 +316,7 @@ async def _stop(names: list[str], timeout: float | None, *, as_json: bool) -> in
                 ]
 
             def late() -> str:
-                return f"after {common.span(timeout or 0)} {'; '.join(lasting())}; {stays}"
+                return f"after {terminal.span(timeout or 0)} {'; '.join(lasting())}; {stays}"
 
             async with shown.within(timeout, late, stays):
                 ends = await asyncio.gather(*(_end(placer, name) for name in names), return_exceptions=True)
@@ -325,7 +326,7 @@ async def _stop(names: list[str], timeout: float | None, *, as_json: bool) -> in
             last = {end.component: end for end in ends if isinstance(end, Placement)}
             last |= {name: record for name, record in placer.placements.items() if name in last}
     if as_json:
-        common.print_json({"components": [placement_object(one) for one in last.values()]})
+        terminal.print_json({"components": [placement_object(one) for one in last.values()]})
     for one in last.values():
         shown.say(f"{one.component} {standing(one)}")
     failures = [end for end in ends if isinstance(end, BaseException)]

@@ -15,6 +15,7 @@ from typing import Final
 
 import msgspec
 
+from zscout import terminal
 from zscout.cli import common
 from zscout.config.strict import BadInput
 from zscout.services.node import launch
@@ -89,7 +90,7 @@ class Child:
             if not line:
                 self._news.set()
                 return
-            text = common.clean(_COLOURS.sub("", line.decode(errors="replace"))).strip()
+            text = terminal.clean(_COLOURS.sub("", line.decode(errors="replace"))).strip()
             if text:
                 self.lines.append(text)
                 self._news.set()

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from zscout import terminal
 from zscout.cli import common
 from zscout.cli.fleet.fleet_view import FleetView
 from zscout.keyexpr import Keys, Role, Sender, Token
@@ -45,7 +46,7 @@ async def _list(as_json: bool) -> None:
                 {**token._asdict(), "token": own.alive(token), "keys": served(own, token, sharable)}
                 for token in tokens
             ]
-            common.print_json({"fleet": own.fleet, "base": own.base, "links": links, "alive": alive})
+            terminal.print_json({"fleet": own.fleet, "base": own.base, "links": links, "alive": alive})
         else:
             _print(own, tokens, links, sharable)
 
@@ -95,7 +96,7 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
 
 
 def _print(own: Keys, tokens: list[Token], links: int, sharable: set[str] | None) -> None:
-    common.print_line(
+    terminal.print_line(
         f"Fleet {own.fleet}: {len(tokens)} alive, {links} links; all keys lie under {own.base}/"
     )
     rows: list[tuple[str, ...]] = []
@@ -104,10 +105,10 @@ def _print(own: Keys, tokens: list[Token], links: int, sharable: set[str] | None
         keys = served(own, token, sharable) or [{"how": "-", "key": "-", "what": "it is alive"}]
         for number, key in enumerate(keys):
             # People see at once whom a key belongs to; programs want it on each line.
-            who = token[:3] if number == 0 or not common.at_terminal() else ("", "", "")
+            who = token[:3] if number == 0 or not terminal.at_terminal() else ("", "", "")
             rows.append((*who, key["how"], key["key"].removeprefix(f"{own.base}/"), key["what"]))
-    common.print_line("")
+    terminal.print_line("")
     columns: tuple[str, ...] = ("HOST", "ROLE", "NAME", "HOW", "KEY", "WHAT")
-    if common.at_terminal() and common.narrow():
+    if terminal.at_terminal() and terminal.narrow():
         columns, rows = columns[:-1], [row[:-1] for row in rows]
-    common.print_table(columns, rows)
+    terminal.print_table(columns, rows)

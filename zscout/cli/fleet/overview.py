@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from zscout import terminal
 from zscout.cli import common
 from zscout.cli.fleet.fleet_view import FleetView, Host
 from zscout.keyexpr import Role, Token
@@ -81,12 +82,12 @@ def _with_params(hold: HoldView, rc: str) -> str:
 def _running_table(fleet_view: FleetView, state: RcmState) -> Table:
     rows, styles = [], []
     for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
-        left = common.span(hold.remaining) if hold.remaining > 0 else "over"
+        left = terminal.span(hold.remaining) if hold.remaining > 0 else "over"
         rows.append(
             (
                 hold.arc,
                 str(hold.priority),
-                common.span(hold.held),
+                terminal.span(hold.held),
                 f"{left}, keeps" if hold.keep else left,
                 hold.client,
                 " ".join(sorted(hold.needs)),
@@ -102,9 +103,9 @@ def _waiting_table(state: RcmState) -> Table:
             str(number),
             wait.arc,
             str(wait.priority),
-            common.span(wait.waited),
-            common.span(float(wait.min_runtime)),
-            "?" if wait.starts_in is None else f"in {common.span(wait.starts_in)}",
+            terminal.span(wait.waited),
+            terminal.span(float(wait.min_runtime)),
+            "?" if wait.starts_in is None else f"in {terminal.span(wait.starts_in)}",
             str(wait.preemptions),
             wait.client,
             wait.reason,
@@ -132,7 +133,7 @@ def _host_table(fleet_view: FleetView) -> Table:
 
 def _condition(fleet_view: FleetView, name: str, host: Host) -> tuple[str, str]:
     if host.gone is not None:
-        return f"gone for {common.span((clock.now() - host.gone) / SECOND)}", "red"
+        return f"gone for {terminal.span((clock.now() - host.gone) / SECOND)}", "red"
     if not host.tokens:
         return "not there", "red"
     if fleet_view.stale(host):
@@ -173,16 +174,16 @@ def fleet_overview(
 
 
 def print_overview(overview: Overview) -> None:
-    if common.at_terminal():
-        common.console().print(rich_overview(overview))
+    if terminal.at_terminal():
+        terminal.console().print(rich_overview(overview))
         return
-    common.print_line(common.clean(overview.headline))
+    terminal.print_line(terminal.clean(overview.headline))
     for table in overview.tables:
-        rows = [[common.clean(cell) for cell in row] for row in table.rows]
+        rows = [[terminal.clean(cell) for cell in row] for row in table.rows]
         if rows:
-            common.print_line("")
-            for line in common.plain_table(table.columns, rows, table.title):
-                common.print_line(line)
+            terminal.print_line("")
+            for line in terminal.plain_table(table.columns, rows, table.title):
+                terminal.print_line(line)
 
 
 def rich_overview(overview: Overview, *after: Text) -> Group:
@@ -191,8 +192,10 @@ def rich_overview(overview: Overview, *after: Text) -> Group:
     from rich.console import Group
     from rich.text import Text
 
-    narrow = common.narrow()
-    parts: list[Any] = [Text(common.clean(overview.headline), style="bold red" if overview.alarm else "bold")]
+    narrow = terminal.narrow()
+    parts: list[Any] = [
+        Text(terminal.clean(overview.headline), style="bold red" if overview.alarm else "bold")
+    ]
     for table in overview.tables:
         if not table.rows:
             continue
@@ -203,7 +206,7 @@ def rich_overview(overview: Overview, *after: Text) -> Group:
         for at in kept:
             shown.add_column(table.columns[at], header_style="dim", overflow="fold")
         for row, style in zip(table.rows[:MAX_ROWS], table.styles, strict=False):
-            shown.add_row(*(Text(common.clean(row[at])) for at in kept), style=style)
+            shown.add_row(*(Text(terminal.clean(row[at])) for at in kept), style=style)
         parts += [Text(""), shown]
         if len(table.rows) > MAX_ROWS:
             parts.append(Text(f"... {len(table.rows) - MAX_ROWS} more rows: --json has all", style="dim"))

@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 import click
 
+from zscout import terminal
 from zscout.cli import common
 from zscout.cli.fleet.children import (
     Child,
@@ -91,8 +92,8 @@ async def _view(
         children = [recorder] if recorder is not None else []
         shown = recording.url or recording.file
         if not as_json and recorder is not None:
-            common.print_line(f"Recording to {recording.file}")
-            common.print_line(f"Live at {recording.url}")
+            terminal.print_line(f"Recording to {recording.file}")
+            terminal.print_line(f"Live at {recording.url}")
         address: str | None = None
         command = [str(viewer_binary())]
         if not web:
@@ -110,10 +111,10 @@ async def _view(
                 url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
                 address = f"http://{_host(bind)}:{page}/?url={url}&renderer=webgl&hide_welcome_screen=1"
             if as_json:
-                common.print_json({"url": address, "live": recording.url, "file": recording.file})
+                terminal.print_json({"url": address, "live": recording.url, "file": recording.file})
             elif web:
-                common.print_line(f"Open {address}")
-                common.print_line("Ctrl-C ends")
+                terminal.print_line(f"Open {address}")
+                terminal.print_line("Ctrl-C ends")
             await first_to_end([viewer, *children])
 
 
@@ -147,7 +148,7 @@ async def _say_if_alone() -> None:
         async with common.connected("view"):
             pass
     except common.NobodyThere as error:
-        common.print_line(f"zscout: {error}", sys.stderr)
+        terminal.print_line(f"zscout: {error}", sys.stderr)
 
 
 def _check(file: Path) -> None:

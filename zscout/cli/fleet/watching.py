@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AsyncExitStack, contextmanager, suppress
 from typing import Any, Final, Protocol, TypeAlias
 
-from zscout.cli import common
+from zscout import terminal
 from zscout.cli.fleet.overview import Overview, print_overview, rich_overview
 
 EVERY: Final = 1.0
@@ -39,7 +39,7 @@ Show: TypeAlias = Callable[[Displayed], None]
 
 def show_once(shown: Displayed, *, as_json: bool) -> None:
     if as_json:
-        common.print_json(shown.as_object())
+        terminal.print_json(shown.as_object())
     else:
         print_overview(shown.overview())
 
@@ -47,8 +47,8 @@ def show_once(shown: Displayed, *, as_json: bool) -> None:
 def display_for(stack: AsyncExitStack, *, as_json: bool, end: Callable[[], None]) -> Show:
     """What shows it each time; calls `end` when somebody presses q. `stack` clears the terminal up."""
     if as_json:
-        return lambda shown: common.print_json(shown.as_object())
-    if common.at_terminal():
+        return lambda shown: terminal.print_json(shown.as_object())
+    if terminal.at_terminal():
         stack.enter_context(_q_ends(end))
         return _in_place(stack)
     return _blocks()
@@ -75,7 +75,7 @@ def _blocks() -> Show:
         lasting = _lasting(shown.as_object())
         if lasting != last[0]:
             if last[0] is not None:
-                common.print_line("")
+                terminal.print_line("")
             last[0] = lasting
             print_overview(shown.overview())
 
@@ -93,7 +93,7 @@ def _in_place(stack: AsyncExitStack) -> Show:
     from rich.live import Live
     from rich.text import Text
 
-    live = stack.enter_context(Live(console=common.console(), auto_refresh=False))
+    live = stack.enter_context(Live(console=terminal.console(), auto_refresh=False))
 
     def show(shown: Displayed) -> None:
         hint = Text("q or Ctrl-C ends", style="dim")

@@ -8,29 +8,34 @@ from typing import Final
 
 import click
 
+from zscout import terminal
 from zscout.cli import common
-from zscout.cli.groups import DefaultGroup
-from zscout.cli.lab.study_options import (
-    check_recording,
+from zscout.cli.lab.options import (
+    DefaultGroup,
+    check_rrd,
     jobs_option,
     parse_seeds,
-    print_recording,
     rrd_option,
-    run_trials,
     seeds_option,
 )
-from zscout.cli.lab.study_placement import placement
-from zscout.cli.lab.study_robots import robots
-from zscout.config.strict import BadInput
+from zscout.config.strict import BadInput, quoted
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.trial import STRATEGIES, SchedulingJob, run_timed
 
-MAX_TRIALS: Final = 5_000
+MAX_SCHEDULES: Final = 5_000
 """More would fill the memory with their waits."""
-DEFAULT: Final = "schedule"
+MAX_SEEDS: Final = 1_000
+"""More take hours."""
+MAX_NETS: Final = 5_000
+"""At ten seconds each they take half a day."""
+MAX_LISTED: Final = 64
+MAX_CREW: Final = 16
+MAX_BAUD: Final = 1_000_000
+MIN_BAUD: Final = 110
+MAX_SLOT: Final = 3_600
 
 
-@click.group(cls=DefaultGroup, default=DEFAULT)
+@click.group(cls=DefaultGroup, default="schedule")
 def study() -> None:
     """Runs experiments with random workloads in virtual time; `schedule` unless another one is named.
 
@@ -42,10 +47,6 @@ def study() -> None:
       zscout study robots --starts 40
       zscout study schedule --help
     """
-
-
-study.add_command(placement)
-study.add_command(robots)
 
 
 @study.command()
@@ -92,13 +93,15 @@ def schedule(
     compared = list(dict.fromkeys(strategies)) or list(STRATEGIES)
     numbers = parse_seeds(seeds)
     trials = len(chosen) * len(compared) * len(numbers)
-    if trials > MAX_TRIALS:
+    if trials > MAX_SCHEDULES:
         raise BadInput(
-            f"--seeds: {trials} trials are more than {MAX_TRIALS}; ask for fewer seeds or families"
+            f"--seeds: {trials} trials are more than {MAX_SCHEDULES}; ask for fewer seeds or families"
         )
-    check_recording(rrd)
+    check_rrd(rrd)
     # numpy is wanted from here on.
+    from zscout.lab.study.process_pool import run_trials
     from zscout.lab.study.scheduling.summary import Study
+    from zscout.lab.study.scheduling.tables import print_report
 
     result = Study(chosen, compared, numbers)
     planned = [
@@ -114,9 +117,173 @@ def schedule(
 
         record(rrd, report, result.curves)
     if as_json:
-        common.print_json(dataclasses.asdict(report))
+        terminal.print_json(dataclasses.asdict(report))
         return
-    from zscout.cli.lab.study_tables import print_report
-
     print_report(report)
     print_recording(rrd)
+
+
+@study.command()
+@seeds_option("5", "Runs of each kind: so many, or those of seeds A to B.")
+@common.json_option("Print one JSON object instead of tables.")
+@rrd_option(what=" of the load curves")
+def placement(seeds: str, as_json: bool, rrd: Path | None) -> None:
+    """Compares how the load balancer's policies and metrics place components, on simulated hosts.
+
+    Three Place Sensor Nets on three workstations, started at once and a minute apart (Figure 3 of the paper),
+    under every policy; a mixed batch on machines of unlike speed and memory under every metric; and what
+    metric `auto` learns where one figure decides. A seed gives the same on every machine. docs/placement.md
+    says what was found.
+
+    \b
+    Examples:
+      zscout study placement
+      zscout study placement --seeds 50 --json
+      zscout study placement --rrd placement.rrd && zscout view placement.rrd
+    """
+    numbers = parse_seeds(seeds, MAX_SEEDS)
+    check_rrd(rrd)
+    from zscout.lab.study.placement.study import parts
+    from zscout.lab.study.placement.study import study as compare
+    from zscout.lab.study.placement.tables import print_report
+
+    with terminal.progress(len(numbers) * parts()) as advance:
+        report, outcomes = compare(numbers, advance)
+    if rrd is not None:
+        from zscout.lab.plots.placement import record
+
+        record(rrd, report, outcomes)
+    if as_json:
+        terminal.print_json(dataclasses.asdict(report))
+        return
+    print_report(report)
+    print_recording(rrd)
+
+
+@study.command()
+@seeds_option("2", "Runs of each kind in each building: so many, or those of seeds A to B.")
+@click.option("--robots", metavar="LIST", help="How many robots, as in 1-4,8. Default: 1,2,4,6,8.")
+@click.option("--channels", metavar="LIST", help="How many video channels and framegrabbers. Default: 1-4.")
+@click.option("--baud", metavar="LIST", help="Rates of the radio. Default: 300,600,1200,2400,9600.")
+@click.option("--slot", metavar="LIST", help="Seconds of a robot's turn to hide in. Default: 30,60,90.")
+@click.option(
+    "--building",
+    "buildings",
+    multiple=True,
+    metavar="NAME|FILE",
+    help="One that is shipped, `drawn` (another one for each seed), or a TOML file; repeat it for several. "
+    "Default: all shipped, and drawn.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(1, 3_600),
+    default=180.0,
+    show_default=True,
+    help="Of the building, that each run takes.",
+)
+@click.option(
+    "--starts",
+    type=click.IntRange(1, MAX_SEEDS),
+    help="Instead: so many random starts of one robot in each building, 120 s each.",
+)
+@jobs_option
+@common.json_option("Print one JSON object instead of tables; it has every run as well.")
+@rrd_option("--record", what=" of plots")
+@click.option(
+    "--svg",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    metavar="FOLDER",
+    help="Write the plots as SVG files into this folder besides.",
+)
+def robots(
+    seeds: str,
+    robots: str | None,
+    channels: str | None,
+    baud: str | None,
+    slot: str | None,
+    buildings: tuple[str, ...],
+    seconds: float,
+    starts: int | None,
+    processes: int | None,
+    as_json: bool,
+    rrd: Path | None,
+    svg: Path | None,
+) -> None:
+    """Measures Place Sensor Net in simulated buildings: how soon robots are hidden, and what they then see.
+
+    Against the number of robots and of video channels with a framegrabber each; against the rate of the
+    radio, with four robots and four channels; and against the length of their turns, with four robots on one
+    channel. Whatever of --robots, --channels, --baud and --slot is given, only that is tried. Mind, votes and
+    scheduling are those that run live; the mesh is left out, and time is virtual. docs/robots.md says what
+    was found.
+
+    \b
+    Examples:
+      zscout study robots --robots 2,4 --channels 1-2 --seeds 1
+      zscout study robots --baud 300,9600 --building office --json
+      zscout study robots --starts 40
+      zscout study robots --rrd robots.rrd && zscout view robots.rrd
+    """
+    crews = _numbers("--robots", robots, 1, MAX_CREW)
+    channel_counts = _numbers("--channels", channels, 1, MAX_CREW)
+    bauds = _numbers("--baud", baud, MIN_BAUD, MAX_BAUD)
+    slots = _numbers("--slot", slot, 1, MAX_SLOT)
+    numbers = range(starts) if starts is not None else parse_seeds(seeds, MAX_SEEDS)
+    check_rrd(rrd)
+    from zscout.lab.study import robots as nets
+    from zscout.lab.study.process_pool import run_trials
+    from zscout.lab.study.robots_tables import print_report
+
+    names = list(dict.fromkeys(buildings)) or nets.buildings()
+    for name in names:
+        # Those that are drawn have robots.
+        if name != nets.DRAWN and not nets.plan_of(name, 0).robots and starts is not None:
+            raise BadInput(f"--building {name}: there is no robot in it to start; add a [[robot]]")
+    plan = nets.StudyPlan.of(crews, channel_counts, bauds, slots) if starts is None else nets.StudyPlan()
+    planned = plan.jobs(names, numbers, seconds)
+    if len(planned) > MAX_NETS:
+        raise BadInput(f"--seeds: {len(planned)} runs are more than {MAX_NETS}; ask for fewer of something")
+    trials: list[nets.RobotsTrial] = []
+    common.run(run_trials(nets.run, planned, processes, trials.append))
+    found = plan.report(trials)
+    if rrd is not None:
+        from zscout.lab.plots.robots import record
+
+        record(rrd, found.grid, found.radio, found.turns, found.starts)
+    if svg is not None:
+        from zscout.lab.plots.robots_svg import write
+
+        write(svg, found.grid, found.radio)
+    if as_json:
+        shown = dataclasses.asdict(found)
+        terminal.print_json({**shown, "runs": [dataclasses.asdict(trial) for trial in trials]})
+        return
+    print_report(found, names, len(numbers), seconds)
+    print_recording(rrd)
+
+
+def _numbers(option: str, text: str | None, low: int, high: int) -> list[int]:
+    """`1-4,8` is 1, 2, 3, 4 and 8; nothing is nothing. Raises BadInput."""
+    if text is None:
+        return []
+    listed: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        ends = [first, last] if dash else [first, first]
+        if not all(end.isascii() and end.isdigit() and len(end) <= 7 for end in ends):
+            raise BadInput(f"{option} {quoted(text)}: write numbers and ranges of them, as in 1-4,8")
+        begin, end = int(ends[0]), int(ends[1])
+        if not low <= begin <= end <= high:
+            raise BadInput(
+                f"{option} {quoted(text)}: {quoted(part)} is not within {low} to {high}, or backwards"
+            )
+        if len(listed) + end - begin >= MAX_LISTED:
+            raise BadInput(f"{option} {quoted(text)}: these are more than {MAX_LISTED} numbers; give fewer")
+        listed += range(begin, end + 1)
+    return list(dict.fromkeys(listed))
+
+
+def print_recording(rrd: Path | None) -> None:
+    """Where the recording is, and how to look at it."""
+    if rrd is not None:
+        terminal.print_line(f"\nRecording: {rrd} (zscout view {rrd})")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from zscout import terminal
 from zscout.cli import common
 from zscout.cli.requests.arguments import RcName
 from zscout.config.strict import BadInput, quoted
@@ -85,25 +86,8 @@ def drive(robot: str, as_json: bool, **options: Any) -> int:
     """
     if not sys.stdin.isatty():
         raise BadInput("zscout drive reads keys: run it at a terminal, its standard input is none")
-    _check_file(options["record"])
+    common.check_recording("--record", options["record"])
     return common.run(_drive(robot, as_json=as_json, **options))
-
-
-def _check_file(path: Path | None) -> None:
-    """Nobody is preempted for a recording that can't be written. Raises BadInput."""
-    if path is None:
-        return
-    if path.suffix != ".rrd":
-        raise BadInput(f"--record {path}: viewers know a recording by its name; let it end in .rrd")
-    there = path.exists()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("ab").close()
-    except OSError as error:
-        why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise BadInput(f"--record {path}: can't be written ({why}); give another file") from None
-    if not there:
-        path.unlink()
 
 
 async def _drive(
@@ -278,10 +262,10 @@ class _Console:
         self._told: object = None
 
     def __enter__(self) -> _Console:
-        if not self._as_json and common.at_terminal():
+        if not self._as_json and terminal.at_terminal():
             from rich.live import Live
 
-            self._live = Live(console=common.console(), auto_refresh=False, transient=True)
+            self._live = Live(console=terminal.console(), auto_refresh=False, transient=True)
             self._live.start()
         return self
 
@@ -294,12 +278,12 @@ class _Console:
 
     def event(self, event: str, words: str, **more: Any) -> None:
         if self._as_json:
-            common.print_json({"event": event, "robot": self._robot, **more})
+            terminal.print_json({"event": event, "robot": self._robot, **more})
         elif self._live is not None:
             with suppress(OSError):
-                self._live.console.print(common.clean(words), soft_wrap=True)
+                self._live.console.print(terminal.clean(words), soft_wrap=True)
         else:
-            common.print_line(common.clean(words))
+            terminal.print_line(terminal.clean(words))
 
     def update(self, teleop: Teleop) -> None:
         """The state has changed, or the first command was obeyed."""
@@ -343,7 +327,7 @@ class _Console:
         colour = {"driving": "bold green", "waiting": "yellow", "free": "dim"}[teleop.state]
         line.append(f"{self._robot}  {teleop.state}", style=colour)
         if teleop.why:
-            line.append(f": {common.clean(teleop.why)}")
+            line.append(f": {terminal.clean(teleop.why)}")
         if teleop.robot is not None:
             line.append(f"  wheels {wheels.left:+.1f} {wheels.right:+.1f}  speed {teleop.pilot.speed:.1f}")
             line.append(f"  {pictures} pictures/s  {teleop.robot.sent} commands")

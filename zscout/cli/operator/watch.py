@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 from click.shell_completion import CompletionItem
 
+from zscout import terminal
 from zscout.cli import common
 from zscout.config.strict import BadInput
 from zscout.mesh import clock
@@ -180,13 +181,13 @@ class _WatchReport:
 
     def say(self, text: str) -> None:
         """A word about the source, on stderr."""
-        text = common.clean(text)
+        text = terminal.clean(text)
         if self.recording is not None:
             self.recording.event(self.at, text)
-        if self._live is not None and common.at_terminal(sys.stderr):
+        if self._live is not None and terminal.at_terminal(sys.stderr):
             self._live.console.print(text, style="red", soft_wrap=True)
         else:
-            common.print_line(text, sys.stderr)
+            terminal.print_line(text, sys.stderr)
 
     def draw(self, source: Source, event: Event | None) -> None:
         """The live line, now and then."""
@@ -196,39 +197,39 @@ class _WatchReport:
         self._drawn = now
         from rich.text import Text
 
-        of = "" if source.duration is None else f" of {common.span(source.duration)}"
-        line = Text(f"{common.span(self.at)}{of}  {_many(self._events, 'event')}  ", no_wrap=True)
+        of = "" if source.duration is None else f" of {terminal.span(source.duration)}"
+        line = Text(f"{terminal.span(self.at)}{of}  {_many(self._events, 'event')}  ", no_wrap=True)
         if event is None:
             line.append("still", style="green")
         else:
-            line.append(f"moving for {common.span(self.at - event.start)}", style="bold yellow")
+            line.append(f"moving for {terminal.span(self.at - event.start)}", style="bold yellow")
         line.append("  Ctrl-C ends", style="dim")
         self._live.update(line, refresh=True)
 
     def summary(self) -> None:
         share = f" ({100 * self._moving / self.at:.0f} %)" if self.at > 0 else ""
-        line = f"{common.span(self.at)} watched, {_many(self.pictures, 'picture')}; "
-        line += f"{_many(self._events, 'event')}, motion for {common.span(self._moving)}{share}"
-        common.print_line(line, sys.stderr if self._json else sys.stdout)
+        line = f"{terminal.span(self.at)} watched, {_many(self.pictures, 'picture')}; "
+        line += f"{_many(self._events, 'event')}, motion for {terminal.span(self._moving)}{share}"
+        terminal.print_line(line, sys.stderr if self._json else sys.stdout)
 
     def _line(self, text: str, style: str = "") -> None:
         if self._live is not None and not self._live.console.stderr:
             self._live.console.print(text, style=style, soft_wrap=True)
         else:
-            common.print_line(text)
+            terminal.print_line(text)
 
 
 @contextmanager
 def _screen() -> Iterator[Live | None]:
     """The live line, where people look: at stdout, or else at stderr."""
-    here = common.at_terminal(sys.stdout)
-    if not here and not common.at_terminal(sys.stderr):
+    here = terminal.at_terminal(sys.stdout)
+    if not here and not terminal.at_terminal(sys.stderr):
         yield None
         return
     from rich.live import Live
 
     with Live(
-        console=common.console(stderr=not here),
+        console=terminal.console(stderr=not here),
         auto_refresh=False,
         transient=True,
         redirect_stdout=False,
@@ -266,7 +267,7 @@ def _as_json(event: Event) -> str:
 def _words(event: Event) -> str:
     largest = event.boxes[0]
     things = "one thing" if len(event.boxes) == 1 else f"{len(event.boxes)} things"
-    end = "and goes on" if event.going_on else f"for {common.span(event.end - event.start)}"
+    end = "and goes on" if event.going_on else f"for {terminal.span(event.end - event.start)}"
     return (
         f"{event.start:9.2f} to {event.end:.2f} s: motion {end}, {things} at the peak, the largest "
         f"{largest.width}x{largest.height} at {largest.x},{largest.y}"

@@ -7,21 +7,11 @@ from typing import Any, Final, NamedTuple
 import click
 
 from zscout.behaviors.client.client import TRY_AGAIN, Client
-from zscout.cli.common import (
-    Failed,
-    NobodyThere,
-    arc_named,
-    clean,
-    connected,
-    json_option,
-    print_json,
-    print_line,
-    run,
-    state_of,
-)
+from zscout.cli.common import Failed, NobodyThere, arc_named, connected, json_option, run, state_of
 from zscout.config.strict import quoted
 from zscout.keyexpr import check_name, client_of
 from zscout.messages import Cancel, Notice, RcmState, Release
+from zscout.terminal import clean, print_json, print_line
 
 TRIES: Final = 3
 TIMEOUT: Final = 1.0

@@ -6,9 +6,9 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from zscout.cli.common import clean, span
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import HoldView, RcmState
+from zscout.terminal import clean, span
 
 
 @dataclass(frozen=True, slots=True)

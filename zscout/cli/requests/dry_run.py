@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from zscout.cli.common import NobodyThere, clean, connected, print_json, print_line, span
+from zscout.cli.common import NobodyThere, connected
 from zscout.cli.requests.options import HoldOptions
 from zscout.messages import Foresight
+from zscout.terminal import clean, print_json, print_line, span
 
 
 async def foresee(wanted: HoldOptions) -> int:

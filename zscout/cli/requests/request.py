@@ -11,7 +11,7 @@ import click
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import OpenArc
-from zscout.cli.common import Failed, clean, connected, fleet_file, run, span
+from zscout.cli.common import Failed, connected, fleet_file, run
 from zscout.cli.requests.arguments import (
     Need,
 )
@@ -21,6 +21,7 @@ from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather,
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.waiting import Report
 from zscout.mesh import clock
+from zscout.terminal import clean, span
 
 TAKEN_AWAY: Final = 75
 """EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""

@@ -13,10 +13,10 @@ from msgspec.structs import replace
 
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
-from zscout.cli.common import at_terminal, clean, console, print_json, print_line, span
 from zscout.cli.requests.contention import contention_of, held_text
 from zscout.mesh import clock
 from zscout.messages import RcmState
+from zscout.terminal import at_terminal, clean, console, print_json, print_line, span
 from zscout.types import SECOND, Ns
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 from msgspec import structs
 
+from zscout import terminal
 from zscout.cli import common
 from zscout.cli.requests.contention import NeedContention, contention_of, hold_json
 from zscout.config.strict import quoted
@@ -42,14 +43,14 @@ def why(arc: str, as_json: bool) -> None:
     """
     found = common.run(_look(common.arc_named(arc)))
     if as_json:
-        common.print_json(found)
+        terminal.print_json(found)
         return
     for number, one in enumerate(found["arcs"]):
         if number:
-            common.print_line("")
+            terminal.print_line("")
         for line, style in _words(one):
             # `secho` leaves the colours out in a pipe.
-            click.secho(common.clean(line), **style)
+            click.secho(terminal.clean(line), **style)
 
 
 async def _look(asked: str) -> dict[str, Any]:
@@ -149,7 +150,7 @@ def _words(arc: dict[str, Any]) -> Iterator[Line]:
         for need in arc["needs"]:
             yield from _need_words(need)
     yield "Story", _BOLD
-    spans = [f"{common.span(line['ago'])} ago" for line in arc["story"]]
+    spans = [f"{terminal.span(line['ago'])} ago" for line in arc["story"]]
     width = max(map(len, spans), default=0)
     for span, line in zip(spans, arc["story"], strict=True):
         yield f"  {span:>{width}}  {line['text']}", _PLAIN
@@ -157,20 +158,20 @@ def _words(arc: dict[str, Any]) -> Iterator[Line]:
 
 def _standing(arc: dict[str, Any]) -> Iterator[Line]:
     who = f"{arc['arc']} (id {arc['id']}, of {arc['client']}, priority {arc['priority']})"
-    runtime = common.span(float(arc["min_runtime"]))
+    runtime = terminal.span(float(arc["min_runtime"]))
     if arc["state"] == "running":
-        yield f"{who} has run for {common.span(arc['held'])}", {"bold": True, "fg": "green"}
-        left = f"{common.span(arc['remaining'])} left" if arc["remaining"] > 0 else "nothing left"
+        yield f"{who} has run for {terminal.span(arc['held'])}", {"bold": True, "fg": "green"}
+        left = f"{terminal.span(arc['remaining'])} left" if arc["remaining"] > 0 else "nothing left"
         after = "; it keeps what it has after that" if arc["keep"] else ""
         yield f"  {left} of its minimum runtime of {runtime}{after}", _PLAIN
         return
-    yield f"{who} has waited for {common.span(arc['waited'])}", {"bold": True, "fg": "yellow"}
+    yield f"{who} has waited for {terminal.span(arc['waited'])}", {"bold": True, "fg": "yellow"}
     yield f"  {arc['reason']}", _PLAIN
     ahead = arc["ahead"]
     place = "nobody is ahead of it" if not ahead else f"{ahead} {'is' if ahead == 1 else 'are'} ahead of it"
     yield f"  {place} in the queue of {arc['queued']}; it wants {runtime}", _PLAIN
     if arc.get("starts_in") is not None:
-        yield f"  it may start in {common.span(arc['starts_in'])}, if nothing else comes", _PLAIN
+        yield f"  it may start in {terminal.span(arc['starts_in'])}, if nothing else comes", _PLAIN
     else:
         yield "  no start can be foretold as things stand", _PLAIN
     if arc["preemptions"]:
@@ -194,7 +195,7 @@ def _need_words(need: dict[str, Any]) -> Iterator[Line]:
         yield (
             f"{name}: {which}{'shared with' if need['sharable'] else 'held by'} {holder['arc']}"
             + (f" ({share})" if share else "")
-            + f" of {holder['client']}, priority {holder['priority']}, for {common.span(holder['held'])}; "
+            + f" of {holder['client']}, priority {holder['priority']}, for {terminal.span(holder['held'])}; "
             + _left(holder),
             _PLAIN,
         )
@@ -203,7 +204,7 @@ def _need_words(need: dict[str, Any]) -> Iterator[Line]:
 def _left(hold: dict[str, Any]) -> str:
     if hold["remaining"] <= 0:
         return "its minimum runtime is over"
-    return f"{common.span(hold['remaining'])} left" + (" at least" if hold["keep"] else "")
+    return f"{terminal.span(hold['remaining'])} left" + (" at least" if hold["keep"] else "")
 
 
 def _times(count: int) -> str:

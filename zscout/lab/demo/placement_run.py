@@ -4,16 +4,20 @@ really work."""
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import tempfile
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
 from zscout.keyexpr import Sender
 from zscout.lab import LabError
 from zscout.lab.demo.runner import HOSTS, DemoRunner
+from zscout.lab.demo.screen import keep_recording
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.messages import (
     ComponentSpec,
@@ -33,6 +37,10 @@ START: Final = 30.0
 """Seconds within which everything must be there."""
 PLACE: Final = 20.0
 REPORT: Final = 20.0
+GAP: Final = 5.0
+SCENARIOS: Final = {"at-once": 0.0, "staggered": GAP}
+"""Seconds from one net to the next."""
+TITLES: Final = {"at-once": "all at once", "staggered": f"one net every {GAP:g} s"}
 SHOWN: Final = 2
 """Reports of each host while all components work."""
 
@@ -159,8 +167,80 @@ class PlacementDemo(DemoRunner):
             await self._mesh.close()
 
 
-def as_object(trial: PlacementTrial) -> dict[str, object]:
-    """For --json."""
+# On the screen
+
+
+async def play(chosen: Sequence[tuple[str, Policy]], out: Path | None, *, as_json: bool) -> int:
+    """One trial for each scenario and policy, on fresh nodes; returns the exit code. Raises LabError,
+    MeshError."""
+    began, done = time.monotonic(), []
+
+    def show(at: float, text: str) -> None:
+        if not as_json:
+            terminal.print_line(f"{at:7.2f} s  {terminal.clean(text)}")
+
+    for number, (scenario, policy) in enumerate(chosen, start=1):
+        if not as_json:
+            title = f"{policy}, {TITLES[scenario]}"
+            terminal.print_line(f"Trial {number} of {len(chosen)}: {title}; starting three nodes")
+        with tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
+            trial = PlacementTrial(policy, SCENARIOS[scenario])
+            async with PlacementDemo(Path(folder), trial, show) as demo:
+                await demo.run()
+            if out is not None:
+                keep_recording(Path(folder), out / f"{scenario}-{policy}.rrd")
+        done.append((scenario, trial))
+    failures = [why for scenario, trial in done if (why := _failure(scenario, trial))]
+    if as_json:
+        trials = [{"scenario": scenario, **_as_object(trial)} for scenario, trial in done]
+        terminal.print_json({"trials": trials, "failures": failures})
+        return 1 if failures else 0
+    terminal.print_line("")
+    _table(done)
+    terminal.print_line("")
+    for why in failures:
+        terminal.print_line(why)
+    if not failures:
+        terminal.print_line(f"As Figure 3 has it, and its cure ({time.monotonic() - began:.0f} s).")
+    if out is not None:
+        terminal.print_line(f"Recordings: {out}; look at one: zscout view {out}/at-once-pending.rrd")
+    return 1 if failures else 0
+
+
+def _failure(scenario: str, trial: PlacementTrial) -> str:
+    """What is not as it must be; empty if all is."""
+    counts = "-".join(map(str, trial.counts().values()))
+    if trial.policy == "pending" and trial.spread() > 1:
+        return f"pending, {TITLES[scenario]}: {counts} is not within one component"
+    if trial.policy == "least_loaded" and scenario == "at-once" and max(trial.counts().values()) < 12:
+        return f"least_loaded, all at once: {counts}, where the paper has all on one host"
+    if scenario == "staggered" and not all(trial.counts().values()):
+        return f"{trial.policy}, {TITLES[scenario]}: {counts} leaves a host unused"
+    return ""
+
+
+def _table(done: list[tuple[str, PlacementTrial]]) -> None:
+    hosts = list(done[0][1].counts())
+    rows = []
+    for scenario, trial in done:
+        counts = trial.counts()
+        rows.append(
+            [
+                TITLES[scenario],
+                trial.policy,
+                *(str(counts[host]) for host in hosts),
+                str(trial.spread()),
+                f"{trial.apart():.2f}",
+            ]
+        )
+    terminal.print_table(
+        ["started", "policy", *hosts, "spread", "load apart"],
+        rows,
+        title="Components of three Place Sensor Nets on each host; load apart in cores, at the end",
+    )
+
+
+def _as_object(trial: PlacementTrial) -> dict[str, object]:
     return {
         "policy": trial.policy,
         "gap": trial.gap,

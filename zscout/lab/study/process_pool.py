@@ -15,19 +15,34 @@ import signal
 import threading
 import traceback
 from collections.abc import AsyncGenerator, Callable, Sequence
-from contextlib import suppress
+from contextlib import aclosing, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Final, Generic, TypeVar
 
+from zscout import terminal
 from zscout.config.strict import BadInput
 from zscout.lab import LabError
 
 ENDING: Final = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+MAX_PROCESSES: Final = 256
 REMEDY: Final = "use fewer with --jobs 1"
 
 J = TypeVar("J")
 A = TypeVar("A")
+
+
+async def run_trials(
+    work: Callable[[J], A], jobs: Sequence[J], processes: int | None, take: Callable[[A], None]
+) -> None:
+    """Hands the answers of `work` to `take`, in the order of the jobs, with a bar at a terminal; on all
+    processors unless `processes` says on how many. Raises what `answers` raises."""
+    processes = processes or min(MAX_PROCESSES, len(os.sched_getaffinity(0)))
+    with terminal.progress(len(jobs)) as advance:
+        async with aclosing(answers(work, jobs, processes)) as found:
+            async for answer in found:
+                take(answer)
+                advance()
 
 
 async def answers(work: Callable[[J], A], jobs: Sequence[J], processes: int) -> AsyncGenerator[A, None]:

@@ -1,4 +1,4 @@
-"""What the commands of `zscout demo` share: a run on the screen, and the recording that it leaves."""
+"""What the demos share: a run on the screen, and the recording that it leaves."""
 
 from __future__ import annotations
 
@@ -9,42 +9,21 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
-import click
-
-from zscout.cli import common
-from zscout.config.strict import BadInput
+from zscout import terminal
+from zscout.lab.demo.runner import RECORDINGS, DemoRunner
 
 if TYPE_CHECKING:
     from rich.console import Group
+    from rich.live import Live
     from rich.text import Text
-
-    from zscout.lab.demo.runner import DemoRunner
 
 FOLDER: Final = Path("runs")
 FRAMES: Final = 4
 """Drawings a second at a terminal."""
 
-F = TypeVar("F", bound=Callable[..., Any])
 D = TypeVar("D", bound="DemoRunner")
-
-
-def recording_option(command: F) -> F:
-    """`--out FILE`, checked."""
-    return click.option(
-        "--out",
-        metavar="FILE",
-        type=click.Path(path_type=Path),
-        callback=_checked,
-        help="The recording. Default: runs/demo-….rrd",
-    )(command)
-
-
-def _checked(_context: click.Context, _option: click.Parameter, out: Path | None) -> Path | None:
-    if out is not None and out.suffix != ".rrd":
-        raise BadInput(f"--out {out}: viewers know a recording by its name; let it end in .rrd")
-    return out
 
 
 class DemoScreen:
@@ -52,19 +31,19 @@ class DemoScreen:
 
     def __init__(self, *, as_json: bool, decimals: int) -> None:
         """`decimals` of the events' seconds."""
-        self.plain = not as_json and not common.at_terminal()
-        self._drawn = not as_json and common.at_terminal()
+        self._plain = not as_json and not terminal.at_terminal()
+        self._drawn = not as_json and not self._plain
         self._decimals = decimals
         self._events: list[str] = []
 
     def print_line(self, text: str) -> None:
         """A line of a pipe."""
-        if self.plain:
-            common.print_line(text)
+        if self._plain:
+            terminal.print_line(text)
 
     def show(self, at: float, text: str) -> None:
         """An event, `at` in seconds."""
-        self._events.append(f"{at:6.{self._decimals}f} s  {common.clean(text)}")
+        self._events.append(f"{at:6.{self._decimals}f} s  {terminal.clean(text)}")
         self.print_line(self._events[-1])
 
     def latest(self, count: int) -> list[Text]:
@@ -82,22 +61,22 @@ class DemoScreen:
             demo = make(Path(folder))
             try:
                 # The picture stays until all processes have ended: that takes some seconds.
-                with self._picture(lambda: draw(demo)) if self._drawn else nullcontext():
+                with picture(lambda: draw(demo)) if self._drawn else nullcontext():
                     async with demo:
                         await demo.run()
             except BaseException:
                 if keep_recording(Path(folder), path):
-                    click.echo(f"the recording until then: {path}", err=True)
+                    terminal.print_line(f"the recording until then: {path}", sys.stderr)
                 raise
             keep_recording(Path(folder), path)
         return demo, path
 
-    @contextmanager
-    def _picture(self, draw: Callable[[], Group]) -> Iterator[None]:
-        from rich.live import Live
 
-        with Live(get_renderable=draw, console=common.console(), refresh_per_second=FRAMES, transient=True):
-            yield
+def picture(draw: Callable[[], Group]) -> Live:
+    """What `draw` gives, in place, again and again."""
+    from rich.live import Live
+
+    return Live(get_renderable=draw, console=terminal.console(), refresh_per_second=FRAMES, transient=True)
 
 
 @contextmanager
@@ -105,17 +84,9 @@ def _recording(out: Path | None) -> Iterator[Path]:
     """The recording's file, made beforehand: a bad place is known at once. It goes if it stays empty."""
     from zscout.services.recorder.files import new_recording, prune
 
+    path = out or new_recording(FOLDER, "demo")
     if out is None:
-        path = new_recording(FOLDER, "demo")
         prune(FOLDER, "demo")
-    else:
-        path = out
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.open("ab").close()
-        except OSError as error:
-            why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
-            raise BadInput(f"--out {path}: can't be written ({why}); give another file") from None
     try:
         yield path
     finally:
@@ -125,8 +96,6 @@ def _recording(out: Path | None) -> Iterator[Path]:
 
 def keep_recording(folder: Path, path: Path) -> bool:
     """Moves the recording out of the demo's folder; False if there is none."""
-    from zscout.lab.demo.runner import RECORDINGS
-
     recorded = next((folder / RECORDINGS).glob("*.rrd"), None)
     if recorded is not None:
         shutil.move(recorded, path)

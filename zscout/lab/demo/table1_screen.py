@@ -1,23 +1,21 @@
-"""`zscout demo table1`: the paper's example on a live mesh, compared with what the paper reports."""
+"""`zscout demo table1` on the screen: who holds what, and how that compares with the paper."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Set
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-import click
-
-from zscout.cli import common
-from zscout.cli.lab.demo_screen import DemoScreen, how_to_view, recording_option
+from zscout import terminal
+from zscout.lab.demo.screen import DemoScreen, how_to_view
+from zscout.lab.demo.table1_run import Table1Demo
+from zscout.lab.demo.tables import Difference, Observed, Paper, Table, differences, paper
+from zscout.mesh import clock
 from zscout.types import SECOND
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.text import Text
-
-    from zscout.lab.demo.table1_run import Table1Demo
-    from zscout.lab.demo.tables import Difference, Observed, Paper, Table
 
 LINES: Final = 7
 """Events shown below the growing table."""
@@ -39,29 +37,8 @@ WIDE: Final = 26
 """Columns left of the first second."""
 
 
-@click.command()
-@recording_option
-@common.json_option("Print the tables as JSON.")
-def table1(out: Path | None, as_json: bool) -> int:
-    """Play Table 1 of the paper on a live mesh, and compare what happens with Table 2.
-
-    It starts three nodes with four devices and five programs on this machine, apart from every other fleet,
-    for about 25 seconds, and records them. Nothing is left but the recording. Exit code 1: a cell differs.
-
-    \b
-    Examples:
-      zscout demo table1
-      zscout demo table1 --out demo.rrd --json
-    """
-    return common.run(_demo(out, as_json=as_json))
-
-
-async def _demo(out: Path | None, *, as_json: bool) -> int:
-    # Zenoh is loaded here: the help needs none of it.
-    from zscout.lab.demo.table1_run import Table1Demo
-    from zscout.lab.demo.tables import differences, paper
-    from zscout.mesh import clock
-
+async def play(out: Path | None, *, as_json: bool) -> int:
+    """Plays it; returns the exit code. Raises what `Table1Demo` raises."""
     expected = paper()
     rcs, seconds = list(expected.table), len(next(iter(expected.table.values())))
     began = clock.now()
@@ -77,7 +54,7 @@ async def _demo(out: Path | None, *, as_json: bool) -> int:
     wrong = differences(expected.table, published, bodies)
     took = (now - began) / SECOND
     if as_json:
-        common.print_json(
+        terminal.print_json(
             {
                 "paper": expected.table,
                 "published": published,
@@ -96,33 +73,29 @@ async def _demo(out: Path | None, *, as_json: bool) -> int:
 def _report(
     tables: dict[str, Table], wrong: list[Difference], seen: Observed, path: Path, took: float
 ) -> None:
-    console = common.console()
-    _print(console, "")
+    console = terminal.console()
+    terminal.print_line("")
     for source, meaning in SOURCES.items():
-        _print(console, f"{source:<6} {meaning}")
+        terminal.print_line(f"{source:<6} {meaning}")
     for line in _lines(tables, {(item.rc, item.second) for item in wrong}):
         console.print(line, soft_wrap=True)
-    _print(console, "")
+    terminal.print_line("")
     rows = [
         [host, *(f"{load:.2f}" for load in report.load_average), f"{report.cpu:.0f} %", str(report.number)]
         for host, report in sorted(seen.loads.items())
     ]
-    common.print_table(["host", "load 1 min", "5 min", "15 min", "CPU", "reports"], rows)
-    _print(console, "")
+    terminal.print_table(["host", "load 1 min", "5 min", "15 min", "CPU", "reports"], rows)
+    terminal.print_line("")
     if wrong:
         for item in wrong:
             words = f"the RCM {item.published}, the ARCs {item.bodies}, the paper {item.paper}"
-            _print(console, f"differs: {item.rc} in second {item.second}: {words}")
-        _print(console, "a very busy machine can do that; try again")
+            terminal.print_line(f"differs: {item.rc} in second {item.second}: {words}")
+        terminal.print_line("a very busy machine can do that; try again")
     else:
         cells = sum(len(row) for row in tables["paper"].values())
-        _print(console, f"All {cells} cells are those of the paper's Table 2 ({took:.0f} s).")
+        terminal.print_line(f"All {cells} cells are those of the paper's Table 2 ({took:.0f} s).")
     for words in how_to_view(path):
-        _print(console, words)
-
-
-def _print(console: Any, text: str) -> None:
-    console.print(text, soft_wrap=True)
+        terminal.print_line(words)
 
 
 def _lines(tables: dict[str, Table], wrong: Set[tuple[str, int]] = frozenset()) -> Iterator[Text]:
@@ -148,8 +121,6 @@ def _picture(demo: Table1Demo, expected: Paper, screen: DemoScreen) -> Group:
     """Who holds what, growing with time, and the latest events."""
     from rich.console import Group
     from rich.text import Text
-
-    from zscout.mesh import clock
 
     rcs, seconds = list(expected.table), len(next(iter(expected.table.values())))
     head = "Table 1 of the paper on three nodes of this machine: starting them"

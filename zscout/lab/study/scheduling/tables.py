@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from zscout.cli.common import print_line, print_table
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.summary import (
     Degeneracy,
@@ -10,6 +9,7 @@ from zscout.lab.study.scheduling.summary import (
     SchedulingReport,
     StrategyReport,
 )
+from zscout.terminal import print_line, print_table
 
 
 def print_report(report: SchedulingReport) -> None:

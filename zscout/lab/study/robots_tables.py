@@ -1,0 +1,94 @@
+"""What `zscout study robots` prints for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from zscout import terminal
+from zscout.lab.study.robots import FieldFigures, Quantiles, RobotsReport
+
+COLUMNS: Final = (
+    "all placed (10-90 %)",
+    "placed",
+    "truly dark",
+    "walks noticed",
+    "crossings in 1 s",
+    "false/h",
+    "preempted",
+    "unheld",
+    "stands in",
+)
+
+
+def print_report(found: RobotsReport, names: Sequence[str], seeds: int, seconds: float) -> None:
+    where = f"{seconds:g} s, {seeds} seed{'s' * (seeds != 1)} in each of {', '.join(names)}"
+    radio, turns = found.radio[:1], found.turns[:1]
+    tables: list[tuple[str, tuple[str, ...], list[FieldFigures]]] = [
+        (f"Robots and video channels: {where}", ("robots", "channels"), found.grid),
+        (f"The radio, {_means(radio)}: {where}", ("baud", "command_rate"), found.radio),
+        (f"Turns, {_means(turns)}: {where}", ("slot",), found.turns),
+    ]
+    tables = [table for table in tables if table[2]]
+    for number, (title, keys, figures) in enumerate(tables):
+        if number:
+            terminal.print_line("")
+        terminal.print_table(
+            [*(key.replace("command_rate", "commands/s") for key in keys), *COLUMNS],
+            [[*(f"{getattr(one, key):g}" for key in keys), *_cells(one)] for one in figures],
+            title=title,
+        )
+    if found.starts:
+        terminal.print_table(
+            ["building", "starts", "truly dark", "and facing the light", "seconds (10-90 %)", "bumps"],
+            [
+                [
+                    one.building,
+                    str(one.starts),
+                    f"{one.dark} ({one.dark / one.starts:.0%})",
+                    f"{one.good} ({one.good / one.starts:.0%})",
+                    spread_text(one.seconds),
+                    f"{one.bumped:.1f} s",
+                ]
+                for one in found.starts
+            ],
+            title="One robot, random starts: hidden within 120 s",
+        )
+
+
+def _means(figures: Sequence[FieldFigures]) -> str:
+    """`4 robots, 1 channel`; nothing for none."""
+    return "".join(
+        f"{one.robots} robots, {one.channels} channel{'s' * (one.channels != 1)}" for one in figures
+    )
+
+
+def _cells(one: FieldFigures) -> list[str]:
+    return [
+        spread_text(one.all_placed),
+        percent(one.placed),
+        percent(one.dark),
+        f"{percent(one.noticed)} of {one.walks}",
+        f"{percent(one.alerted)} of {one.crossings}",
+        "-" if math.isnan(one.false_alarms) else f"{one.false_alarms:.1f}",
+        f"{one.preemptions:.1f}",
+        f"{one.turned_unheld:.1f} s",
+        f"{one.longest_stop:.1f} s",
+    ]
+
+
+def percent(share: float) -> str:
+    """`95 %`, or a dash where there was nothing to have a share of."""
+    return "-" if math.isnan(share) else f"{share:.0%}"
+
+
+def spread_text(spread: Quantiles) -> str:
+    """`41 s (30-77)`; what never came to an end is `never`."""
+    if math.isnan(spread.median):
+        return "-"
+    low, median, high = (
+        f"{value:.0f}" if math.isfinite(value) else "never"
+        for value in (spread.low, spread.median, spread.high)
+    )
+    return f"{median}{' s' * (median != 'never')} ({low}-{high})"

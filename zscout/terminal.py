@@ -1,0 +1,232 @@
+"""Output for people and programs: lines, JSON, tables, a bar, pictures in place; and keys that are typed.
+
+Rich is imported by the functions that need it: most of a short command's time is imports.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import IO, TYPE_CHECKING, Any, Final, Self
+
+import msgspec
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.live import Live
+
+NARROW: Final = 110
+"""Columns of a terminal below which tables leave out what matters least."""
+MAX_TYPED: Final = 1_024
+
+_JSON: Final = msgspec.json.Encoder(decimal_format="number")
+
+
+def print_json(value: Any, stream: IO[str] | None = None) -> None:
+    """One JSON value (structs and Decimals included) on one line, at once."""
+    print_line(_JSON.encode(value).decode(), stream)
+
+
+def print_line(text: str, stream: IO[str] | None = None) -> None:
+    """One plain line, at once, so that a reader of the pipe sees it."""
+    stream = stream or sys.stdout
+    stream.write(text + "\n")
+    stream.flush()
+
+
+def at_terminal(stream: IO[str] | None = None) -> bool:
+    """Whether people look at the stream (default stdout) and it can be drawn on."""
+    return (stream or sys.stdout).isatty() and os.environ.get("TERM") != "dumb"
+
+
+def console(*, stderr: bool = False) -> Console:
+    """A Rich console without guesses: no markup, no highlighting; texts come from other hosts."""
+    from rich.console import Console
+
+    return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+
+
+def narrow() -> bool:
+    """Whether the terminal has so few columns that tables leave out what matters least."""
+    return console().width < NARROW
+
+
+def clean(text: str) -> str:
+    """Words from another host, on one line, unable to draw on the terminal."""
+    return "".join(char if char.isprintable() else " " for char in text)
+
+
+def span(seconds: float) -> str:
+    """A span of time as people read it: `0.4 s`, `12 s`, `3 min 5 s`, `2 h 4 min`, `3 d 2 h`."""
+    seconds = max(0.0, seconds)
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    for big, small, big_unit, small_unit in (
+        (86_400, 3600, "d", "h"),
+        (3600, 60, "h", "min"),
+        (60, 1, "min", "s"),
+    ):
+        if whole >= big:
+            rest = whole % big // small
+            return f"{whole // big} {big_unit}" + (f" {rest} {small_unit}" if rest else "")
+    return f"{whole} s"
+
+
+def many(count: int, what: str) -> str:
+    """`1 link`, `2 links`."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+# Tables
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "") -> None:
+    """A table: coloured at a terminal, aligned plain lines elsewhere. Cells are made safe to print."""
+    cells = [[clean(cell) for cell in row] for row in rows]
+    if not at_terminal():
+        for line in plain_table(columns, cells, title):
+            print_line(line)
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title=title or None, title_justify="left", box=None, header_style="bold", padding=(0, 2, 0, 0)
+    )
+    for column in columns:
+        # A name or key that is cut short can't be copied.
+        table.add_column(column, overflow="fold")
+    for row in cells:
+        table.add_row(*(Text(cell) for cell in row))
+    console().print(table)
+
+
+def plain_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> list[str]:
+    """The lines of a table without colours: two spaces between columns."""
+    widths = [max(len(line[at]) for line in (columns, *rows)) for at in range(len(columns))]
+    lines = [title] if title else []
+    for row in (columns, *rows):
+        padded = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        lines += ["  ".join(padded).rstrip()]
+    return lines
+
+
+# Drawn in place
+
+
+class LiveLine:
+    """Drawn in place at a terminal, while lines that stay are printed above it; nothing is drawn elsewhere,
+    or if not `shown`. A context manager: it is gone afterwards, but for one that `stays`."""
+
+    def __init__(self, stream: IO[str] | None = None, *, shown: bool = True, stays: bool = False) -> None:
+        self._stream = stream or sys.stdout
+        self._stays = stays
+        self._live: Live | None = None
+        self.watched = shown and at_terminal(self._stream)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.hide()
+
+    def draw(self, picture: str | RenderableType) -> None:
+        """Draws it anew. A text is cut at the terminal's edge."""
+        if not self.watched:
+            return
+        from rich.live import Live
+        from rich.text import Text
+
+        if isinstance(picture, str):
+            text = "\n".join(map(clean, picture.split("\n")))
+            picture = Text(text, overflow="ellipsis", no_wrap=True)
+        # Where the terminal is gone, its keys' end or a signal ends the command.
+        with suppress(OSError):
+            if self._live is None:
+                self._live = Live(
+                    picture,
+                    console=console(stderr=self._stream is sys.stderr),
+                    transient=not self._stays,
+                    auto_refresh=False,
+                    redirect_stdout=False,
+                    redirect_stderr=False,
+                )
+                self._live.start()
+            self._live.update(picture, refresh=True)
+
+    def print(self, text: str, style: str = "") -> None:
+        """A line that stays."""
+        if self._live is None:
+            print_line(clean(text), self._stream)
+        else:
+            with suppress(OSError):
+                self._live.console.print(clean(text), style=style, soft_wrap=True)
+
+    def hide(self) -> None:
+        """Takes it away: the terminal is another's now."""
+        if self._live is not None:
+            with suppress(OSError):
+                self._live.stop()
+            self._live = None
+
+
+@contextmanager
+def progress(total: int) -> Iterator[Callable[[], None]]:
+    """A bar at a terminal, on stderr; call what it yields once for each of `total` trials."""
+    if not at_terminal(sys.stderr):
+        yield lambda: None
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns: list[Any] = [TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()]
+    with Progress(*columns, console=console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda: bar.advance(task)
+
+
+# Keys
+
+
+@contextmanager
+def typed_keys(pressed: Callable[[bytes], None], ended: Callable[[], None]) -> Iterator[None]:
+    """Calls `pressed` with each key typed at the terminal, and `ended` when that is gone. Keys come one by
+    one and are not echoed; the terminal is as before afterwards."""
+    import termios
+    import tty
+
+    loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+
+    def readable() -> None:
+        try:
+            typed = os.read(terminal, MAX_TYPED)
+        except OSError:
+            typed = b""
+        if not typed:
+            loop.remove_reader(terminal)
+            ended()
+        for key in keys_in(typed):
+            pressed(key)
+
+    tty.setcbreak(terminal)
+    loop.add_reader(terminal, readable)
+    try:
+        yield
+    finally:
+        loop.remove_reader(terminal)
+        # A terminal that is gone has no modes to be set back.
+        with suppress(termios.error):
+            termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+def keys_in(typed: bytes) -> Iterator[bytes]:
+    """The single keys of what was typed; an escape sequence is one key."""
+    at = 0
+    while at < len(typed):
+        length = 3 if typed[at : at + 2] in (b"\x1b[", b"\x1bO") and len(typed) - at >= 3 else 1
+        yield typed[at : at + length]
+        at += length
