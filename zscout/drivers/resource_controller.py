@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 from zscout.drivers.driver import Driver
 from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.rc_directory import RcDirectory
-from zscout.drivers.work_queue import CommandQuery, WorkQueue
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.stall import StallWatch
@@ -44,8 +44,67 @@ REREAD_TIMEOUT = 0.5
 REREADS = 4
 """Queries in a row when publications overtake the answers."""
 COMMAND_QUEUE = 64
+EARLY_PER_HOST = 16
+"""Commands of one host that may be set aside."""
 FIGURES_PERIOD = 1.0
 """Seconds between two publications of changed figures."""
+
+CommandQuery: TypeAlias = IncomingQuery[Command]
+
+
+class WorkQueue:
+    """What an RC has to carry out: changes of holders first, so that a safe state waits for no command.
+
+    A command under a grant that the RC does not know yet is set aside, outside the queue, until the RC knows
+    more; then it goes before all other commands, so that none of the same grant overtakes it.
+    """
+
+    def __init__(self) -> None:
+        self._changes: deque[HoldChange] = deque()
+        self._commands: deque[CommandQuery] = deque()
+        self._early: list[tuple[str, CommandQuery]] = []
+        """With the sender's host, in the order of arrival."""
+        self._news = asyncio.Event()
+
+    @property
+    def commands(self) -> int:
+        """Commands that wait, those that are set aside included."""
+        return len(self._commands) + len(self._early)
+
+    def put_change(self, change: HoldChange) -> None:
+        self._changes.append(change)
+        self._news.set()
+
+    def put_command(self, command: CommandQuery) -> None:
+        self._commands.append(command)
+        self._news.set()
+
+    def set_aside(self, command: CommandQuery, host: str) -> bool:
+        """Keeps a command for `resume`. False: too many of this host are kept already."""
+        if Counter(of for of, _ in self._early)[host] >= EARLY_PER_HOST:
+            return False
+        self._early.append((host, command))
+        return True
+
+    def resume(self, ready: Callable[[CommandQuery], bool]) -> None:
+        """Puts early commands that are `ready` before all others, in the order of arrival."""
+        found = [early for early in self._early if ready(early[1])]
+        self._early = [early for early in self._early if early not in found]
+        self._commands.extendleft(command for _, command in reversed(found))
+        if found:
+            self._news.set()
+
+    def drop_early(self) -> list[CommandQuery]:
+        """Commands that are set aside still, which are no longer kept."""
+        dropped, self._early = self._early, []
+        return [command for _, command in dropped]
+
+    async def get(self) -> HoldChange | CommandQuery:
+        """The next change or command, once there is one."""
+        while not (self._changes or self._commands):
+            self._news.clear()
+            await self._news.wait()
+        return self._changes.popleft() if self._changes else self._commands.popleft()
 
 
 class ResourceController:
@@ -71,7 +130,6 @@ class ResourceController:
         self.health = "ok"
         self.queue = WorkQueue()
         self.directory = RcDirectory(mesh) if driver.relays else None
-        """Which host offers which RC; only of a driver that relays."""
         self.stall = stall
         self._on_failure = on_failure
         self.supervisor = Supervisor(name, self._failed)
@@ -123,19 +181,18 @@ class ResourceController:
         self._on_failure(error)
         self.fail(f"its resource controller failed: {error}")  # which may fail as well
 
+    # For the driver: see RcHandle
+
     def rules_changed(self) -> None:
-        """The driver votes by other rules from now on: earlier votes are void."""
         self.rules += 1
         self.publish()
 
     def fail(self, why: str) -> None:
-        """The device can't carry its holders any longer: their holds end, the RC counts as lost."""
         self.health = why
         self._apply(self.holds.fail(why))
         self.publish()
 
     def recover(self) -> None:
-        """The device works again."""
         self.health = "ok"
         self.publish()
 
@@ -145,10 +202,7 @@ class ResourceController:
     # What the RCM sends
 
     def _on_leader(self, token: Token, alive: bool) -> None:
-        if alive:
-            self._leaders.add(token)
-        else:
-            self._leaders.discard(token)
+        (self._leaders.add if alive else self._leaders.discard)(token)
 
     def _on_grants(self, _key: str, grants: Grants) -> None:
         self._apply(self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable))
@@ -179,7 +233,7 @@ class ResourceController:
         )
 
     def _sees_leader(self) -> bool:
-        """A leader counts while it publishes: its token lives on when its program hangs."""
+        """A leader counts while it publishes: its token outlives a program that hangs."""
         # Half a hold lease is longer than a heartbeat, and leaves a successor time before holds end.
         silence = self.mesh.now() - self.holds.last_contact
         return bool(self._leaders) and silence < self.holds.hold_lease // 2
@@ -220,10 +274,8 @@ class ResourceController:
         command = query.message
         sender = self.mesh.keys.sender_of(query.key)
         if self._is_stale(query):
-            waited = self._waited(query) / SECOND
-            raise Refused(
-                "stale", f"the command waited {waited:.2f} s, longer than its ttl {command.ttl:g} s"
-            )
+            waited = f"{self._waited(query) / SECOND:.2f} s"
+            raise Refused("stale", f"the command waited {waited}, longer than its ttl {command.ttl:g} s")
         if command.grant is None:
             return await self.driver.command_without_grant(sender, command.do)
         refused = self._refusal(query)
@@ -241,12 +293,8 @@ class ResourceController:
         grant, sender = query.message.grant, self.mesh.keys.sender_of(query.key)
         if grant is None:
             return None
-        client, held = str(sender), self.holds.held.get(grant)
-        if (
-            held is not None
-            and self.directory is not None
-            and self.directory.is_node_of_gang(sender, held.holder, self.name)
-        ):
+        client, held, directory = str(sender), self.holds.held.get(grant), self.directory
+        if held and directory and directory.is_node_of_gang(sender, held.holder, self.name):
             client = held.holder.client
         refusal = self.holds.check(grant, client, self.mesh.now())
         return None if refusal is None else Refused(refusal.code, refusal.message, self.holds.term)
@@ -283,13 +331,6 @@ class ResourceController:
             self._read_state()
         else:
             query.refuse(Refused("busy", f"too many commands to {self.name} are early; ask again").problem)
-
-    def _decide_early(self) -> None:
-        """`rcm/state` has been read: what is early still is refused."""
-        self.queue.resume(lambda query: not self._is_early(query))
-        for query in self.queue.drop_early():
-            if refused := self._refusal(query):
-                query.refuse(refused.problem)
 
     # Holds
 
@@ -328,13 +369,11 @@ class ResourceController:
 
     async def _read(self) -> None:
         for _ in range(REREADS):
-            query = StateAsk(holds_only=True)
-            replies = await self.mesh.ask(
-                self.mesh.keys.rcm_state, query, RcmState, timeout=REREAD_TIMEOUT, enough=self._is_current
-            )
-            states = [reply.message for reply in replies if reply.message is not None]
+            key, ask = self.mesh.keys.rcm_state, StateAsk(holds_only=True)
+            replies = await self.mesh.ask(key, ask, RcmState, timeout=REREAD_TIMEOUT, enough=self._is_current)
             # One absurd answer must not hide the true one.
-            states = [state for state in states if not absurd(state.term, self.holds.term)]
+            answers = (reply.message for reply in replies if reply.message is not None)
+            states = [state for state in answers if not absurd(state.term, self.holds.term)]
             if not states:
                 break
             newest = max(states, key=lambda state: (state.term, state.seq))
@@ -344,7 +383,10 @@ class ResourceController:
             if not overtaken:
                 self._missed = False
                 break
-        self._decide_early()
+        self.queue.resume(lambda query: not self._is_early(query))
+        for query in self.queue.drop_early():
+            if refused := self._refusal(query):
+                query.refuse(refused.problem)
 
     def _is_current(self, reply: Reply[RcmState]) -> bool:
         """Whether no other answer is needed: this one is of an RCM that is obeyed already."""
