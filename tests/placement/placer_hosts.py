@@ -12,19 +12,22 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Literal
 
-from zscout.messages import HowEnded, Incarnation
+from zscout.messages import (
+    ComponentSpec,
+    ComponentView,
+    HowEnded,
+    Incarnation,
+    MoveComponent,
+    StartComponent,
+    StopComponent,
+)
 from zscout.placement.events import (
     ComponentsListed,
     HostLost,
-    ListedComponent,
     MoveAnswered,
-    MoveCommand,
-    PlacementSpec,
     PlacerEvent,
     StartAnswered,
-    StartCommand,
     StopAnswered,
-    StopCommand,
     TokenAppeared,
     TokenVanished,
 )
@@ -45,7 +48,7 @@ class Proc:
 
     component: ComponentId
     incarnation: Incarnation
-    spec: PlacementSpec
+    spec: ComponentSpec
     phase: Phase = "starting"
     ended: HowEnded | None = None
     token: bool = False
@@ -112,7 +115,7 @@ class Hosts(ABC):
 
     # A host: what it does when it is asked
 
-    def on_start(self, host: Host, start: StartCommand, say: Say) -> None:
+    def on_start(self, host: Host, start: StartComponent, say: Say) -> None:
         component, incarnation = start.component, start.incarnation
 
         def tell(proc: Proc) -> None:
@@ -185,9 +188,9 @@ class Hosts(ABC):
             ):
                 self.end(host, one, "superseded")
 
-    def on_stop(self, host: Host, stop: StopCommand, say: Say) -> None:
-        proc = host.procs.get((stop.component, stop.incarnation))
-        done = StopAnswered(stop.component, stop.incarnation, host.name, done=True)
+    def on_stop(self, host: Host, stop: StopComponent, say: Say) -> None:
+        proc = host.procs.get((stop.component, stop.incarnation or 0))
+        done = StopAnswered(stop.component, stop.incarnation or 0, host.name, done=True)
         if proc is None or proc.phase == "ended":
             say(done)
             return
@@ -200,7 +203,7 @@ class Hosts(ABC):
 
         self.later(self.delay(), over)
 
-    def on_move(self, host: Host, move: MoveCommand, say: Say) -> None:
+    def on_move(self, host: Host, move: MoveComponent, say: Say) -> None:
         """The source comes to a safe point, or not; hands over; and goes, or takes back."""
         source = host.procs.get((move.component, move.incarnation))
         there, life = self.hosts[move.to], host.procs
@@ -234,7 +237,7 @@ class Hosts(ABC):
                 return
             if begun and host.there:
                 self.end(host, old, "moved")
-                say(MoveAnswered(move.component, move.incarnation, host.name, "moved", "", 1))
+                say(MoveAnswered(move.component, move.incarnation, host.name, "moved", "", 1e-9))
             else:
                 refuse("taken back")
 
@@ -299,16 +302,16 @@ class Hosts(ABC):
 
 
 def told_of(host: Host, component: ComponentId) -> ComponentsListed:
-    return ComponentsListed(host.name, tuple(seen_of(one) for one in host.of(component)), component)
+    return ComponentsListed(host.name, tuple(seen_of(host, one) for one in host.of(component)), component)
 
 
-def seen_of(proc: Proc) -> ListedComponent:
-    return ListedComponent(
+def seen_of(host: Host, proc: Proc) -> ComponentView:
+    return ComponentView(
         component=proc.component,
         incarnation=proc.incarnation,
+        host=host.name,
         spec=proc.spec,
-        running=proc.phase == "running",
-        standby=proc.phase == "standby",
+        phase=proc.phase,
         movable=True,
         ended=proc.ended,
     )

@@ -13,30 +13,33 @@ from random import Random
 
 from tests.placement.placer_hosts import Host, Hosts, Say, seen_of, told_of
 from zscout.config.placement_policy import PlacementPolicy
-from zscout.messages import Incarnation
+from zscout.messages import (
+    Incarnation,
+    ListComponents,
+    LoadReport,
+    MoveComponent,
+    Placement,
+    StartComponent,
+    StopComponent,
+)
 from zscout.placement.balancer import Balancer
 from zscout.placement.events import (
     ComponentChanged,
     ComponentForgotten,
     ComponentsListed,
-    ComponentStatus,
+    HostCommand,
     HostJoined,
     HostLost,
     Inherited,
     MoveAnswered,
-    MoveCommand,
     PlacementRefused,
     PlacerEffect,
     PlacerEvent,
     PlacerTick,
     PlacerWakeAt,
-    ProbeCommand,
     StartAnswered,
-    StartCommand,
     StopAnswered,
-    StopCommand,
 )
-from zscout.placement.model import HostReport
 from zscout.placement.placer import Placer
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
@@ -55,8 +58,8 @@ class World(Hosts):
     def __init__(self, seed: int, hosts: int, rules: PlacementPolicy = RULES) -> None:
         super().__init__(seed, hosts)
         self.rules = rules
-        self.starts: dict[tuple[ComponentId, Incarnation], StartCommand] = {}
-        self.published: dict[ComponentId, ComponentStatus] = {}
+        self.starts: dict[tuple[ComponentId, Incarnation], HostCommand] = {}
+        self.published: dict[ComponentId, Placement] = {}
         self.refusals: list[PlacementRefused] = []
         self.alive: set[HostName] = set()
         """As the leading placer was told."""
@@ -93,7 +96,7 @@ class World(Hosts):
         load = float(sum(one.lives for one in host.procs.values()))
         self.balancer.reported(
             self.now,
-            HostReport(
+            LoadReport(
                 host=host.name,
                 number=next(self._reports),
                 cores=4.0,
@@ -127,7 +130,7 @@ class World(Hosts):
         self.send(HostJoined(host.name))
         leader = self.counter
         if host.there and not self.lost():
-            told = ComponentsListed(host.name, tuple(seen_of(one) for one in host.procs.values()))
+            told = ComponentsListed(host.name, tuple(seen_of(host, one) for one in host.procs.values()))
             self.later(self.delay(), lambda: self.answer(leader, told))
 
     def send(self, *events: PlacerEvent) -> None:
@@ -157,20 +160,20 @@ class World(Hosts):
             case PlacerWakeAt(at):
                 assert at is None or at > self.now, "it would wake at once, for ever"
                 self._wake = at
-            case StartCommand(component, incarnation, host):
+            case HostCommand(host, StartComponent(component, incarnation) as start):
                 before = self.starts.setdefault((component, incarnation), effect)
                 assert before == effect, f"one incarnation, two starts: {before} and {effect}"
                 known = self.published[component].incarnation
-                assert effect.standby or known == incarnation, "started before it was published"
-                start, unknown = effect, StartAnswered(component, incarnation, host, "unknown")
+                assert start.standby or known == incarnation, "started before it was published"
+                unknown = StartAnswered(component, incarnation, host, "unknown")
                 self.ask(host, lambda there, say: self.on_start(there, start, say), unknown)
-            case StopCommand(component, incarnation, host):
-                stop, silent = effect, StopAnswered(component, incarnation, host, done=False)
+            case HostCommand(host, StopComponent(component, incarnation) as stop):
+                silent = StopAnswered(component, incarnation or 0, host, done=False)
                 self.ask(host, lambda there, say: self.on_stop(there, stop, say), silent)
-            case MoveCommand(component, incarnation, host):
-                move, open_end = effect, MoveAnswered(component, incarnation, host, "unknown")
+            case HostCommand(host, MoveComponent(component, incarnation) as move):
+                open_end = MoveAnswered(component, incarnation, host, "unknown")
                 self.ask(host, lambda there, say: self.on_move(there, move, say), open_end)
-            case ProbeCommand(host, component):
+            case HostCommand(host, ListComponents(str(component))):
                 self.ask(host, lambda there, say: say(told_of(there, component)), None)
 
     def ask(self, name: HostName, on_host: Callable[[Host, Say], None], unknown: PlacerEvent | None) -> None:

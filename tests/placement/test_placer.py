@@ -9,42 +9,41 @@ import pytest
 
 from tests.placement.test_balancer import report
 from tests.thorough import times
-from zscout.messages import Restart
+from zscout.messages import (
+    ComponentSpec,
+    ComponentView,
+    DrainHost,
+    EndComponent,
+    MigrateComponent,
+    PlaceComponent,
+    Placement,
+    Restart,
+    StartComponent,
+    UncordonHost,
+)
 from zscout.placement import state
 from zscout.placement.balancer import Balancer, RankingCache
 from zscout.placement.events import (
     ComponentChanged,
     ComponentForgotten,
     ComponentsListed,
-    ComponentState,
-    ComponentStatus,
-    DrainRequested,
+    HostCommand,
     HostJoined,
     HostLost,
     Inherited,
-    ListedComponent,
     MoveAnswered,
-    MoveCommand,
-    MoveRequested,
     PlacementRefused,
-    PlacementSpec,
     PlacerEffect,
-    PlaceRequested,
     PlacerEvent,
     PlacerTick,
     PlacerWakeAt,
-    ProbeCommand,
     StartAnswered,
-    StartCommand,
     StopAnswered,
-    StopCommand,
-    StopRequested,
     TokenAppeared,
     TokenVanished,
-    UncordonRequested,
 )
 from zscout.placement.lifecycle import AT_ONCE
-from zscout.placement.model import RankQuery, Requirements
+from zscout.placement.model import RankQuery
 from zscout.placement.placer import Placer
 from zscout.placement.state import RETENTION
 from zscout.types import SECOND, Policy
@@ -62,15 +61,19 @@ def fleet(hosts: int = 2, counter: int = 1) -> tuple[Placer, Balancer]:
     return placer, balancer
 
 
-def starts(effects: list[PlacerEffect]) -> list[StartCommand]:
-    return [one for one in effects if isinstance(one, StartCommand)]
+def starts(effects: list[PlacerEffect]) -> list[tuple[str, StartComponent]]:
+    return [
+        (one.host, one.operation)
+        for one in effects
+        if isinstance(one, HostCommand) and isinstance(one.operation, StartComponent)
+    ]
 
 
 def test_what_has_ended_is_forgotten_after_a_while_and_its_incarnations_are_not_used_again() -> None:
-    (placer, balancer), spec = fleet(), PlacementSpec("job")
-    [first] = starts(placer.handle(0, PlaceRequested("a", spec)))
+    (placer, balancer), spec = fleet(), ComponentSpec("job")
+    [(host, first)] = starts(placer.handle(0, PlaceComponent("a", spec)))
     ended = ComponentsListed(
-        first.host, (ListedComponent("a", first.incarnation, spec, running=False, ended="completed"),)
+        host, (ComponentView("a", first.incarnation, host, spec, "ended", ended="completed"),)
     )
     assert placer.handle(SECOND, ended)[0] == ComponentChanged("a")
     assert ComponentForgotten("a") not in placer.handle(RETENTION, PlacerTick())
@@ -78,20 +81,20 @@ def test_what_has_ended_is_forgotten_after_a_while_and_its_incarnations_are_not_
     assert placer.status().components == {}
     now = SECOND + RETENTION
     balancer.reported(now, report("h0", 2))
-    again = starts(placer.handle(now, PlaceRequested("a", spec), PlaceRequested("b", spec)))
-    assert {one.incarnation for one in again} == {first.incarnation + 1}
+    again = starts(placer.handle(now, PlaceComponent("a", spec), PlaceComponent("b", spec)))
+    assert {one.incarnation for _, one in again} == {first.incarnation + 1}
 
 
 def test_limits_hold_and_what_has_ended_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(state, "MAX_COMPONENTS", 4)
     monkeypatch.setattr(state, "MAX_ENDED", 2)
-    (placer, _), spec = fleet(), PlacementSpec("job", hosts=frozenset({"nowhere"}))
-    placer.handle(0, *(PlaceRequested(name, spec) for name in "abcd"))
-    assert [type(one) for one in placer.handle(0, PlaceRequested("e", spec))] == [PlacementRefused]
+    (placer, _), spec = fleet(), ComponentSpec("job", hosts=["nowhere"])
+    placer.handle(0, *(PlaceComponent(name, spec) for name in "abcd"))
+    assert [type(one) for one in placer.handle(0, PlaceComponent("e", spec))] == [PlacementRefused]
     # Three end, two of them are remembered; and those two make room for others.
-    effects = placer.handle(1, *(StopRequested(name) for name in "abc"))
+    effects = placer.handle(1, *(EndComponent(name) for name in "abc"))
     assert effects[:3] == [ComponentForgotten("a"), ComponentChanged("b"), ComponentChanged("c")]
-    assert placer.handle(2, *(PlaceRequested(name, spec) for name in "xyz"))[:3] == [
+    assert placer.handle(2, *(PlaceComponent(name, spec) for name in "xyz"))[:3] == [
         ComponentChanged("x"),
         ComponentForgotten("b"),
         ComponentChanged("y"),
@@ -101,7 +104,7 @@ def test_limits_hold_and_what_has_ended_makes_room(monkeypatch: pytest.MonkeyPat
 
 def test_many_are_placed_a_part_at_a_time_and_all_of_them() -> None:
     (placer, _), count = fleet(5), 2 * AT_ONCE + 10
-    asked = [PlaceRequested(f"c{number}", PlacementSpec("job")) for number in range(count)]
+    asked = [PlaceComponent(f"c{number}", ComponentSpec("job")) for number in range(count)]
     effects, found, now = placer.handle(0, *asked), [], 0
     while now < SECOND:
         batch = starts(effects)
@@ -111,7 +114,7 @@ def test_many_are_placed_a_part_at_a_time_and_all_of_them() -> None:
         assert wake is not None
         now = wake
         effects = placer.handle(now, PlacerTick())
-    assert len({one.component for one in found}) == len(found) == count
+    assert len({one.component for _, one in found}) == len(found) == count
 
 
 def test_time_does_not_go_backwards() -> None:
@@ -130,9 +133,7 @@ def test_rankings_that_are_mended_are_those_of_the_balancer(policy: Policy, memo
     balancer.cordoned.add("h3")
     ranks = RankingCache(balancer)
     some = frozenset(f"h{number}" for number in range(10))
-    questions = [
-        RankQuery("job", "composite", policy, Requirements(memory=memory), hosts) for hosts in (None, some)
-    ]
+    questions = [RankQuery("job", "composite", policy, memory=memory, hosts=hosts) for hosts in (None, some)]
     for number in range(200):
         name, host = f"c{rng.randrange(30)}", f"h{rng.randrange(20)}"
         before = next((there for there, one in placed(balancer) if one == name), None)
@@ -166,7 +167,7 @@ def test_what_nobody_would_send_does_no_harm() -> None:
                 alive.discard(event.host)
             effects = placer.handle(now, event)
             for effect in effects:
-                if isinstance(effect, StartCommand | StopCommand | MoveCommand | ProbeCommand):
+                if isinstance(effect, HostCommand):
                     assert effect.host in alive, (seed, effect)
             for record in placer.status().components.values():
                 assert (record.to is not None) == (record.state == "moving")
@@ -176,24 +177,29 @@ def nonsense(rng: Random) -> PlacerEvent:
     name, host, spec = (
         rng.choice("ab"),
         rng.choice(["h0", "h1", "h2", "h9"]),
-        PlacementSpec("job", rng.choice(RESTARTS)),
+        ComponentSpec("job", restart=rng.choice(RESTARTS)),
     )
     number = rng.choice([1001, 1002, 1003, 2001, 10**15])
-    lives = rng.choice([{"running": True}, {"running": False}, {"running": False, "standby": True}])
-    over = {"running": False, "ended": rng.choice(["completed", "failed", "moved", "superseded", "stopped"])}
-    seen = ListedComponent(name, number, spec, movable=True, **rng.choice([lives, over]))  # type: ignore[arg-type]
+    lives = {"phase": rng.choice(["running", "starting", "standby"])}
+    over = {"phase": "ended", "ended": rng.choice(["completed", "failed", "moved", "superseded", "stopped"])}
+    seen = ComponentView(name, number, host, spec, movable=True, **rng.choice([lives, over]))  # type: ignore[arg-type]
     result = rng.choice(["ok", "ok", "refused", "failed", "unknown"])
     moved = rng.choice(["moved", "refused", "unknown"])
     state = rng.choice(["waiting", "starting", "running", "moving", "backing_off", "stopping", "ended"])
-    record = ComponentStatus(
-        name, spec, ComponentState(state), number, rng.choice([host, None]), wanted=rng.random() < 0.5
+    record = Placement(
+        name,
+        spec,
+        state,  # type: ignore[arg-type]
+        number,
+        rng.choice([host, None]),
+        wanted=rng.random() < 0.5,
     )
     events: list[PlacerEvent] = [
-        PlaceRequested(name, spec),
-        StopRequested(name),
-        MoveRequested(name, rng.choice([host, None])),
-        DrainRequested(host),
-        UncordonRequested(host),
+        PlaceComponent(name, spec),
+        EndComponent(name),
+        MigrateComponent(name, rng.choice([host, None])),
+        DrainHost(host),
+        UncordonHost(host),
         StartAnswered(name, number, host, result, movable=True, again=rng.random() < 0.5),  # type: ignore[arg-type]
         StopAnswered(name, number, host, done=rng.random() < 0.5),
         MoveAnswered(name, number, host, moved),  # type: ignore[arg-type]

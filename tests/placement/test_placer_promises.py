@@ -11,14 +11,14 @@ from msgspec.structs import replace
 from tests.placement.placer_hosts import STANDS_BY
 from tests.placement.placer_world import RULES, World
 from tests.thorough import times
-from zscout.messages import Restart
-from zscout.placement.events import (
-    DrainRequested,
-    MoveRequested,
-    PlacementSpec,
-    PlaceRequested,
-    StopRequested,
-    UncordonRequested,
+from zscout.messages import (
+    ComponentSpec,
+    DrainHost,
+    EndComponent,
+    MigrateComponent,
+    PlaceComponent,
+    Restart,
+    UncordonHost,
 )
 from zscout.types import SECOND, HostName
 
@@ -69,14 +69,14 @@ class Chaos:
             case "place":
                 self.place(name)
             case "stop":
-                world.send(StopRequested(name))
+                world.send(EndComponent(name))
                 self.asked[name] = False
             case "move":
-                world.send(MoveRequested(name, rng.choice([None, None, host.name])))
+                world.send(MigrateComponent(name, rng.choice([None, None, host.name])))
             case "drain":
-                world.send(DrainRequested(host.name))
+                world.send(DrainHost(host.name))
             case "uncordon":
-                world.send(UncordonRequested(host.name))
+                world.send(UncordonHost(host.name))
             case "crash" | "complete" if running:
                 there, one = rng.choice(running)
                 world.end(there, one, "failed" if op == "crash" else "completed")
@@ -91,10 +91,10 @@ class Chaos:
 
     def place(self, name: str) -> None:
         policy: Restart = self.rng.choice(POLICIES)
-        some = frozenset(self.rng.sample(list(self.world.hosts), 1))
-        hosts: frozenset[HostName] | None = self.rng.choice([*[None] * 6, some])
+        some = self.rng.sample(list(self.world.hosts), 1)
+        hosts: list[HostName] | None = self.rng.choice([*[None] * 6, some])
         refused = len(self.world.refusals)
-        self.world.send(PlaceRequested(name, PlacementSpec("job", policy, hosts=hosts)))
+        self.world.send(PlaceComponent(name, ComponentSpec("job", restart=policy, hosts=hosts)))
         if len(self.world.refusals) == refused:
             self.asked[name] = True
 
@@ -129,7 +129,7 @@ class Chaos:
                 continue
             assert not live, (found, record)
             fit = world.alive - world.balancer.cordoned
-            fit &= record.spec.hosts if record.spec.hosts is not None else fit
+            fit &= set(record.spec.hosts) if record.spec.hosts is not None else fit
             if record.state == "waiting":
                 assert not fit, record
             elif record.wanted and record.state == "given_up":
@@ -144,7 +144,7 @@ class Chaos:
         usable = world.alive - world.balancer.cordoned
         for record in world.placer.status().components.values():
             if record.host in world.balancer.cordoned:
-                assert not (usable & (record.spec.hosts or usable)), record
+                assert not (usable & set(record.spec.hosts or usable)), record
 
 
 def run(seed: int) -> World:
@@ -176,5 +176,5 @@ def test_in_these_runs_everything_does_happen() -> None:
         assert heard[f"StartAnswered {result}"] > 50, heard
     for result in ("moved", "refused", "unknown"):
         assert heard[f"MoveAnswered {result}"] > 10, heard
-    for event in ("TokenVanished", "HostLost", "ComponentsListed", "Inherited", "DrainRequested"):
+    for event in ("TokenVanished", "HostLost", "ComponentsListed", "Inherited", "DrainHost"):
         assert heard[event] > 50, heard

@@ -4,35 +4,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from random import Random
 
 import pytest
+from msgspec.structs import replace
 
 from zscout.config.placement_policy import PlacementPolicy
 from zscout.lab.study.placement.simulation import Machine, SimulatedJob, _Host, _Running
+from zscout.messages import (
+    ComponentSpec,
+    ComponentView,
+    DrainHost,
+    MoveComponent,
+    StartComponent,
+    StopComponent,
+)
 from zscout.placement.balancer import LOAD_TIME, Balancer
 from zscout.placement.events import (
     ComponentsListed,
-    DrainRequested,
+    HostCommand,
     HostJoined,
-    ListedComponent,
     MoveAnswered,
-    MoveCommand,
-    PlacementSpec,
     PlacerEffect,
     PlacerEvent,
     PlacerTick,
     PlacerWakeAt,
     StartAnswered,
-    StartCommand,
     StopAnswered,
-    StopCommand,
     TokenAppeared,
     TokenVanished,
 )
-from zscout.placement.model import REPORT_EVERY, Profile, Requirements
+from zscout.placement.model import REPORT_EVERY, Profile
 from zscout.placement.placer import Placer
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
@@ -58,14 +61,14 @@ class Fleet:
         noise: float = 0.0,
         seed: int = 0,
         movable: bool = True,
-        labels: frozenset[str] = frozenset(),
+        labels: tuple[str, ...] = (),
     ) -> None:
         """A component's kind is its name up to the first digit; its profile is in `profiles`."""
         self.rng, self.noise = Random(seed), noise  # noqa: S311
         self.balancer = Balancer(Random(seed))  # noqa: S311
         self.placer = Placer(self.balancer, 1, rules)
         self.hosts = {one.name: _Host(one, 0) for one in machines}
-        self.labels = {one.name: frozenset({one.name}) for one in machines}
+        self.labels = {one.name: (one.name,) for one in machines}
         self.now: Ns = 0
         self.wake: Ns | None = None
         self.moves: list[Moved] = []
@@ -81,8 +84,8 @@ class Fleet:
                 job = SimulatedJob(component, kind, 0, profile.cpu, profile.memory, greedy=True)
                 host.running.append(_Running(job, 0))
                 self.where[component] = name
-                spec = PlacementSpec(kind, requirements=Requirements(labels))
-                seen.append(ListedComponent(component, 1001, spec, running=True, movable=movable))
+                spec = ComponentSpec(kind, labels=list(labels))
+                seen.append(ComponentView(component, 1001, name, spec, "running", movable))
                 events.append(TokenAppeared(component, 1001, name))
             host.load = host.share(0)[1]
             events.insert(0, ComponentsListed(name, tuple(seen)))
@@ -102,20 +105,20 @@ class Fleet:
 
     def carry_out(self, effect: PlacerEffect) -> None:
         match effect:
-            case StartCommand(component, incarnation, host, _, standby):
+            case HostCommand(host, StartComponent(component, incarnation, _, standby)):
                 assert standby
                 self.send(StartAnswered(component, incarnation, host, "ok", movable=True))
-            case MoveCommand(component, incarnation, host, to, to_incarnation):
+            case HostCommand(host, MoveComponent(component, incarnation, to, to_incarnation)):
                 [one] = [one for one in self.hosts[host].running if one.job.component == component]
                 self.hosts[host].running.remove(one)
                 self.hosts[to].running.append(one)
                 self.where[component] = to
                 self.moves.append((self.now, component, host, to))
-                answer = MoveAnswered(component, incarnation, host, "moved", dead=1)
+                answer = MoveAnswered(component, incarnation, host, "moved", dead=1e-9)
                 appeared = TokenAppeared(component, to_incarnation, to)
                 self.send(answer, appeared, TokenVanished(component, incarnation, host))
-            case StopCommand(component, incarnation, host):
-                self.send(StopAnswered(component, incarnation, host, done=True))
+            case HostCommand(host, StopComponent(component, incarnation)):
+                self.send(StopAnswered(component, incarnation or 0, host, done=True))
             case PlacerWakeAt(at):
                 self.wake = at
             case _:
@@ -214,10 +217,10 @@ def test_nothing_moves_that_may_not(why: str) -> None:
         {"h0": names("full", 4)},
         rules=PlacementPolicy(rebalance=why != "off"),
         movable=why != "not movable",
-        labels=frozenset({"h0"}) if why == "label" else frozenset(),
+        labels=("h0",) if why == "label" else (),
     )
     if why == "drained":
-        fleet.send(DrainRequested("h1"))
+        fleet.send(DrainHost("h1"))
     fleet.run((RULES.rest if why == "settled in lately" else 300 * SECOND) - SECOND)
     assert fleet.moves == []
 

@@ -25,38 +25,42 @@ from typing import Any
 
 from tests.transcripts import ns, seconds, settings
 from zscout.config.placement_policy import PlacementPolicy
+from zscout.messages import (
+    ComponentSpec,
+    ComponentView,
+    DrainHost,
+    EndComponent,
+    ListComponents,
+    LoadReport,
+    MigrateComponent,
+    MoveComponent,
+    PlaceComponent,
+    Placement,
+    StartComponent,
+    StopComponent,
+    UncordonHost,
+)
 from zscout.placement.balancer import Balancer
 from zscout.placement.events import (
     ComponentChanged,
     ComponentForgotten,
     ComponentsListed,
-    ComponentStatus,
-    DrainRequested,
+    HostCommand,
     HostJoined,
     HostLost,
     Inherited,
-    ListedComponent,
     MoveAnswered,
-    MoveCommand,
-    MoveRequested,
     PlacementRefused,
-    PlacementSpec,
     PlacerEffect,
-    PlaceRequested,
     PlacerEvent,
     PlacerTick,
     PlacerWakeAt,
-    ProbeCommand,
     StartAnswered,
-    StartCommand,
     StopAnswered,
-    StopCommand,
-    StopRequested,
     TokenAppeared,
     TokenVanished,
-    UncordonRequested,
 )
-from zscout.placement.model import REPORT_EVERY, HostReport, Profile, Requirements
+from zscout.placement.model import REPORT_EVERY, Profile
 from zscout.placement.placer import Placer
 from zscout.types import HostName, Ns
 
@@ -77,7 +81,7 @@ class PlacerPlayer:
 
     def __post_init__(self) -> None:
         self.placer = Placer(self.balancer, 1)
-        self.specs: dict[str, PlacementSpec] = {}
+        self.specs: dict[str, ComponentSpec] = {}
 
     def batch(self, line: str) -> list[str]:
         events: list[PlacerEvent] = []
@@ -139,7 +143,7 @@ class PlacerPlayer:
         memory = int(known.get("memory", 4_000)) * MEGABYTE
         self.balancer.reported(
             self.now,
-            HostReport(
+            LoadReport(
                 host=host,
                 number=self.number,
                 cores=float(known.get("cores", 1)),
@@ -148,7 +152,7 @@ class PlacerPlayer:
                 memory_available=memory,
                 memory_total=2 * memory,
                 speed=float(known.get("speed", 1)),
-                labels=_names(known.get("labels")),
+                labels=tuple(_names(known.get("labels"))),
             ),
         )
 
@@ -169,15 +173,15 @@ class PlacerPlayer:
                 return None
             case "place", name, *options:
                 self.specs[name] = _spec(options)
-                return PlaceRequested(name, self.specs[name])
+                return PlaceComponent(name, self.specs[name])
             case "end", name:
-                return StopRequested(name)
+                return EndComponent(name)
             case "move", name, *to:
-                return MoveRequested(name, to[0] if to else None)
+                return MigrateComponent(name, to[0] if to else None)
             case "drain", host:
-                return DrainRequested(host)
+                return DrainHost(host)
             case "uncordon", host:
-                return UncordonRequested(host)
+                return UncordonHost(host)
             case "start", name, incarnation, host, result, *rest:
                 return _start_answered(name, int(incarnation), host, result, rest)
             case "stop", name, incarnation, host, "done" | "said" | "unknown" as result:
@@ -190,7 +194,7 @@ class PlacerPlayer:
                 return TokenVanished(name, int(incarnation), host)
             case "told", host, *rest:
                 only = next((word[5:] for word in rest if word.startswith("only=")), None)
-                told = [self.seen(word) for word in rest if not word.startswith("only=")]
+                told = [self.seen(host, word) for word in rest if not word.startswith("only=")]
                 return ComponentsListed(host, tuple(told), only)
             case "seen", host:
                 return HostJoined(host)
@@ -202,30 +206,30 @@ class PlacerPlayer:
             case _:
                 raise ValueError(f"no such command: {' '.join([verb, *words])}")
 
-    def seen(self, word: str) -> ListedComponent:
+    def seen(self, host: HostName, word: str) -> ComponentView:
         name, incarnation, phase, *rest = word.split(":")
         lives = phase in {"starting", "standby", "running"}
         movable = "movable" in rest
-        return ListedComponent(
+        return ComponentView(
             component=name,
             incarnation=int(incarnation),
-            spec=self.specs.get(name, PlacementSpec("job")),
-            running=phase == "running",
-            standby=phase == "standby",
+            host=host,
+            spec=self.specs.get(name, ComponentSpec("job")),
+            phase=phase if lives else "ended",  # type: ignore[arg-type]
             movable=movable,
-            ended=None if lives else phase,  # type: ignore[arg-type]
+            ended=None if lives or phase == "lost" else phase,  # type: ignore[arg-type]
             reason=" ".join(part for part in rest if part != "movable").replace("_", " "),
         )
 
     def print(self, effect: PlacerEffect) -> str:
         match effect:
-            case StartCommand(component, incarnation, host, _, standby):
+            case HostCommand(host, StartComponent(component, incarnation, _, standby)):
                 return f"start {component} {incarnation} on {host}" + (" to stand by" if standby else "")
-            case StopCommand(component, incarnation, host):
+            case HostCommand(host, StopComponent(component, incarnation)):
                 return f"stop {component} {incarnation} on {host}"
-            case MoveCommand(component, incarnation, host, to, to_incarnation):
+            case HostCommand(host, MoveComponent(component, incarnation, to, to_incarnation)):
                 return f"move {component} {incarnation} on {host} to {to_incarnation} on {to}"
-            case ProbeCommand(host, component):
+            case HostCommand(host, ListComponents(component)):
                 return f"look at {host} for {component}"
             case ComponentChanged(component):
                 return _print(self.placer.status().components[component])
@@ -235,9 +239,11 @@ class PlacerPlayer:
                 return f"refused {about} {code}: {message}"
             case PlacerWakeAt(at):
                 return "wake " + ("never" if at is None else f"at {seconds(at)}")
+            case _:
+                raise AssertionError(effect)
 
 
-def _print(record: ComponentStatus) -> str:
+def _print(record: Placement) -> str:
     words = [f"{record.component}: {record.state}"]
     words += [f"on {record.host}"] if record.host else []
     words += [f"to {record.to}"] if record.to else []
@@ -246,7 +252,7 @@ def _print(record: ComponentStatus) -> str:
     words += ["movable"] if record.movable else []
     words += [f"restarts={record.restarts}"] if record.restarts else []
     words += [f"moves={record.moves}"] if record.moves else []
-    words += [f"dead={seconds(record.dead)}"] if record.dead is not None else []
+    words += [f"dead={record.dead:g}"] if record.dead is not None else []
     return " ".join(words) + (f": {record.reason}" if record.reason else "")
 
 
@@ -268,23 +274,24 @@ def _start_answered(name: str, incarnation: int, host: str, result: str, rest: l
 def _move_answered(name: str, incarnation: int, host: str, result: str, rest: list[str]) -> MoveAnswered:
     if result not in {"moved", "refused", "unknown"}:
         raise ValueError(f"no such result: {result}")
-    dead = next((ns(word[5:]) for word in rest if word.startswith("dead=")), 0)
+    dead = next((float(word[5:]) for word in rest if word.startswith("dead=")), 0.0)
     words = [word for word in rest if not word.startswith("dead=")]
     return MoveAnswered(name, incarnation, host, result, " ".join(words), dead)  # type: ignore[arg-type]
 
 
-def _spec(options: list[str]) -> PlacementSpec:
+def _spec(options: list[str]) -> ComponentSpec:
     known = settings(options, "kind", "restart", "hosts", "labels", "memory", "policy", "metric", "n")
-    return PlacementSpec(
+    return ComponentSpec(
         kind=known.get("kind", "job"),
         restart=known.get("restart", "on_failure"),
         metric=known.get("metric", "composite"),
         policy=known.get("policy", "pending"),
-        requirements=Requirements(_names(known.get("labels")), int(known.get("memory", 0)) * MEGABYTE),
+        labels=_names(known.get("labels")),
+        memory=int(known.get("memory", 0)) * MEGABYTE,
         hosts=_names(known["hosts"]) if "hosts" in known else None,
-        extra={"n": known["n"]} if "n" in known else {},
+        params={"n": known["n"]} if "n" in known else {},
     )
 
 
-def _names(text: str | None) -> frozenset[str]:
-    return frozenset(text.split(",")) if text else frozenset()
+def _names(text: str | None) -> list[str]:
+    return sorted(text.split(",")) if text else []

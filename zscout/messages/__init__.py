@@ -50,6 +50,7 @@ from zscout.messages.components import CheckpointComponent as CheckpointComponen
 from zscout.messages.components import ComponentList as ComponentList
 from zscout.messages.components import ComponentOperation as ComponentOperation
 from zscout.messages.components import ComponentSpec as ComponentSpec
+from zscout.messages.components import ComponentState as ComponentState
 from zscout.messages.components import ComponentView as ComponentView
 from zscout.messages.components import DrainHost as DrainHost
 from zscout.messages.components import EndComponent as EndComponent

@@ -247,13 +247,18 @@ PlacementOperation: TypeAlias = PlaceComponent | EndComponent | MigrateComponent
 PlacerOperation: TypeAlias = PlacementOperation | DrainHost | UncordonHost | ListPlacements
 
 
+ComponentState: TypeAlias = Literal[
+    "waiting", "starting", "running", "moving", "backing_off", "stopping", "ended", "given_up"
+]
+
+
 class Placement(Message, frozen=True):
     """A component as the placer knows it. `waiting`: no host will do; `ended`: it completed or was stopped;
     `given_up`: it failed, and its restart policy or their limit says that is all."""
 
     component: str
     spec: ComponentSpec
-    state: Literal["waiting", "starting", "running", "moving", "backing_off", "stopping", "ended", "given_up"]
+    state: ComponentState
     incarnation: Annotated[int, msgspec.Meta(ge=0)] = 0
     """0: it was never started."""
     host: str | None = None

@@ -17,21 +17,24 @@ from __future__ import annotations
 import heapq
 import math
 from bisect import insort
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from random import Random
 from typing import Final, TypeAlias
 
-from zscout.placement.metrics import SCORES, WORDS, Outlook
+from zscout.messages import ComponentUse, LoadReport, RankedHost
 from zscout.placement.model import (
     DEFAULT_PROFILE,
+    NO_REPORT,
+    SCORES,
     STALE,
-    ComponentUsage,
-    HostReport,
+    WORDS,
+    Exclusion,
+    Outlook,
     Profile,
     Ranking,
     RankQuery,
-    ScoredHost,
 )
 from zscout.placement.profiles import MetricLearner, Observation, learn_profile
 from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns
@@ -51,6 +54,8 @@ SHOWN: Final = 8 * LOAD_TIME
 MAX_HOSTS: Final = 10_000
 MAX_KINDS: Final = 10_000
 MAX_PLACED: Final = 100_000
+LARGEST: Final = 2**63
+"""No load and no bytes of memory that a report may have are more."""
 
 _Found: TypeAlias = tuple[float, HostName]
 """A host's score, negated: so the best comes first, and of equals the first by name."""
@@ -58,7 +63,7 @@ _Found: TypeAlias = tuple[float, HostName]
 
 @dataclass(slots=True)
 class _Placed:
-    """A component that this balancer's placer started, or that was found in a report (`adopted`)."""
+    """A component that this balancer's placer started, or that was found in a report: then without scores."""
 
     kind: Kind
     host: HostName
@@ -66,7 +71,6 @@ class _Placed:
     scores: Mapping[Metric, float]
     seen: bool = False
     learnt: bool = False
-    adopted: bool = False
 
 
 class Balancer:
@@ -74,7 +78,7 @@ class Balancer:
 
     def __init__(self, rng: Random) -> None:
         self._rng = rng
-        self.reports: dict[HostName, tuple[Ns, HostReport]] = {}
+        self.reports: dict[HostName, tuple[Ns, LoadReport]] = {}
         """The oldest first."""
         self._outlooks: dict[HostName, Outlook] = {}
         """From the reports alone."""
@@ -88,8 +92,12 @@ class Balancer:
         self._chosen: dict[HostName, int] = {}
         self._choices = 0
 
-    def reported(self, now: Ns, report: HostReport) -> None:
-        """A load report came. One with an older number than the last is dropped."""
+    def reported(self, now: Ns, report: LoadReport) -> None:
+        """A load report came. One with an older number than the last is dropped. Raises ValueError for
+        figures that no host can have."""
+        load, memory = report.load_average[0], report.memory_available
+        if not (0 <= load <= LARGEST and 0 <= memory <= LARGEST):
+            raise ValueError(f"load_average {load} or memory_available {memory}: no host has that")
         last = self.reports.get(report.host)
         if last is not None and report.number <= last[1].number and now - last[0] < STALE:
             return
@@ -97,8 +105,8 @@ class Balancer:
             return
         self.reports.pop(report.host, None)
         self.reports[report.host] = (now, report)
-        self._outlooks[report.host] = Outlook(report, report.load_average[0], report.memory_available)
-        for use in report.uses:
+        self._outlooks[report.host] = Outlook(report, load, memory)
+        for use in report.components:
             self._add_sample(now, report, use)
 
     def lost(self, host: HostName) -> None:
@@ -144,15 +152,15 @@ class Balancer:
     def _room(self, now: Ns) -> bool:
         """Room for a host more: where there is none, silent ones make it."""
         if len(self.reports) >= MAX_HOSTS:
-            for host in [host for host in self.reports if self._silent(now, host)]:
+            for host in [host for host, (at, _) in self.reports.items() if now - at > STALE]:
                 self.lost(host)
         return len(self.reports) < MAX_HOSTS
 
-    def _add_sample(self, now: Ns, report: HostReport, use: ComponentUsage) -> None:
+    def _add_sample(self, now: Ns, report: LoadReport, use: ComponentUse) -> None:
         one = self._placed.get(use.component)
         if one is None and len(self._placed) < MAX_PLACED:
             # Of a balancer before this one: its profile is learnt, and the load average shows it already.
-            one = _Placed(use.kind, report.host, now, {}, adopted=True)
+            one = _Placed(use.kind, report.host, now, {})
             self._placed[use.component] = one
             self._there.setdefault(report.host, set()).add(use.component)
         if one is None or one.host != report.host:
@@ -213,7 +221,7 @@ class Balancer:
             best_first = heapq.nsmallest(named, found)
         words = WORDS[metric]
         return Ranking(
-            tuple(ScoredHost(host, -value, words(fit[host], profile)) for value, host in best_first),
+            tuple(RankedHost(host, -value, words(fit[host], profile)) for value, host in best_first),
             metric,
             why,
             left_out,
@@ -238,64 +246,46 @@ class Balancer:
             return min(one, other, key=lambda found: self._chosen.get(found[1], 0))
         return min(one, other)
 
-    def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
+    def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, Exclusion]]:
         """Eligible hosts, and why the others are not."""
-        needs, pending = query.requirements, query.policy in COUNTING
+        pending = query.policy in COUNTING
         doubtful: Iterable[HostName]
-        if query.hosts is not None or self.cordoned or needs.labels or needs.memory:
+        if query.hosts is not None or self.cordoned or query.labels or query.memory:
             fit: dict[HostName, Outlook] = {}
             doubtful = self.reports if query.hosts is None else query.hosts
         else:
             # Of thousands, only those are examined that may differ from their reports.
             fit = self._outlooks.copy()
-            doubtful = [*self._overdue(now), *(self._pending.keys() & fit.keys() if pending else ())]
-        left_out: dict[HostName, str] = {}
-        for host in doubtful:
+            overdue = takewhile(lambda host: now - self.reports[host][0] > STALE, self.reports)
+            doubtful = {*overdue, *(self._pending.keys() & fit.keys() if pending else ())}
+        left_out: dict[HostName, Exclusion] = {}
+        for host in sorted(doubtful):
             reason = self._unfit(now, host, query)
-            if reason:
+            if reason is None:
+                fit[host] = self.outlook(now, host, pending=pending)
+            else:
                 left_out[host] = reason
                 fit.pop(host, None)
-            else:
-                fit[host] = self.outlook(now, host, pending=pending)
-        return fit, dict(sorted(left_out.items()))
+        return fit, left_out
 
-    def _overdue(self, now: Ns) -> Iterator[HostName]:
-        """Hosts whose last report is too old."""
-        for host, (at, _) in self.reports.items():
-            if now - at <= STALE:
-                return
-            yield host
-
-    def _unfit(self, now: Ns, host: HostName, query: RankQuery) -> str:
-        """Why a host is not eligible; empty if it is."""
-        cordoned = "it is cordoned" if host in self.cordoned else ""
-        return self._silent(now, host) or cordoned or self._lacks(now, host, query)
-
-    def _silent(self, now: Ns, host: HostName) -> str:
-        last = self.reports.get(host)
-        if last is None:
-            return "no report of it"
-        age = now - last[0]
-        return f"its last report is {age / SECOND:.1f} s old" if age > STALE else ""
-
-    def _lacks(self, now: Ns, host: HostName, query: RankQuery) -> str:
-        _, report = self.reports[host]
-        missing = sorted(query.requirements.labels - report.labels)
+    def _unfit(self, now: Ns, host: HostName, query: RankQuery) -> Exclusion | None:
+        """Why a host is not eligible; None if it is."""
+        if host not in self.reports:
+            return NO_REPORT
+        at, report = self.reports[host]
+        if now - at > STALE:
+            return Exclusion("stale", f"its last report is {(now - at) / SECOND:.1f} s old")
+        if host in self.cordoned:
+            return Exclusion("cordoned", "it is cordoned")
+        missing = sorted(query.labels.difference(report.labels))
         if missing:
-            return f"it has no label {', '.join(missing)}"
-        required = query.requirements.memory
-        if required:
+            return Exclusion("label", f"it has no label {', '.join(missing)}")
+        if query.memory:
             available = max(0, self.outlook(now, host, pending=query.policy in COUNTING).memory)
-            if available < required:
-                return f"{available:,} bytes available, {required:,} required"
-        return ""
-
-
-@dataclass(slots=True)
-class _Cached:
-    query: RankQuery
-    ranking: Ranking
-    changed: set[HostName]
+            if available < query.memory:
+                words = f"{available:,} bytes available, {query.memory:,} required"
+                return Exclusion("memory", words)
+        return None
 
 
 class RankingCache:
@@ -305,7 +295,8 @@ class RankingCache:
     def __init__(self, balancer: Balancer) -> None:
         self._balancer = balancer
         self._now: Ns = 0
-        self._cached: dict[RankQuery, _Cached] = {}
+        self._cached: dict[RankQuery, tuple[Ranking, set[HostName]]] = {}
+        """With the hosts that have changed since."""
 
     def begin(self, now: Ns) -> None:
         """Another instant, or hosts were cordoned: nothing is cached."""
@@ -313,28 +304,28 @@ class RankingCache:
 
     def invalidate(self, host: HostName) -> None:
         """A component came to a host or left it."""
-        for cached in self._cached.values():
-            cached.changed.add(host)
+        for _, changed in self._cached.values():
+            changed.add(host)
 
     def rank(self, query: RankQuery) -> Ranking:
         if query.metric == "auto" or query.policy in ("randomized", "two_choices"):
             # These draw lots, each time anew.
             return self._balancer.rank(self._now, query)
-        cached = self._cached.get(query)
-        if cached is None:
-            cached = self._cached[query] = _Cached(query, self._balancer.rank(self._now, query), set())
-        elif cached.changed:
-            cached.ranking = self._updated(cached)
-            cached.changed = set()
-        return cached.ranking
+        ranking, changed = self._cached.get(query, (None, set[HostName]()))
+        if ranking is None:
+            ranking = self._balancer.rank(self._now, query)
+        elif changed:
+            ranking = self._updated(query, ranking, changed)
+        else:
+            return ranking
+        self._cached[query] = ranking, set()
+        return ranking
 
-    def _updated(self, cached: _Cached) -> Ranking:
-        changed, old = cached.changed, cached.ranking
-        if cached.query.hosts is not None:
-            changed = changed & cached.query.hosts
-        new = self._balancer.rank(self._now, replace(cached.query, hosts=frozenset(changed)))
-        hosts = [one for one in old.hosts if one.host not in changed]
+    def _updated(self, query: RankQuery, old: Ranking, changed: set[HostName]) -> Ranking:
+        some = frozenset(changed if query.hosts is None else changed & query.hosts)
+        new = self._balancer.rank(self._now, replace(query, hosts=some))
+        hosts = [one for one in old.hosts if one.host not in some]
         for one in new.hosts:
             insort(hosts, one, key=lambda one: (-one.score, one.host))
-        left_out = {host: why for host, why in old.left_out.items() if host not in changed}
+        left_out = {host: why for host, why in old.left_out.items() if host not in some}
         return replace(old, hosts=tuple(hosts), left_out=left_out | dict(new.left_out))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from typing import Final
 
-from zscout.placement.events import ComponentState, PlacementSpec, StartAnswered, StopAnswered
-from zscout.placement.model import ScoredHost
-from zscout.placement.orphans import Orphans, Probes
+from zscout.messages import ComponentSpec, ComponentState, RankedHost
+from zscout.placement.events import StartAnswered, StopAnswered
+from zscout.placement.repeating import Probes, SurplusIncarnations
 from zscout.placement.state import (
     OVER,
     PROBE_TIMEOUT,
@@ -30,20 +29,16 @@ SHORTLY: Final[Ns] = SECOND // 100
 CAUSES_NAMED: Final = 4
 """In the reason why no host can start a component."""
 
-WAITING, STARTING, RUNNING = ComponentState.WAITING, ComponentState.STARTING, ComponentState.RUNNING
-BACKING_OFF, STOPPING = ComponentState.BACKING_OFF, ComponentState.STOPPING
-ENDED, GIVEN_UP = ComponentState.ENDED, ComponentState.GIVEN_UP
-
 
 class Lifecycle:
     """Decides for every component that is not `moving`; for that, see `Migrations`."""
 
-    def __init__(self, state: PlacementState, orphans: Orphans, probes: Probes) -> None:
-        self.state, self.orphans, self.probes = state, orphans, probes
+    def __init__(self, state: PlacementState, surplus: SurplusIncarnations, probes: Probes) -> None:
+        self.state, self.surplus, self.probes = state, surplus, probes
 
     # Requests
 
-    def place(self, component: ComponentId, spec: PlacementSpec) -> None:
+    def place(self, component: ComponentId, spec: ComponentSpec) -> None:
         state = self.state
         record = state.get(component)
         if record is None:
@@ -67,7 +62,7 @@ class Lifecycle:
             return
         state.mark_changed(component, always=True)
 
-    def _reset(self, record: ComponentRecord, spec: PlacementSpec) -> None:
+    def _reset(self, record: ComponentRecord, spec: ComponentSpec) -> None:
         record.spec, record.wanted, record.movable = spec, True, False
         record.restarts = record.failed_rounds = record.moves = 0
         record.dead = None
@@ -78,11 +73,11 @@ class Lifecycle:
         """For good. A migration must have been cancelled before."""
         record.wanted = False
         self.state.mark_changed(record.component, always=True)
-        if record.state is GIVEN_UP:
-            self._finish(record, ENDED, "stopped")
-        elif record.state not in (ENDED, STOPPING):
-            nowhere = record.state in (WAITING, BACKING_OFF)
-            record.enter(STOPPING)
+        if record.state == "given_up":
+            self._finish(record, "ended", "stopped")
+        elif record.state not in ("ended", "stopping"):
+            nowhere = record.state in ("waiting", "backing_off")
+            record.enter("stopping")
             record.reason = "asked to stop"
             if nowhere:
                 self.check_stopped(record)
@@ -94,7 +89,7 @@ class Lifecycle:
 
     def place_again(self, record: ComponentRecord, cause: str = "") -> None:
         """Has it placed at the end of this instant."""
-        record.enter(WAITING)
+        record.enter("waiting")
         record.restart_cause, record.whereabouts_unknown = cause, False
         self.state.wake(record, None)
         self.state.to_place[record.component] = None
@@ -107,7 +102,7 @@ class Lifecycle:
         waiting = [
             (name, state.components[name].spec.kind)
             for name in names
-            if state.components[name].state is WAITING
+            if state.components[name].state == "waiting"
         ]
         for number, component in enumerate(state.balancer.heaviest_first(waiting)):
             record = state.components[component]
@@ -127,16 +122,16 @@ class Lifecycle:
             self._start_on(record, untried)
         elif not hosts:
             tried.clear()
-            reason = f"no host will do: {eligible.why_none()}"
-            # Ages and amounts in it change all the time: that is not published.
-            if _without_figures(record.reason) != _without_figures(reason):
-                record.reason = reason
+            causes = eligible.causes()
+            if record.no_host != (causes, record.reason):
+                record.reason = f"no host will do: {eligible.why_none()}"
+                record.no_host = causes, record.reason
             self.state.wake(record, self.state.now + TRY_AGAIN)
         elif all(tried[one.host] for one in hosts):
-            causes = list(dict.fromkeys(tried[one.host] for one in hosts))
-            more = f"; and {len(causes) - CAUSES_NAMED} more" if len(causes) > CAUSES_NAMED else ""
-            reason = f"no host can start it: {'; '.join(causes[:CAUSES_NAMED])}{more}"
-            self._finish(record, GIVEN_UP, reason)
+            refusals = list(dict.fromkeys(tried[one.host] for one in hosts))
+            more = f"; and {len(refusals) - CAUSES_NAMED} more" if len(refusals) > CAUSES_NAMED else ""
+            reason = f"no host can start it: {'; '.join(refusals[:CAUSES_NAMED])}{more}"
+            self._finish(record, "given_up", reason)
         else:
             tried.clear()
             pause = self.state.back_off_time(record.failed_rounds)
@@ -144,9 +139,9 @@ class Lifecycle:
             reason = f"no host started it; tried again after {_seconds(pause)}: {record.restart_cause}"
             self._back_off(record, reason, pause)
 
-    def _start_on(self, record: ComponentRecord, chosen: ScoredHost) -> None:
+    def _start_on(self, record: ComponentRecord, chosen: RankedHost) -> None:
         state, cause = self.state, record.restart_cause
-        record.enter(STARTING)
+        record.enter("starting")
         record.incarnation = state.next_incarnation(record.component)
         record.host, record.superseded, record.running_since = chosen.host, False, None
         record.token, record.confirmed, record.probed, record.unanswered = False, False, False, 0
@@ -155,7 +150,7 @@ class Lifecycle:
         state.start(record)
 
     def _back_off(self, record: ComponentRecord, reason: str, pause: Ns) -> None:
-        record.enter(BACKING_OFF)
+        record.enter("backing_off")
         record.reason = reason
         self.state.wake(record, self.state.now + pause)
 
@@ -170,18 +165,18 @@ class Lifecycle:
     def start_answered(self, record: ComponentRecord, answer: StartAnswered) -> None:
         """Of the record's own incarnation, not of a migration's target."""
         record.start_until = None
-        if record.state is STOPPING:
+        if record.state == "stopping":
             # The stop may have come before the start: once more.
             if answer.result in ("refused", "failed"):
                 self.stopped(record)
             else:
                 self._command_stop(record)
-        elif answer.result == "failed" and record.state is not STARTING:
+        elif answer.result == "failed" and record.state != "starting":
             self.ended(record, Termination("failed", answer.reason, answer.tail))
         elif answer.result == "ok":
             record.movable, record.confirmed = answer.movable, True
             self.runs(record)
-        elif record.state is STARTING:
+        elif record.state == "starting":
             self._not_started(record, answer)
 
     def _not_started(self, record: ComponentRecord, answer: StartAnswered) -> None:
@@ -217,8 +212,8 @@ class Lifecycle:
 
     def runs(self, record: ComponentRecord, *, anew: bool = False) -> None:
         """It is known to run where it is; `anew`: as another incarnation than before."""
-        if record.state is not RUNNING or anew:
-            record.enter(RUNNING)
+        if record.state != "running" or anew:
+            record.enter("running")
             record.running_since, record.whereabouts_unknown = self.state.now, False
             record.failed_rounds, record.reason = 0, record.host_reason
             record.tried.clear()
@@ -247,7 +242,7 @@ class Lifecycle:
         if host is None or host not in state.alive:
             return Termination("lost", f"host {host} is gone", with_host=True)
         if record.unanswered >= MAX_PROBES and not record.token:
-            self.orphans.add(record.component, record.incarnation, host)
+            self.surplus.add(record.component, record.incarnation, host)
             return Termination("lost", f"its token is gone, and {host} tells nothing of it")
         record.unanswered += 1
         record.probed = True
@@ -260,10 +255,10 @@ class Lifecycle:
     def ended(self, record: ComponentRecord, end: Termination) -> None:
         """The record's incarnation has ended, or is taken for lost."""
         state, rules = self.state, self.state.rules
-        if record.state is STOPPING:
+        if record.state == "stopping":
             self.stopped(record, certain=end.cause != "lost")
             return
-        if record.state is STARTING and end.cause in ("failed", "lost") and not end.with_host:
+        if record.state == "starting" and end.cause in ("failed", "lost") and not end.with_host:
             self._start_failed(record, end)
             return
         host = record.host or "its host"
@@ -282,9 +277,9 @@ class Lifecycle:
             return
         cause = _cause(end, host)
         if end.cause == "completed" and record.spec.restart != "always":
-            self._finish(record, ENDED, cause)
+            self._finish(record, "ended", cause)
         elif record.spec.restart == "never":
-            self._finish(record, GIVEN_UP if end.cause == "failed" else ENDED, cause)
+            self._finish(record, "given_up" if end.cause == "failed" else "ended", cause)
         elif end.with_host:
             record.tried.clear()
             self.place_again(record, cause)
@@ -301,10 +296,10 @@ class Lifecycle:
     def _exhausted(self, record: ComponentRecord, cause: str) -> bool:
         """Gives it up if that was its last try."""
         if record.spec.restart == "never":
-            self._finish(record, GIVEN_UP, cause)
+            self._finish(record, "given_up", cause)
         elif record.restarts >= self.state.rules.restarts:
-            self._finish(record, GIVEN_UP, f"{cause}; {record.restarts} starts in a row failed")
-        return record.state is GIVEN_UP
+            self._finish(record, "given_up", f"{cause}; {record.restarts} starts in a row failed")
+        return record.state == "given_up"
 
     def host_lost(self, record: ComponentRecord, host: HostName) -> None:
         self.ended(record, Termination("lost", f"host {host} is gone", with_host=True))
@@ -347,18 +342,18 @@ class Lifecycle:
         self.check_stopped(record)
 
     def check_stopped(self, record: ComponentRecord) -> None:
-        """Stopped is a component once its orphans have ended, too."""
-        if record.host is not None or self.orphans.any(record.component):
+        """Stopped is a component once its surplus incarnations have ended, too."""
+        if record.host is not None or self.surplus.any(record.component):
             return
         if record.wanted:
             record.superseded = True
             self.place_again(record)
         else:
-            self._finish(record, ENDED, "stopped")
+            self._finish(record, "ended", "stopped")
 
-    def orphan_ended(self, component: ComponentId) -> None:
+    def surplus_ended(self, component: ComponentId) -> None:
         record = self.state.get(component)
-        if record is not None and record.state is STOPPING:
+        if record is not None and record.state == "stopping":
             self.check_stopped(record)
 
     # Time
@@ -366,17 +361,17 @@ class Lifecycle:
     def timer(self, record: ComponentRecord) -> None:
         state = self.state
         match record.state:
-            case ComponentState.BACKING_OFF if record.whereabouts_unknown:
+            case "backing_off" if record.whereabouts_unknown:
                 record.whereabouts_unknown = False
                 self.ended(record, Termination("lost", "it went on elsewhere and was not heard of again"))
-            case ComponentState.WAITING | ComponentState.BACKING_OFF:
+            case "waiting" | "backing_off":
                 self.place_again(record, record.restart_cause)
-            case ComponentState.STARTING:
+            case "starting":
                 self._repeat_start(record)
-            case ComponentState.RUNNING:
+            case "running":
                 if (end := self.check(record)) is not None:
                     self.ended(record, end)
-            case ComponentState.STOPPING:
+            case "stopping":
                 if record.start_until is not None and record.start_until <= state.now:
                     record.start_until = None
                 self._command_stop(record)
@@ -407,7 +402,3 @@ def _cause(end: Termination, host: HostName) -> str:
 
 def _seconds(pause: Ns) -> str:
     return f"{pause / SECOND:g} s"
-
-
-def _without_figures(reason: str) -> str:
-    return re.sub(r"[\d.,]+", "#", reason)

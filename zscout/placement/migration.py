@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from typing import Final
 
+from zscout.messages import Phase
 from zscout.placement.balancer import MAX_HOSTS
-from zscout.placement.events import ComponentState, MoveAnswered, StartAnswered
+from zscout.placement.events import MoveAnswered, StartAnswered
 from zscout.placement.lifecycle import Lifecycle
 from zscout.placement.state import (
     PROBE_TIMEOUT,
@@ -33,8 +34,6 @@ RETRY: Final[Ns] = 5 * SECOND
 MOVES_PER_HOST: Final = 2
 """Off a drained host at the same time."""
 
-RUNNING, MOVING = ComponentState.RUNNING, ComponentState.MOVING
-
 
 class Migrations:
     """Decides for components that are `moving`."""
@@ -55,7 +54,7 @@ class Migrations:
             else:
                 message = f"{component} is moving to {record.migration.to} already: wait for that"
                 state.refuse(component, "move_failed", message)
-        elif record.state is not RUNNING:
+        elif record.state != "running":
             message = f"{component} does not run: it is {record.state.replace('_', ' ')}"
             state.refuse(component, "not_running", message)
         elif to == record.host:
@@ -77,7 +76,7 @@ class Migrations:
     def begin(self, record: ComponentRecord, to: HostName, why: str) -> None:
         """The record runs and is movable, and `to` is eligible for it. `why`: in words."""
         state = self.state
-        record.enter(MOVING)
+        record.enter("moving")
         record.migration = Migration(to, state.next_incarnation(record.component), why)
         record.reason, record.drain_reason = f"moving to {to}, {why}", ""
         state.component_arrives(_reservation(record), record.spec.kind, to)
@@ -118,20 +117,17 @@ class Migrations:
         else:
             self._finish(record, move)
 
-    def target_listed(
-        self, record: ComponentRecord, move: Migration, *, running: bool, standby: bool
-    ) -> None:
-        if running:
+    def target_listed(self, record: ComponentRecord, move: Migration, phase: Phase) -> None:
+        if phase in ("running", "stopping"):
             move.target = "running"
             if move.stage == "starting":
                 self._finish(record, move)
             elif move.stage == "probing":
                 self._judge(record, move)
-        elif standby and move.stage == "starting":
-            self.target_answered(
-                record, move, StartAnswered(record.component, move.incarnation, move.to, "ok")
-            )
-        elif standby and move.stage == "probing":
+        elif phase == "standby" and move.stage == "starting":
+            answer = StartAnswered(record.component, move.incarnation, move.to, "ok")
+            self.target_answered(record, move, answer)
+        elif phase == "standby" and move.stage == "probing":
             move.target = "standby"
             self._judge(record, move)
 
@@ -240,7 +236,7 @@ class Migrations:
 
     # Ends of a migration
 
-    def _finish(self, record: ComponentRecord, move: Migration, dead: Ns | None = None) -> None:
+    def _finish(self, record: ComponentRecord, move: Migration, dead: float | None = None) -> None:
         """The target runs, and is the record's incarnation from now on."""
         state, old, source, token = self.state, record.incarnation, record.host, record.token
         self._close(record, move)
@@ -248,7 +244,7 @@ class Migrations:
         if move.source == "ended" or source is None:
             record.ended_incarnations.append(old)
         else:
-            self.lifecycle.orphans.add(record.component, old, source, token=token)
+            self.lifecycle.surplus.add(record.component, old, source, token=token)
         record.incarnation, record.host, record.token = move.incarnation, move.to, move.token
         record.moves += 1
         record.dead = dead
@@ -277,7 +273,7 @@ class Migrations:
         if move is not None:
             self._close(record, move)
             if stop_standby:
-                self.lifecycle.orphans.add(
+                self.lifecycle.surplus.add(
                     record.component, move.incarnation, move.to, move.start_until, token=move.token
                 )
 
@@ -286,7 +282,7 @@ class Migrations:
         state.balancer.gone(_reservation(record))
         state.rankings.invalidate(move.to)
         record.migration, record.not_before = None, state.now + RETRY
-        record.enter(RUNNING)
+        record.enter("running")
         state.wake_migration(record, None)
 
     # Drained hosts: nothing is placed there, and what is movable leaves, heaviest first
@@ -311,7 +307,7 @@ class Migrations:
         state.balancer.cordoned.discard(host)
         state.rankings.begin(state.now)
         for record in state.components.values():
-            if record.state is ComponentState.WAITING:
+            if record.state == "waiting":
                 state.wake(record, max(state.now, record.not_before))
             elif record.host == host and record.drain_reason:
                 record.drain_reason = ""
@@ -320,7 +316,7 @@ class Migrations:
     def drain_timer(self) -> None:
         on: dict[HostName, list[ComponentRecord]] = {}
         for record in self.state.components.values():
-            if record.host in self.state.balancer.cordoned and record.state in (RUNNING, MOVING):
+            if record.host in self.state.balancer.cordoned and record.state in ("running", "moving"):
                 on.setdefault(record.host, []).append(record)
         for host in sorted(on):
             self._empty(host, on[host])

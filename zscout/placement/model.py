@@ -1,99 +1,28 @@
-"""What the load balancer knows: hosts by their reports, kinds of components by their profiles.
+"""What the load balancer knows of hosts and kinds of components, and how each metric scores a host.
 
-Times are whole nanoseconds on one clock of the caller's choice.
+The greater score is the better host, whatever the unit. `load_average`, `processor_speed` and
+`available_memory` are the paper's (section 5). `composite` predicts how fast the component would run there: a
+processor shared by all who want it, and a memory that must hold it.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
-from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns, Policy
+from zscout.messages import ComponentSpec, LoadReport, RankAsk, RankedHost
+from zscout.types import SECOND, HostName, Kind, Metric, Ns, Policy
 
 REPORT_EVERY: Final[Ns] = SECOND
 """Period of a host's load reports."""
 STALE: Final[Ns] = 3 * REPORT_EVERY + REPORT_EVERY // 2
 """A host whose last report is older is never ranked."""
-
-MAX_USES: Final = 1_000
-"""Components in one load report."""
-
-
-class ComponentUsage(NamedTuple):
-    """What one component uses, with all its child processes: `cpu` in cores, `memory` in bytes.
-
-    `served`: of the time in which it wanted a processor, the share in which it had one, from 0 to 1; None
-    where the system does not measure it."""
-
-    component: ComponentId
-    kind: Kind
-    incarnation: int
-    cpu: float
-    memory: int
-    served: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class HostReport:
-    """One load report. `cores` may be a fraction where a container has only so much.
-
-    `speed`: how fast one core is, measured by the same short piece of work on every host (`1.0` is the speed
-    at which that takes a millisecond), so that unlike machines compare; `clock` and `clock_rated` in MHz, 0
-    where the system does not report it. Load averages as the kernel has them, memory in bytes, `cpu` 0 to 1.
-    Raises ValueError for figures that no host can have."""
-
-    host: HostName
-    number: int
-    cores: float
-    load_average: tuple[float, float, float]
-    cpu: float
-    memory_available: int
-    memory_total: int
-    speed: float = 1.0
-    clock: float = 0.0
-    clock_rated: float = 0.0
-    temperature: float | None = None
-    labels: frozenset[str] = frozenset()
-    uses: tuple[ComponentUsage, ...] = ()
-
-    def __post_init__(self) -> None:
-        # Thousands come each second: which figure is wrong is determined only where one is.
-        one, five, fifteen = self.load_average
-        if not (
-            SMALLEST <= self.cores <= LARGEST
-            and SMALLEST <= self.speed <= LARGEST
-            and 0 <= self.cpu <= 1
-            and 0 <= one <= LARGEST
-            and 0 <= five <= LARGEST
-            and 0 <= fifteen <= LARGEST
-            and 0 <= self.memory_available <= LARGEST
-            and 0 <= self.memory_total <= LARGEST
-            and len(self.uses) <= MAX_USES
-        ):
-            self._refuse()
-
-    def _refuse(self) -> None:
-        _bounded("cores", self.cores, SMALLEST)
-        _bounded("speed", self.speed, SMALLEST)
-        _bounded("cpu", self.cpu, 0, 1)
-        for load in self.load_average:
-            _bounded("load_average", load, 0)
-        _bounded("memory_available", self.memory_available, 0)
-        _bounded("memory_total", self.memory_total, 0)
-        if len(self.uses) > MAX_USES:
-            raise ValueError(f"uses: {len(self.uses)} components; a report has at most {MAX_USES}")
-
-
-SMALLEST: Final = 0.001
-"""The least cores and the least speed: what is divided by."""
-LARGEST: Final = 2**63
-
-
-def _bounded(name: str, value: float, least: float, most: float = LARGEST) -> None:
-    if not (math.isfinite(value) and least <= value <= most):
-        raise ValueError(f"{name}: {value} is not from {least:g} to {most:g}")
+THRASHING: Final = 0.05
+"""What a component keeps of its speed where memory is far too small for it."""
+MEGABYTE: Final = 1_000_000
+LEAST: Final = 0.01
+"""Cores that any component wants."""
 
 
 class Profile(NamedTuple):
@@ -109,9 +38,7 @@ class Profile(NamedTuple):
 
     def wants(self, speed: float) -> float:
         """Cores that it wants of a host of this speed. A kind that never ran counts the same on all."""
-        if not self.samples:
-            return min(self.cpu, float(self.threads))
-        return min(self.cpu / speed, float(self.threads))
+        return min(self.cpu / speed if self.samples else self.cpu, float(self.threads))
 
 
 DEFAULT_PROFILE: Final = Profile(cpu=0.25, memory=64_000_000)
@@ -119,42 +46,105 @@ DEFAULT_PROFILE: Final = Profile(cpu=0.25, memory=64_000_000)
 
 
 @dataclass(frozen=True, slots=True)
-class Requirements:
-    """Where a component can run at all."""
-
-    labels: frozenset[str] = frozenset()
-    """The host must have all of these: devices, operating system, a place."""
-    memory: int = 0
-    """Bytes that must be available."""
-
-
-@dataclass(frozen=True, slots=True)
 class RankQuery:
-    """Which hosts are best for a component? `hosts`: only these; None: all that report."""
+    """Which hosts are best for a component? They must have all `labels`, and `memory` bytes available.
+    `hosts`: only these; None: all that report."""
 
     kind: Kind = ""
     metric: Metric = "composite"
     policy: Policy = "pending"
-    requirements: Requirements = Requirements()
+    labels: frozenset[str] = frozenset()
+    memory: int = 0
     hosts: frozenset[HostName] | None = None
 
+    @classmethod
+    def of(cls, asked: ComponentSpec | RankAsk) -> RankQuery:
+        hosts = None if asked.hosts is None else frozenset(asked.hosts)
+        labels = frozenset(asked.labels)
+        return cls(asked.kind, asked.metric, asked.policy, labels, asked.memory, hosts)
 
-@dataclass(frozen=True, slots=True)
-class ScoredHost:
-    """A host and its score, which is greater for a better host; `reason` has it in words."""
 
-    host: HostName
-    score: float
-    reason: str
+class Exclusion(NamedTuple):
+    """Why a host can't be used, and the same in words. Figures in these change all the time."""
+
+    cause: Literal["no_report", "stale", "cordoned", "label", "memory", "gone", "not_named"]
+    words: str
+
+
+NO_REPORT: Final = Exclusion("no_report", "no report of it")
 
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Hosts best first; `metric` is the one that was used, `why` says how it was chosen; `left_out` has the
-    reasons of hosts that are not eligible; `more` hosts are ranked behind those listed."""
+    """Hosts best first; `metric` is the one that was used, `why` is how it was chosen; `more` hosts are
+    ranked behind those listed."""
 
-    hosts: tuple[ScoredHost, ...]
+    hosts: tuple[RankedHost, ...]
     metric: Metric
     why: str
-    left_out: Mapping[HostName, str] = field(default_factory=dict)
+    left_out: Mapping[HostName, Exclusion] = field(default_factory=dict)
     more: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """A host as it will be: its report, and what was placed there and is not in the report yet."""
+
+    report: LoadReport
+    load: float
+    """Processes that want a processor: the load average, and what is not in it yet."""
+    memory: int
+    """Bytes available when all that was placed has taken its own."""
+
+    @property
+    def load_per_core(self) -> float:
+        return self.load / self.report.cores
+
+
+def rate(outlook: Outlook, profile: Profile) -> float:
+    """How fast a component of this profile would run: 1.0 is a core of speed 1.0 whenever it wants one."""
+    return rates([outlook], profile)[0]
+
+
+def rates(outlooks: Sequence[Outlook], profile: Profile) -> list[float]:
+    """Of thousands of hosts at once: `profile.wants` is inlined, as a call would cost more."""
+    cpu, threads, needed = profile.cpu, float(profile.threads), profile.memory
+    found = []
+    for outlook in outlooks:
+        report = outlook.report
+        speed, cores = report.speed, report.cores
+        wants = cpu / speed
+        if wants > threads:
+            wants = threads
+        elif wants < LEAST:
+            wants = LEAST
+        wanting = outlook.load + wants
+        got = speed if wanting <= cores else speed * cores / wanting
+        if max(0, outlook.memory) < needed:
+            got *= max(THRASHING, (max(0, outlook.memory) / needed) ** 2)
+        found.append(got)
+    return found
+
+
+def _composite_words(outlook: Outlook, profile: Profile) -> str:
+    return (
+        f"would run at {rate(outlook, profile):.2f}: speed {outlook.report.speed:.2f}, "
+        f"load {outlook.load_per_core:.2f} a core, {outlook.memory / MEGABYTE:,.0f} MB available"
+    )
+
+
+SCORES: Final[Mapping[Metric, Callable[[Sequence[Outlook], Profile], list[float]]]] = {
+    "load_average": lambda outlooks, _: [-one.load_per_core for one in outlooks],
+    "processor_speed": lambda outlooks, _: [one.report.speed for one in outlooks],
+    "available_memory": lambda outlooks, _: [float(one.memory) for one in outlooks],
+    "composite": rates,
+}
+"""All but `auto`, which chooses among them: the scores of these hosts."""
+
+WORDS: Final[Mapping[Metric, Callable[[Outlook, Profile], str]]] = {
+    "load_average": lambda outlook, _: f"load {outlook.load_per_core:.2f} a core",
+    "processor_speed": lambda outlook, _: f"speed {outlook.report.speed:.2f}",
+    "available_memory": lambda outlook, _: f"{outlook.memory / MEGABYTE:,.0f} MB available",
+    "composite": _composite_words,
+}
+"""The same in words, for the hosts that are listed: they take longer than the scores."""

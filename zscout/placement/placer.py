@@ -1,6 +1,6 @@
 """The pure core of the component placer: events in, effects out, time passed in.
 
-    effects = placer.handle(now, PlaceRequested("counter", spec), ...)
+    effects = placer.handle(now, PlaceComponent("counter", spec), ...)
 
 Every decision about where components run is made here and in the modules around the one `state`: `lifecycle`
 places, restarts and stops; `migration` and `rebalancing` move; `reconciler` decides which incarnation counts.
@@ -21,34 +21,35 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from zscout.config.placement_policy import DEFAULT_PLACEMENT, PlacementPolicy
+from zscout.messages import (
+    DrainHost,
+    EndComponent,
+    MigrateComponent,
+    PlaceComponent,
+    Placement,
+    UncordonHost,
+)
 from zscout.placement.balancer import Balancer
 from zscout.placement.events import (
     ComponentsListed,
-    ComponentState,
-    ComponentStatus,
-    DrainRequested,
     HostJoined,
     HostLost,
     Inherited,
     MoveAnswered,
-    MoveRequested,
     PlacerEffect,
-    PlaceRequested,
     PlacerEvent,
     PlacerTick,
     PlacerWakeAt,
     StartAnswered,
     StopAnswered,
-    StopRequested,
     TokenAppeared,
     TokenVanished,
-    UncordonRequested,
 )
 from zscout.placement.lifecycle import Lifecycle
 from zscout.placement.migration import Migrations
-from zscout.placement.orphans import Orphans, Probes
 from zscout.placement.rebalancing import Rebalancer
 from zscout.placement.reconciler import Reconciler
+from zscout.placement.repeating import Probes, SurplusIncarnations
 from zscout.placement.state import PlacementState, TimerKind
 from zscout.types import ComponentId, HostName, Ns
 
@@ -57,7 +58,7 @@ from zscout.types import ComponentId, HostName, Ns
 class PlacerStatus:
     """`components` as they were last published: a view that follows what is handled."""
 
-    components: Mapping[ComponentId, ComponentStatus]
+    components: Mapping[ComponentId, Placement]
     cordoned: frozenset[HostName]
 
 
@@ -67,8 +68,8 @@ class Placer:
 
     def __init__(self, balancer: Balancer, counter: int, rules: PlacementPolicy = DEFAULT_PLACEMENT) -> None:
         self._state = state = PlacementState(balancer, counter, rules)
-        self._orphans, self._probes = Orphans(state), Probes(state)
-        self._lifecycle = Lifecycle(state, self._orphans, self._probes)
+        self._surplus, self._probes = SurplusIncarnations(state), Probes(state)
+        self._lifecycle = Lifecycle(state, self._surplus, self._probes)
         self._migrations = Migrations(state, self._lifecycle)
         self._rebalancer = Rebalancer(state, self._migrations)
         self._reconciler = Reconciler(state, self._lifecycle, self._migrations)
@@ -99,15 +100,15 @@ class Placer:
 
     def _apply(self, event: PlacerEvent) -> None:
         match event:
-            case PlaceRequested(component, spec):
+            case PlaceComponent(component, spec):
                 self._lifecycle.place(component, spec)
-            case StopRequested(component):
+            case EndComponent(component):
                 self._stop(component)
-            case MoveRequested(component, to):
+            case MigrateComponent(component, to):
                 self._migrations.request(component, to)
-            case DrainRequested(host):
+            case DrainHost(host):
                 self._migrations.drain(host)
-            case UncordonRequested(host):
+            case UncordonHost(host):
                 self._migrations.uncordon(host)
             case StartAnswered():
                 self._start_answered(event)
@@ -143,7 +144,7 @@ class Placer:
     # Answers: those about an incarnation that no longer counts change nothing
 
     def _start_answered(self, answer: StartAnswered) -> None:
-        if self._orphans.start_answered(answer.component, answer.incarnation):
+        if self._surplus.start_answered(answer.component, answer.incarnation):
             return
         record = self._state.get(answer.component)
         if record is None:
@@ -155,9 +156,9 @@ class Placer:
             self._lifecycle.start_answered(record, answer)
 
     def _stop_answered(self, answer: StopAnswered) -> None:
-        self._orphans.stop_answered(answer.component, answer.incarnation, done=answer.done)
+        self._surplus.stop_answered(answer.component, answer.incarnation, done=answer.done)
         record = self._state.get(answer.component)
-        if record is None or record.state is not ComponentState.STOPPING:
+        if record is None or record.state != "stopping":
             return
         if (answer.incarnation, answer.host) == (record.incarnation, record.host):
             self._lifecycle.stop_answered(record, answer)
@@ -177,8 +178,8 @@ class Placer:
                 self._migrations.drain_timer()
             case TimerKind.REBALANCE:
                 self._rebalancer.timer()
-            case TimerKind.ORPHANS:
-                self._orphans.timer(name)
+            case TimerKind.SURPLUS:
+                self._surplus.timer(name)
             case TimerKind.PROBES:
                 self._probes.timer(name)
             case TimerKind.LIFECYCLE | TimerKind.MIGRATION:

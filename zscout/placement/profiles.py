@@ -10,14 +10,15 @@ never tried is never known to be one.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from random import Random
-from typing import Final
+from statistics import StatisticsError, correlation
+from typing import Final, NamedTuple
 
-from zscout.placement.metrics import SCORES
-from zscout.placement.model import ComponentUsage, Profile
+from zscout.messages import ComponentUse
+from zscout.placement.model import SCORES, Profile
 from zscout.types import Metric
 
 CHOICES: Final[tuple[Metric, ...]] = tuple(SCORES)
@@ -29,15 +30,13 @@ EXPLORE: Final = 0.1
 DEFAULT: Final[Metric] = "composite"
 AHEAD: Final = 0.02
 """By how much another metric has to agree better than `DEFAULT`."""
-
-
 LEAST_SERVED: Final = 0.05
 """A smaller share does not show what a component wants."""
 LEARN: Final = 0.2
 """Weight of the latest figure in a profile."""
 
 
-def learn_profile(known: Profile | None, use: ComponentUsage, speed: float) -> Profile:
+def learn_profile(known: Profile | None, use: ComponentUse, speed: float) -> Profile:
     """A profile with one sample more; memory is the most that was seen, forgotten slowly."""
     # What it wanted, not what a busy host gave it.
     wanted = use.cpu / max(use.served, LEAST_SERVED) if use.served is not None else use.cpu
@@ -52,9 +51,8 @@ def learn_profile(known: Profile | None, use: ComponentUsage, speed: float) -> P
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """The metrics' scores of a host, and how fast a component then ran there (`metrics.rate`)."""
+class Observation(NamedTuple):
+    """The metrics' scores of a host, and how fast a component then ran there (`model.rate`)."""
 
     scores: Mapping[Metric, float]
     rate: float
@@ -97,27 +95,12 @@ class MetricLearner:
 
 def spearman(one: Sequence[float], other: Sequence[float]) -> float:
     """Rank correlation, ties shared, from -1 to 1; 0 where either does not vary."""
-    if len(one) < 2:
+    try:
+        return correlation(_ranks(one), _ranks(other))
+    except StatisticsError:
         return 0.0
-    return _pearson(_ranks(one), _ranks(other))
 
 
 def _ranks(values: Sequence[float]) -> list[float]:
-    order = sorted(range(len(values)), key=values.__getitem__)
-    ranks = [0.0] * len(values)
-    start = 0
-    while start < len(order):
-        end = start
-        while end + 1 < len(order) and values[order[end + 1]] == values[order[start]]:
-            end += 1
-        for at in order[start : end + 1]:
-            ranks[at] = (start + end) / 2
-        start = end + 1
-    return ranks
-
-
-def _pearson(one: Sequence[float], other: Sequence[float]) -> float:
-    mean, mean_other = sum(one) / len(one), sum(other) / len(other)
-    both = sum((a - mean) * (b - mean_other) for a, b in zip(one, other, strict=True))
-    spread = sum((a - mean) ** 2 for a in one) * sum((b - mean_other) ** 2 for b in other)
-    return float(both / spread**0.5) if spread > 0 else 0.0
+    ordered = sorted(values)
+    return [float(bisect_left(ordered, value) + bisect_right(ordered, value)) for value in values]

@@ -17,10 +17,8 @@ from functools import cache
 from typing import Final
 
 from zscout.placement.balancer import LOAD_TIME
-from zscout.placement.events import ComponentState
-from zscout.placement.metrics import Outlook, rate
 from zscout.placement.migration import Migrations
-from zscout.placement.model import STALE, Profile, RankQuery
+from zscout.placement.model import STALE, Outlook, Profile, RankQuery, rate
 from zscout.placement.state import ComponentRecord, PlacementState, TimerKind
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
@@ -76,11 +74,11 @@ class Rebalancer:
         running: Counter[HostName] = Counter()
         for _, record in sorted(state.components.items()):
             host, spec = record.host, record.spec
-            if host is None or record.state is not ComponentState.RUNNING:
+            if host is None or record.state != "running":
                 continue
             running[host] += 1
             if self._may_leave(record, host):
-                query = RankQuery(spec.kind, "composite", "pending", spec.requirements, spec.hosts)
+                query = replace(RankQuery.of(spec), metric="composite", policy="pending")
                 groups.setdefault((host, query), record)
         outlook, targets = cache(self._outlook), cache(self._targets)
         found = []

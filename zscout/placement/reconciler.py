@@ -4,28 +4,23 @@ published. Of two that live the higher one counts; the lower is stopped.
 
 from __future__ import annotations
 
-from zscout.messages import Incarnation
-from zscout.placement.events import (
-    ComponentsListed,
-    ComponentState,
-    ComponentStatus,
-    ListedComponent,
-    TokenAppeared,
-    TokenVanished,
-)
+from typing import Final
+
+from zscout.messages import ComponentState, ComponentView, Incarnation, Placement
+from zscout.placement.events import ComponentsListed, TokenAppeared, TokenVanished
 from zscout.placement.lifecycle import GRACE, Lifecycle
 from zscout.placement.migration import Migrations
 from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, PlacementState, Termination
 from zscout.types import ComponentId, HostName
 
-WAITING, STARTING, RUNNING = ComponentState.WAITING, ComponentState.STARTING, ComponentState.RUNNING
-BACKING_OFF, STOPPING = ComponentState.BACKING_OFF, ComponentState.STOPPING
+RUNNING: Final = ("running", "stopping")
+"""Phases of a component, as its host lists it, that count as running."""
 
 
 class Reconciler:
     def __init__(self, state: PlacementState, lifecycle: Lifecycle, migrations: Migrations) -> None:
         self.state, self.lifecycle, self.migrations = state, lifecycle, migrations
-        self.orphans, self.probes = lifecycle.orphans, lifecycle.probes
+        self.surplus, self.probes = lifecycle.surplus, lifecycle.probes
 
     # Tokens
 
@@ -35,7 +30,7 @@ class Reconciler:
         if not state.is_plausible(incarnation):
             return
         state.note_incarnation(component, incarnation)
-        self.orphans.token(component, incarnation, alive=True)
+        self.surplus.token(component, incarnation, alive=True)
         if record is None or host not in state.alive:
             # If its node's token is late, the host is probed when it joins.
             self.probes.add(host, component)
@@ -43,24 +38,24 @@ class Reconciler:
             return
         if incarnation in record.ended_incarnations:
             # Late news, or it started after it was stopped.
-            self.orphans.add(component, incarnation, host, token=True)
+            self.surplus.add(component, incarnation, host, token=True)
         elif (move := record.migration) is not None and incarnation == move.incarnation:
             self.migrations.target_appeared(record, move)
         elif incarnation != record.incarnation or record.superseded:
             self._other_runs(record, incarnation, host, token=True)
         elif self._must_not_live(record):
-            self.orphans.add(component, incarnation, host, token=True)
+            self.surplus.add(component, incarnation, host, token=True)
         elif self._can_be_at(record, host):
             record.token = True
-            if record.migration is None and record.state is not STOPPING:
+            if record.migration is None and record.state != "stopping":
                 self.lifecycle.runs(record)
 
     def vanished(self, token: TokenVanished) -> None:
         """How it ended, its host reports; a token may also be gone for a while with the network."""
         component, incarnation = token.component, token.incarnation
         record = self.state.get(component)
-        self.orphans.token(component, incarnation, alive=False)
-        self.lifecycle.orphan_ended(component)
+        self.surplus.token(component, incarnation, alive=False)
+        self.lifecycle.surplus_ended(component)
         if record is None:
             return
         move = record.migration
@@ -68,17 +63,17 @@ class Reconciler:
             record.token = False
             if move is not None:
                 self.migrations.source_vanished(record, move)
-            elif record.state is RUNNING:
+            elif record.state == "running":
                 record.unanswered = 0
                 self.lifecycle.timer(record)
-            elif record.state is STOPPING and record.stop_confirmed:
+            elif record.state == "stopping" and record.stop_confirmed:
                 self.lifecycle.stopped(record)
         elif move is not None and incarnation == move.incarnation:
             move.token, move.target = False, "unknown"
 
     def _must_not_live(self, record: ComponentRecord) -> bool:
         """Its incarnation ended, or is being stopped and its host was believed gone."""
-        return record.state in OVER or (record.state is STOPPING and record.host is None)
+        return record.state in OVER or (record.state == "stopping" and record.host is None)
 
     def _can_be_at(self, record: ComponentRecord, host: HostName) -> bool:
         """Whether the incarnation can be at that host; if it was nowhere, it is there from now on."""
@@ -92,16 +87,16 @@ class Reconciler:
     ) -> None:
         """An incarnation runs that is not the record's."""
         state = self.state
-        if self.orphans.has(record.component, incarnation):
+        if self.surplus.has(record.component, incarnation):
             return
-        stopped = record.state is STOPPING or record.state in OVER
+        stopped = record.state == "stopping" or record.state in OVER
         if stopped or incarnation < record.incarnation + record.superseded:
-            self.orphans.add(record.component, incarnation, host, token=token)
+            self.surplus.add(record.component, incarnation, host, token=token)
             return
         if host not in state.alive:
             return
         if record.host is not None:
-            self.orphans.add(
+            self.surplus.add(
                 record.component, record.incarnation, record.host, record.start_until, token=record.token
             )
         self.migrations.cancel(record)
@@ -125,7 +120,7 @@ class Reconciler:
             self._not_listed(record, listing, present)
         for name in answered:
             waiting = state.components.get(name)
-            if waiting is not None and waiting.state is WAITING:
+            if waiting is not None and waiting.state == "waiting":
                 state.wake(waiting, state.now)
 
     def _on(self, host: HostName) -> list[ComponentRecord]:
@@ -136,7 +131,7 @@ class Reconciler:
             if record.host == host or (record.migration is not None and record.migration.to == host)
         ]
 
-    def _listed(self, host: HostName, listed: ListedComponent) -> None:
+    def _listed(self, host: HostName, listed: ComponentView) -> None:
         state, component, incarnation = self.state, listed.component, listed.incarnation
         if not state.is_plausible(incarnation):
             return
@@ -144,58 +139,59 @@ class Reconciler:
         record = state.get(component)
         if record is None:
             self._adopt(host, listed)
-        elif listed.ended is not None:
-            end = Termination(listed.ended, listed.reason, listed.tail)
+        elif listed.phase == "ended":
+            end = Termination(listed.ended or "lost", listed.reason, listed.tail)
             self._listed_as_ended(record, host, incarnation, end)
         elif incarnation in record.ended_incarnations:
-            self.orphans.add(component, incarnation, host)
+            self.surplus.add(component, incarnation, host)
         elif (move := record.migration) is not None and incarnation == move.incarnation:
-            self.migrations.target_listed(record, move, running=listed.running, standby=listed.standby)
+            self.migrations.target_listed(record, move, listed.phase)
         elif incarnation == record.incarnation and not record.superseded:
             self._listed_alive(record, host, listed)
-        elif not listed.standby:
+        elif listed.phase != "standby":
             self._other_runs(record, incarnation, host, token=False)
 
-    def _adopt(self, host: HostName, listed: ListedComponent) -> None:
+    def _adopt(self, host: HostName, listed: ComponentView) -> None:
         """A placer of a term before had it started."""
         state = self.state
-        if listed.ended is not None or listed.standby or host not in state.alive:
+        if listed.phase in ("ended", "standby") or host not in state.alive:
             return
-        record = state.add(listed.component, listed.spec, STARTING, listed.incarnation, host)
+        record = state.add(listed.component, listed.spec, "starting", listed.incarnation, host)
         if record is None:
             return
-        record.movable, record.confirmed = listed.movable, listed.running
+        running = listed.phase in RUNNING
+        record.movable, record.confirmed = listed.movable, running
         record.host_reason = f"found running on {host}"
-        if listed.running:
+        if running:
             self.lifecycle.runs(record)
         else:
             record.reason = f"found starting on {host}"
             state.start(record)
 
-    def _listed_alive(self, record: ComponentRecord, host: HostName, listed: ListedComponent) -> None:
+    def _listed_alive(self, record: ComponentRecord, host: HostName, listed: ComponentView) -> None:
         """The record's incarnation lives."""
         if self._must_not_live(record):
-            if not listed.standby:
-                self.orphans.add(record.component, listed.incarnation, host)
-        elif record.state is not STOPPING and not listed.standby and self._can_be_at(record, host):
-            if listed.running:
+            if listed.phase != "standby":
+                self.surplus.add(record.component, listed.incarnation, host)
+        elif record.state != "stopping" and listed.phase != "standby" and self._can_be_at(record, host):
+            if listed.phase in RUNNING:
                 record.movable, record.confirmed = listed.movable, True
                 record.unanswered, record.probed = 0, False
                 if record.migration is not None:
                     self.migrations.source_runs(record, record.migration)
                 else:
                     self.lifecycle.runs(record)
-            elif record.state in (WAITING, BACKING_OFF):
-                record.enter(STARTING)
+            elif record.state in ("waiting", "backing_off"):
+                record.enter("starting")
                 self.state.start(record)
 
     def _listed_as_ended(
         self, record: ComponentRecord, host: HostName, incarnation: Incarnation, end: Termination
     ) -> None:
         move = record.migration
-        if self.orphans.has(record.component, incarnation):
-            self.orphans.ended(record.component, incarnation)
-            self.lifecycle.orphan_ended(record.component)
+        if self.surplus.has(record.component, incarnation):
+            self.surplus.ended(record.component, incarnation)
+            self.lifecycle.surplus_ended(record.component)
         elif incarnation in record.ended_incarnations and record.host is None:
             pass
         elif move is not None and incarnation == move.incarnation:
@@ -237,7 +233,7 @@ class Reconciler:
         state.mark_changed(record.component)
         if record.migration is not None:
             self.migrations.source_ended(record, record.migration, end)
-        elif record.state in (RUNNING, STOPPING):
+        elif record.state in ("running", "stopping"):
             self.lifecycle.ended(record, end)
 
     # Hosts
@@ -251,14 +247,14 @@ class Reconciler:
         state.drain_soon(host)
         self.probes.host_joined(host)
         for record in state.components.values():
-            if record.state is WAITING:
+            if record.state == "waiting":
                 if self.probes.has(host, record.component):
                     # Perhaps it is there still: better than to start it anew.
                     record.not_before = state.now + PROBE_TIMEOUT
                 state.wake(record, max(state.now, record.not_before))
-            elif record.state is STOPPING and record.host == host:
+            elif record.state == "stopping" and record.host == host:
                 state.wake(record, state.now)
-            elif record.state is RUNNING and record.host == host:
+            elif record.state == "running" and record.host == host:
                 # Its list or its token comes in a moment.
                 state.wake(record, state.now + GRACE)
 
@@ -268,9 +264,9 @@ class Reconciler:
         state.alive.discard(host)
         state.last_change.pop(host, None)
         state.departed.pop(host, None)
-        for component in self.orphans.host_lost(host):
+        for component in self.surplus.host_lost(host):
             self.probes.add(host, component)
-            self.lifecycle.orphan_ended(component)
+            self.lifecycle.surplus_ended(component)
         for record in self._on(host):
             state.mark_changed(record.component)
             self.probes.add(host, record.component)
@@ -284,7 +280,7 @@ class Reconciler:
 
     # What was published before
 
-    def inherited(self, status: ComponentStatus) -> None:
+    def inherited(self, status: Placement) -> None:
         """It stands until a host reports otherwise, or none does within GRACE."""
         state = self.state
         if not state.is_plausible(status.incarnation):
@@ -297,9 +293,9 @@ class Reconciler:
                 self.migrations.cancel(record)
                 self.lifecycle.stop(record)
             return
-        moved = status.state is ComponentState.MOVING
-        stands = RUNNING if moved else status.state
-        host = status.host if stands in (STARTING, RUNNING, STOPPING) else None
+        moved = status.state == "moving"
+        stands: ComponentState = "running" if moved else status.state
+        host = status.host if stands in ("starting", "running", "stopping") else None
         record = state.add(status.component, status.spec, stands, status.incarnation, host)
         if record is None:
             return
@@ -307,7 +303,7 @@ class Reconciler:
         record.host_reason, record.tail, record.wanted = status.reason, status.tail, status.wanted
         record.movable, record.restarts = status.movable, status.restarts
         record.moves, record.dead = status.moves, status.dead
-        record.running_since = state.now if stands is RUNNING else None
+        record.running_since = state.now if stands == "running" else None
         record.not_before = state.now + GRACE
         if stands in OVER:
             state.retire(record)

@@ -7,30 +7,33 @@ import heapq
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from itertools import islice
 from typing import Final, Literal, TypeAlias
 
 from zscout.config.placement_policy import PlacementPolicy
-from zscout.messages import Incarnation
+from zscout.messages import (
+    ComponentSpec,
+    ComponentState,
+    HowEnded,
+    Incarnation,
+    ListComponents,
+    MoveComponent,
+    Placement,
+    RankedHost,
+    StartComponent,
+    StopComponent,
+)
 from zscout.placement.balancer import LOAD_TIME, Balancer, RankingCache
 from zscout.placement.events import (
     ComponentChanged,
     ComponentForgotten,
-    ComponentState,
-    ComponentStatus,
-    EndCause,
     HostCommand,
-    MoveCommand,
     PlacementRefused,
-    PlacementSpec,
     PlacerEffect,
-    ProbeCommand,
-    StartCommand,
-    StopCommand,
 )
-from zscout.placement.model import RankQuery, ScoredHost
+from zscout.placement.model import NO_REPORT, Exclusion, RankQuery
 from zscout.types import SECOND, ComponentId, HostName, Kind, Ns
 
 PER_TERM: Final = 1_000
@@ -51,18 +54,20 @@ MAX_ENDED_INCARNATIONS: Final = 16
 HOSTS_NAMED: Final = 3
 """In the reason why there is no eligible host."""
 
-_S = ComponentState
 TRANSITIONS: Final[Mapping[ComponentState, frozenset[ComponentState]]] = {
-    _S.WAITING: frozenset({_S.STARTING, _S.RUNNING, _S.BACKING_OFF, _S.STOPPING, _S.ENDED, _S.GIVEN_UP}),
-    _S.STARTING: frozenset({_S.WAITING, _S.RUNNING, _S.BACKING_OFF, _S.STOPPING, _S.ENDED, _S.GIVEN_UP}),
-    _S.RUNNING: frozenset({_S.WAITING, _S.MOVING, _S.BACKING_OFF, _S.STOPPING, _S.ENDED, _S.GIVEN_UP}),
-    _S.MOVING: frozenset({_S.RUNNING}),
-    _S.BACKING_OFF: frozenset({_S.WAITING, _S.STARTING, _S.RUNNING, _S.STOPPING, _S.ENDED, _S.GIVEN_UP}),
-    _S.STOPPING: frozenset({_S.WAITING, _S.ENDED}),
-    _S.ENDED: frozenset({_S.WAITING}),
-    _S.GIVEN_UP: frozenset({_S.WAITING, _S.ENDED}),
+    "waiting": frozenset({"starting", "running", "backing_off", "stopping", "ended", "given_up"}),
+    "starting": frozenset({"waiting", "running", "backing_off", "stopping", "ended", "given_up"}),
+    "running": frozenset({"waiting", "moving", "backing_off", "stopping", "ended", "given_up"}),
+    "moving": frozenset({"running"}),
+    "backing_off": frozenset({"waiting", "starting", "running", "stopping", "ended", "given_up"}),
+    "stopping": frozenset({"waiting", "ended"}),
+    "ended": frozenset({"waiting"}),
+    "given_up": frozenset({"waiting", "ended"}),
 }
-OVER: Final = frozenset({ComponentState.ENDED, ComponentState.GIVEN_UP})
+OVER: Final[frozenset[ComponentState]] = frozenset({"ended", "given_up"})
+
+GONE: Final = Exclusion("gone", "its node is not there")
+NOT_NAMED: Final = Exclusion("not_named", "it is not among the hosts that the component asks for")
 
 SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
 """What is known of the source or the target of a migration."""
@@ -70,9 +75,10 @@ SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
 
 @dataclass(frozen=True, slots=True)
 class Termination:
-    """How an incarnation ended. `with_host`: with its host, so that it does not count as its failure."""
+    """How an incarnation ended; `lost`: nobody knows how. `with_host`: with its host, so that it does not
+    count as its failure."""
 
-    cause: EndCause
+    cause: HowEnded | Literal["lost"]
     reason: str
     tail: str = ""
     with_host: bool = False
@@ -102,8 +108,8 @@ class ComponentRecord:
     """A component. `host` is where its incarnation is, or starts; None: nowhere."""
 
     component: ComponentId
-    spec: PlacementSpec
-    state: ComponentState = ComponentState.WAITING
+    spec: ComponentSpec
+    state: ComponentState = "waiting"
     """Changed by `enter` alone."""
     incarnation: Incarnation = 0
     superseded: bool = False
@@ -122,7 +128,8 @@ class ComponentRecord:
     failed_rounds: int = 0
     """How often all hosts were tried in vain."""
     moves: int = 0
-    dead: Ns | None = None
+    dead: float | None = None
+    """Seconds that its last move took it out of work."""
     running_since: Ns | None = None
     start_until: Ns | None = None
     """A start is commanded and not answered; it is taken for lost then."""
@@ -135,6 +142,8 @@ class ComponentRecord:
     """A probe is sent, and not answered."""
     stop_confirmed: bool = False
     """Its host reported that it has ended, or never was there."""
+    no_host: tuple[Mapping[HostName, str], str] | None = None
+    """The causes for which no host would do (`EligibleHosts.causes`), and the reason given for that."""
     tried: dict[HostName, str] = field(default_factory=dict)
     """Hosts that did not start it in this round, with the reason if another try there would not help."""
     whereabouts_unknown: bool = False
@@ -149,12 +158,12 @@ class ComponentRecord:
 
     def enter(self, state: ComponentState) -> None:
         """Raises ValueError for a transition that the table does not have."""
-        if state not in TRANSITIONS[self.state] and state is not self.state:
+        if state not in TRANSITIONS[self.state] and state != self.state:
             raise ValueError(f"{self.component}: from {self.state} to {state}")
         self.state = state
 
-    def status(self) -> ComponentStatus:
-        return ComponentStatus(
+    def status(self) -> Placement:
+        return Placement(
             component=self.component,
             spec=self.spec,
             state=self.state,
@@ -175,17 +184,21 @@ class ComponentRecord:
 class EligibleHosts:
     """Hosts that can run a component, best first, and of the others why not."""
 
-    hosts: tuple[ScoredHost, ...]
-    left_out: Mapping[HostName, str]
+    hosts: tuple[RankedHost, ...]
+    left_out: Mapping[HostName, Exclusion]
     elsewhere: bool = False
     """The host where it is was excluded."""
 
     def why_none(self) -> str:
         """One bounded line: why there is no host."""
-        named = [f"{host}: {reason}" for host, reason in islice(sorted(self.left_out.items()), HOSTS_NAMED)]
+        named = [f"{host}: {why.words}" for host, why in islice(sorted(self.left_out.items()), HOSTS_NAMED)]
         more = len(self.left_out) - len(named)
         none = "there is no other that it may use" if self.elsewhere else "there is no host"
         return "; ".join(named) + (f"; and {more} more" if more else "") or none
+
+    def causes(self) -> dict[HostName, str]:
+        """The same without the figures, which change all the time."""
+        return {host: why.cause for host, why in self.left_out.items()}
 
 
 class TimerKind(IntEnum):
@@ -196,7 +209,7 @@ class TimerKind(IntEnum):
     PROBES = 2
     MIGRATION = 3
     REBALANCE = 4
-    ORPHANS = 5
+    SURPLUS = 5
 
 
 TimerKey: TypeAlias = tuple[TimerKind, str]
@@ -250,7 +263,7 @@ class PlacementState:
         self.rankings = RankingCache(balancer)
         self.now: Ns = 0
         self.components: dict[ComponentId, ComponentRecord] = {}
-        self.published: dict[ComponentId, ComponentStatus] = {}
+        self.published: dict[ComponentId, Placement] = {}
         self.to_place: dict[ComponentId, None] = {}
         """Placed at the end of this instant."""
         self.alive: set[HostName] = set()
@@ -314,8 +327,8 @@ class PlacementState:
     def add(
         self,
         component: ComponentId,
-        spec: PlacementSpec,
-        state: ComponentState = ComponentState.WAITING,
+        spec: ComponentSpec,
+        state: ComponentState = "waiting",
         incarnation: Incarnation = 0,
         host: HostName | None = None,
     ) -> ComponentRecord | None:
@@ -367,18 +380,20 @@ class PlacementState:
     # Hosts
 
     def eligible_hosts(
-        self, spec: PlacementSpec, *, other_than: HostName | None = None, only: HostName | None = None
+        self, spec: ComponentSpec, *, other_than: HostName | None = None, only: HostName | None = None
     ) -> EligibleHosts:
-        hosts = spec.hosts if only is None else frozenset({only})
-        ranking = self.rankings.rank(RankQuery(spec.kind, spec.metric, spec.policy, spec.requirements, hosts))
+        query = RankQuery.of(spec)
+        if only is not None:
+            query = replace(query, hosts=frozenset({only}))
+        ranking = self.rankings.rank(query)
         found = tuple(one for one in ranking.hosts if one.host in self.alive and one.host != other_than)
         left_out = dict(ranking.left_out)
         if only is not None and spec.hosts is not None and only not in spec.hosts:
-            found, left_out = (), {only: "it is not among the hosts that the component asks for"}
+            found, left_out = (), {only: NOT_NAMED}
         elif not found:
-            left_out |= {one.host: "its node is not there" for one in ranking.hosts if one.host != other_than}
-            known = self.alive if hosts is None else self.alive & hosts
-            left_out |= dict.fromkeys(known - self.balancer.reports.keys(), "no report of it")
+            left_out |= {one.host: GONE for one in ranking.hosts if one.host != other_than}
+            known = self.alive if query.hosts is None else self.alive & query.hosts
+            left_out |= dict.fromkeys(known - self.balancer.reports.keys(), NO_REPORT)
             if other_than is not None:
                 left_out.pop(other_than, None)
         return EligibleHosts(found, left_out, other_than is not None)
@@ -427,30 +442,28 @@ class PlacementState:
         if record.host is not None and record.host in self.alive:
             record.start_until = self.now + self.rules.start_timeout + START_SLACK
             self.wake(record, record.start_until)
-            self._commands.append(
-                StartCommand(record.component, record.incarnation, record.host, record.spec)
-            )
+            start = StartComponent(record.component, record.incarnation, record.spec)
+            self._commands.append(HostCommand(record.host, start))
 
     def start_standby(self, record: ComponentRecord, move: Migration) -> None:
         if move.to in self.alive:
             move.start_until = self.now + self.rules.start_timeout + START_SLACK
             self.wake_migration(record, move.start_until)
-            self._commands.append(
-                StartCommand(record.component, move.incarnation, move.to, record.spec, standby=True)
-            )
+            start = StartComponent(record.component, move.incarnation, record.spec, standby=True)
+            self._commands.append(HostCommand(move.to, start))
 
     def hand_over(self, record: ComponentRecord, move: Migration) -> None:
         if record.host is not None:
-            self._commands.append(
-                MoveCommand(record.component, record.incarnation, record.host, move.to, move.incarnation)
-            )
+            order = MoveComponent(record.component, record.incarnation, move.to, move.incarnation)
+            self._commands.append(HostCommand(record.host, order))
 
     def stop(self, component: ComponentId, incarnation: Incarnation, host: HostName) -> None:
-        self._commands.append(StopCommand(component, incarnation, host))
+        self._commands.append(HostCommand(host, StopComponent(component, incarnation)))
 
     def probe(self, component: ComponentId, host: HostName | None) -> None:
+        """Asks a host for this component."""
         if host is not None:
-            self._commands.append(ProbeCommand(host, component))
+            self._commands.append(HostCommand(host, ListComponents(component)))
 
     def refuse(self, subject: str, code: str, message: str) -> None:
         self._commands.append(PlacementRefused(subject, code, message))

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from random import Random
 
 import msgspec
 import psutil
@@ -16,7 +17,7 @@ import pytest
 
 from zscout import messages
 from zscout.messages import ComponentUse, LoadReport, Malformed
-from zscout.placement.model import ComponentUsage, HostReport
+from zscout.placement.balancer import Balancer
 from zscout.services.node.load_reporter import Gauge
 from zscout.services.node.process_use import (
     PAGE,
@@ -236,23 +237,11 @@ def test_the_report_of_this_host_is_all_that_the_balancer_knows(
     assert 0 < report.memory_available <= report.memory_total <= psutil.virtual_memory().total
     assert 0.01 < report.speed < 100
     (use,) = report.components
-    told = HostReport(
-        host=report.host,
-        number=report.number,
-        cores=report.cores,
-        load_average=report.load_average,
-        cpu=report.cpu / 100,
-        memory_available=report.memory_available,
-        memory_total=report.memory_total,
-        speed=report.speed,
-        clock=report.clock,
-        clock_rated=report.clock_rated,
-        temperature=report.temperature,
-        labels=frozenset(report.labels),
-        uses=(ComponentUsage(use.component, use.kind, use.incarnation, use.cpu, use.memory, use.served),),
-    )
-    assert 0 <= told.cpu <= 1
-    assert told.uses[0].memory > 1_000_000
+    assert 0 <= report.cpu <= 100
+    assert use.memory > 1_000_000
+    balancer = Balancer(Random(0))  # noqa: S311
+    balancer.reported(0, report)
+    assert balancer.reports == {"anvil": (0, report)}
 
 
 class First(msgspec.Struct):

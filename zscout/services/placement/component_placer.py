@@ -17,11 +17,10 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token, incarnation_of
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Placements, PlacerOperation
+from zscout.messages import ListComponents, Placement, Placements, PlacerOperation
 from zscout.placement.events import (
     ComponentChanged,
     ComponentForgotten,
-    ComponentStatus,
     HostCommand,
     HostJoined,
     HostLost,
@@ -34,7 +33,6 @@ from zscout.placement.events import (
     TokenVanished,
 )
 from zscout.placement.placer import Placer
-from zscout.services.placement.convert import placement_of
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.placement.node_client import NodeClient
 from zscout.services.placement.request_handler import PlacerQuery, PlacerRequestHandler
@@ -124,7 +122,7 @@ class ComponentPlacer:
         for _ in range(LIST_TRIES):
             if node.instance not in self._instances.get(node.host, ()):
                 break
-            listing = await self._nodes.list_components(node.host)
+            listing = await self._nodes.list_components(node.host, ListComponents())
             if listing is not None:
                 self._feed(listing)
                 break
@@ -164,7 +162,7 @@ class ComponentPlacer:
     def _feed(self, event: PlacerEvent) -> list[PlacementRefused]:
         """Carries out what follows from an event; returns what the core refused."""
         refusals: list[PlacementRefused] = []
-        changed: dict[str, ComponentStatus | None] = {}
+        changed: dict[str, Placement | None] = {}
         effects = self._core.handle(self.mesh.now(), event)
         status = self._core.status()
         for effect in effects:
@@ -203,12 +201,12 @@ class ComponentPlacer:
         else:
             self._feed(PlacerTick())
 
-    def _publish(self, changed: dict[str, ComponentStatus | None], cordoned: frozenset[HostName]) -> None:
+    def _publish(self, changed: dict[str, Placement | None], cordoned: frozenset[HostName]) -> None:
         self._cordoned = cordoned
         statuses = [status for status in changed.values() if status is not None]
         forgotten = [name for name, status in changed.items() if status is None]
         for first in range(0, max(1, len(statuses)), PUBLISH_AT_ONCE):
-            some = [placement_of(status) for status in statuses[first : first + PUBLISH_AT_ONCE]]
+            some = statuses[first : first + PUBLISH_AT_ONCE]
             self._publisher.put(Placements(self.term, some, sorted(cordoned), forgotten))
             forgotten = []
         for status in statuses:
@@ -216,7 +214,7 @@ class ComponentPlacer:
         self._requests.changed(changed)
 
 
-def describe(status: ComponentStatus) -> str:
+def describe(status: Placement) -> str:
     """One line for the log."""
     where = f" on {status.host}" if status.host is not None else ""
     to = f" to {status.to}" if status.to is not None else ""

@@ -15,7 +15,6 @@ from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import MAX_PLACED, ListPlacements, Placement, Placements, absurd
 from zscout.placement.events import Inherited
-from zscout.services.placement.convert import status_of
 from zscout.types import NO_TERM, ComponentId, HostName, Term
 
 log = logging.getLogger(__name__)
@@ -51,7 +50,7 @@ class PlacementLedger:
 
     def inherited(self) -> Inherited:
         """Everything that is known, for a placer that begins."""
-        return Inherited(tuple(map(status_of, self._placements.values())), self._cordoned)
+        return Inherited(tuple(self._placements.values()), self._cordoned)
 
     def _on_placements(self, _key: str, published: Placements) -> None:
         if published.term < self.term or absurd(published.term, self.term):

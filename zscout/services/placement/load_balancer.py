@@ -12,10 +12,9 @@ from typing import Final
 from zscout.keyexpr import Role, Token, check_name
 from zscout.mesh import IncomingQuery, Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import HostRanking, LoadReport, RankAsk, RankedHost
+from zscout.messages import HostRanking, LoadReport, RankAsk
 from zscout.placement.balancer import Balancer
-from zscout.placement.model import RankQuery, Requirements
-from zscout.services.placement.convert import report_of
+from zscout.placement.model import RankQuery
 from zscout.types import HostName
 
 log = logging.getLogger(__name__)
@@ -72,7 +71,7 @@ class LoadBalancer:
         # A report is believed of the host in whose key it stands.
         try:
             if key == self.mesh.keys.load(report.host) and report.host not in self._lost:
-                self.core.reported(self.mesh.now(), report_of(report))
+                self.core.reported(self.mesh.now(), report)
         except ValueError as error:
             log.debug("ignored a load report on %.200r: %s", key, error)
 
@@ -87,20 +86,8 @@ class LoadBalancer:
         ask = query.message
         for host in ask.hosts or ():
             check_name(host, "host")
-        rank_query = RankQuery(
-            kind=ask.kind,
-            metric=ask.metric,
-            policy=ask.policy,
-            requirements=Requirements(frozenset(ask.labels), ask.memory),
-            hosts=None if ask.hosts is None else frozenset(ask.hosts),
-        )
-        ranking = self.core.rank(self.mesh.now(), rank_query, ask.at_most)
-        query.answer(
-            HostRanking(
-                hosts=[RankedHost(one.host, one.score, one.reason) for one in ranking.hosts],
-                metric=ranking.metric,
-                why=ranking.why,
-                left_out=dict(itertools.islice(ranking.left_out.items(), ask.at_most)),
-                more=ranking.more,
-            )
-        )
+        ranking = self.core.rank(self.mesh.now(), RankQuery.of(ask), ask.at_most)
+        some = itertools.islice(ranking.left_out.items(), ask.at_most)
+        left_out = {host: why.words for host, why in some}
+        hosts = list(ranking.hosts)
+        query.answer(HostRanking(hosts, ranking.metric, ranking.why, left_out, ranking.more))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final, TypeVar
 
 import msgspec
@@ -21,26 +22,17 @@ from zscout.placement.events import (
     ComponentsListed,
     HostCommand,
     MoveAnswered,
-    MoveCommand,
     PlacerEvent,
-    ProbeCommand,
     StartAnswered,
-    StartCommand,
     StopAnswered,
-    StopCommand,
 )
-from zscout.services.placement.convert import listed_of, message_of
-from zscout.types import SECOND, ComponentId, HostName, Ns
+from zscout.types import SECOND, HostName, Ns
 
 R = TypeVar("R")
 
 LIST_TIMEOUT: Final = 1.0
 ANSWER_SLACK: Final = 2.0
 """Seconds beyond what a node may take for a start, a stop or a move."""
-GRACE: Final = 5.0
-"""Seconds that a component gets to end by itself."""
-PATIENCE: Final = 5.0
-"""Seconds that a component gets to come to a safe point."""
 HOPELESS: Final = frozenset({"unknown_kind", "not_allowed", "bad_request"})
 """Refusals of a node that another try there would not change."""
 
@@ -50,61 +42,53 @@ class NodeClient:
         self.mesh, self._start_timeout = mesh, start_timeout / SECOND + ANSWER_SLACK
 
     async def carry_out(self, command: HostCommand) -> PlacerEvent | None:
-        """None: a probe that was not answered."""
-        match command:
-            case StartCommand():
-                return await self._start(command)
-            case StopCommand():
-                return await self._stop(command)
-            case MoveCommand():
-                return await self._move(command)
-            case ProbeCommand(host, component):
-                return await self.list_components(host, component)
+        """None: a list that was not answered."""
+        match command.operation:
+            case StartComponent() as start:
+                return await self._start(command.host, start)
+            case StopComponent() as stop:
+                return await self._stop(command.host, stop)
+            case MoveComponent() as move:
+                return await self._move(command.host, move)
+            case ListComponents() as listing:
+                return await self.list_components(command.host, listing)
 
-    async def list_components(
-        self, host: HostName, only: ComponentId | None = None
-    ) -> ComponentsListed | None:
+    async def list_components(self, host: HostName, listing: ListComponents) -> ComponentsListed | None:
         """None: no answer."""
-        reply = await self._ask(host, ListComponents(only), ComponentList, LIST_TIMEOUT)
+        reply = await self._ask(host, listing, ComponentList, LIST_TIMEOUT)
         if reply is None or reply.message is None:
             return None
-        return ComponentsListed(host, tuple(map(listed_of, reply.message.components)), only)
+        return ComponentsListed(host, reply.message.components, listing.component)
 
-    async def _start(self, start: StartCommand) -> StartAnswered:
-        component, incarnation, host = start.component, start.incarnation, start.host
-        message = StartComponent(component, incarnation, message_of(start.spec), start.standby)
-        reply = await self._ask(host, message, ComponentView, self._start_timeout)
+    async def _start(self, host: HostName, start: StartComponent) -> StartAnswered:
+        answered = partial(StartAnswered, start.component, start.incarnation, host)
+        reply = await self._ask(host, start, ComponentView, self._start_timeout)
         if reply is None:
-            return StartAnswered(component, incarnation, host, "unknown", f"{host} did not answer")
+            return answered("unknown", f"{host} did not answer")
         view = reply.message
         if view is None:
             code, words = (reply.problem.code, reply.problem.message) if reply.problem else ("unknown", "")
-            again = code not in HOPELESS
-            return StartAnswered(component, incarnation, host, "refused", words[:MAX_TAIL], again=again)
+            return answered("refused", words[:MAX_TAIL], again=code not in HOPELESS)
         if view.phase in ("running", "standby"):
-            return StartAnswered(component, incarnation, host, "ok", movable=view.movable)
+            return answered("ok", movable=view.movable)
         if view.phase == "ended":
-            return StartAnswered(component, incarnation, host, "failed", view.reason, view.tail[:MAX_TAIL])
-        return StartAnswered(component, incarnation, host, "unknown", f"it is still {view.phase}")
+            return answered("failed", view.reason, view.tail[:MAX_TAIL])
+        return answered("unknown", f"it is still {view.phase}")
 
-    async def _stop(self, stop: StopCommand) -> StopAnswered:
-        message = StopComponent(stop.component, stop.incarnation, GRACE)
-        reply = await self._ask(stop.host, message, ComponentView, GRACE + ANSWER_SLACK)
+    async def _stop(self, host: HostName, stop: StopComponent) -> StopAnswered:
+        reply = await self._ask(host, stop, ComponentView, stop.grace + ANSWER_SLACK)
         gone = reply is not None and reply.problem is not None and reply.problem.code == "unknown_component"
         ended = reply is not None and reply.message is not None and reply.message.phase == "ended"
-        return StopAnswered(stop.component, stop.incarnation, stop.host, done=ended or gone)
+        return StopAnswered(stop.component, stop.incarnation or 0, host, done=ended or gone)
 
-    async def _move(self, move: MoveCommand) -> MoveAnswered:
-        component, incarnation, host = move.component, move.incarnation, move.host
-        message = MoveComponent(component, incarnation, move.to, move.to_incarnation, PATIENCE)
-        reply = await self._ask(host, message, Moved, PATIENCE + self._start_timeout)
+    async def _move(self, host: HostName, move: MoveComponent) -> MoveAnswered:
+        answered = partial(MoveAnswered, move.component, move.incarnation, host)
+        reply = await self._ask(host, move, Moved, move.patience + self._start_timeout)
         if reply is None:
-            return MoveAnswered(component, incarnation, host, "unknown", f"{host} did not answer")
+            return answered("unknown", f"{host} did not answer")
         if reply.message is None:
-            words = reply.problem.message if reply.problem is not None else ""
-            return MoveAnswered(component, incarnation, host, "refused", words)
-        dead = round(reply.message.dead * SECOND)
-        return MoveAnswered(component, incarnation, host, "moved", dead=dead)
+            return answered("refused", reply.problem.message if reply.problem is not None else "")
+        return answered("moved", dead=reply.message.dead)
 
     async def _ask(
         self, host: HostName, message: msgspec.Struct, kind: type[R], timeout: float

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import msgspec
+from msgspec import structs
 
 from zscout.keyexpr import check_name
 from zscout.mesh import IncomingQuery, Refused
@@ -24,24 +25,15 @@ from zscout.messages import (
     ListPlacements,
     MigrateComponent,
     PlaceComponent,
+    Placement,
     PlacementOperation,
     Placements,
     PlacerOperation,
     UncordonHost,
 )
-from zscout.placement.events import (
-    ComponentState,
-    ComponentStatus,
-    DrainRequested,
-    MoveRequested,
-    PlacementRefused,
-    PlaceRequested,
-    PlacerEvent,
-    StopRequested,
-    UncordonRequested,
-)
+from zscout.placement.events import PlacementRefused, PlacerEvent
 from zscout.placement.placer import PlacerStatus
-from zscout.services.placement.convert import placement_of, spec_of
+from zscout.placement.state import OVER
 from zscout.types import Term
 
 MAX_WAIT: Final = 60.0
@@ -50,8 +42,7 @@ MAX_WAITING: Final = 1_000
 
 PlacerQuery: TypeAlias = IncomingQuery[PlacerOperation]
 
-OVER: Final = frozenset({ComponentState.ENDED, ComponentState.GIVEN_UP})
-SETTLED: Final = OVER | {ComponentState.RUNNING, ComponentState.WAITING}
+SETTLED: Final = OVER | {"running", "waiting"}
 
 
 @dataclass(slots=True)
@@ -59,7 +50,7 @@ class _Waiting:
     """An operation that has not come to its end; `before` is the status when it was requested."""
 
     operation: PlacementOperation
-    before: ComponentStatus | None
+    before: Placement | None
     timer: TimerHandle
 
 
@@ -132,7 +123,7 @@ class PlacerRequestHandler:
                 reason = status.reason or f"it goes on on {status.host}"
                 query.refuse(Refused("move_failed", reason).problem)
             else:
-                query.answer(placement_of(status))
+                query.answer(status)
 
     def placements(self, component: str | None = None, *, host: str | None = None) -> Placements:
         """All components, or that one, or those of a host."""
@@ -140,7 +131,7 @@ class PlacerRequestHandler:
         return Placements(
             self.term,
             [
-                placement_of(one)
+                one
                 for name, one in sorted(status.components.items())
                 if component in (None, name) and host in (None, one.host)
             ],
@@ -151,7 +142,7 @@ class PlacerRequestHandler:
         waiting = self._pop(query)
         status = self._status().components.get(waiting.operation.component) if waiting else None
         if status is not None:
-            query.answer(placement_of(status))
+            query.answer(status)
 
     def _pop(self, query: PlacerQuery) -> _Waiting | None:
         waiting = self._waiting.pop(query, None)
@@ -160,29 +151,25 @@ class PlacerRequestHandler:
         return waiting
 
 
-def _stayed(before: ComponentStatus | None, now: ComponentStatus, move: MigrateComponent) -> bool:
+def _stayed(before: Placement | None, now: Placement, move: MigrateComponent) -> bool:
     return before is not None and now.host == before.host and now.host != move.to
 
 
 def _event_of(operation: PlacementOperation | DrainHost | UncordonHost) -> PlacerEvent:
-    match operation:
-        case PlaceComponent(component, spec):
-            _check_spec(component, spec)
-            return PlaceRequested(component, spec_of(spec))
-        case EndComponent(component):
-            return StopRequested(check_name(component, "component"))
-        case MigrateComponent(component, to):
-            to = None if to is None else check_name(to, "host")
-            return MoveRequested(check_name(component, "component"), to)
-        case DrainHost(host):
-            return DrainRequested(check_name(host, "host"))
-        case UncordonHost(host):
-            return UncordonRequested(check_name(host, "host"))
+    """The operation, its spec in order. Raises BadName or Refused for what can't be."""
+    if isinstance(operation, DrainHost | UncordonHost):
+        check_name(operation.host, "host")
+        return operation
+    check_name(operation.component, "component")
+    if isinstance(operation, PlaceComponent):
+        return structs.replace(operation, spec=_checked(operation.spec))
+    if isinstance(operation, MigrateComponent) and operation.to is not None:
+        check_name(operation.to, "host")
+    return operation
 
 
-def _check_spec(component: str, spec: ComponentSpec) -> None:
-    """Raises BadName or Refused for what can't be placed."""
-    check_name(component, "component")
+def _checked(spec: ComponentSpec) -> ComponentSpec:
+    """In one order, so that equal specs compare so."""
     check_name(spec.kind, "kind")
     for host in spec.hosts or ():
         check_name(host, "host")
@@ -191,3 +178,5 @@ def _check_spec(component: str, spec: ComponentSpec) -> None:
     size = len(msgspec.json.encode(spec.params))
     if size > MAX_PARAMS_SIZE:
         raise Refused("too_large", f"the parameters have {size} bytes; at most {MAX_PARAMS_SIZE} are taken")
+    hosts = None if spec.hosts is None else sorted(set(spec.hosts))
+    return structs.replace(spec, labels=sorted(set(spec.labels)), hosts=hosts)

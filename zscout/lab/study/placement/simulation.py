@@ -13,14 +13,9 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
+from zscout.messages import ComponentUse, LoadReport
 from zscout.placement.balancer import LOAD_TIME, Balancer
-from zscout.placement.metrics import THRASHING
-from zscout.placement.model import (
-    REPORT_EVERY,
-    ComponentUsage,
-    HostReport,
-    RankQuery,
-)
+from zscout.placement.model import REPORT_EVERY, THRASHING, RankQuery
 from zscout.types import (
     SECOND,
     ComponentId,
@@ -141,23 +136,23 @@ class _Host:
         fits = 1.0 if memory <= self.machine.memory else max(THRASHING, (self.machine.memory / memory) ** 2)
         return min(1.0, self.machine.cores / wanting if wanting else 1.0) * fits, wanting
 
-    def report(self, now: Ns) -> HostReport:
+    def report(self, now: Ns) -> LoadReport:
         machine = self.machine
         share, wanting = self.share(now)
         self.number += 1
         active = [one.job for one in self.running if one.begins <= now]
-        return HostReport(
+        return LoadReport(
             host=machine.name,
             number=self.number,
             cores=machine.cores,
             load_average=(self.load, self.load, self.load),
-            cpu=min(1.0, wanting / machine.cores),
+            cpu=100 * min(1.0, wanting / machine.cores),
             memory_available=max(0, machine.memory - sum(job.memory for job in active)),
             memory_total=machine.memory,
             speed=machine.speed,
-            uses=tuple(
-                ComponentUsage(
-                    job.component, job.kind, 1, job.wants(machine.speed) * share, job.memory, share
+            components=tuple(
+                ComponentUse(
+                    job.component, job.kind, 1, job.wants(machine.speed) * share, job.memory, served=share
                 )
                 for job in active
             ),

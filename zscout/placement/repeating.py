@@ -1,4 +1,4 @@
-"""What is repeated to a host until it answers: stops of incarnations that must not live, and probes."""
+"""What is repeated to a host until it answers: stops of surplus incarnations, and probes."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from zscout.messages import Incarnation
 from zscout.placement.state import MAX_COMPONENTS, PROBE_TIMEOUT, STOP_TIMEOUT, PlacementState, TimerKind
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
-MAX_ORPHANS: Final = 100
+MAX_SURPLUS: Final = 100
 """Of one component."""
 PROBES_AT_ONCE: Final = 200
 """To one host; the next follow when these are answered, or time is up."""
 
 
 @dataclass(slots=True)
-class Orphan:
+class _Surplus:
     host: HostName
     start_until: Ns | None
     """Until then its start may still be on the way, and a stop that came first has stopped nothing."""
@@ -28,18 +28,22 @@ class Orphan:
     due: Ns = 0
 
 
-class Orphans:
-    """Incarnations that must not live. Each is stopped until its host reports its end, or is lost."""
+class SurplusIncarnations:
+    """Incarnations that must not live, as another one counts or none. Each is stopped until its host reports
+    its end, or is lost."""
 
     def __init__(self, state: PlacementState) -> None:
         self._state = state
-        self._of: dict[ComponentId, dict[Incarnation, Orphan]] = {}
+        self._of: dict[ComponentId, dict[Incarnation, _Surplus]] = {}
 
     def any(self, component: ComponentId) -> bool:
         return component in self._of
 
     def has(self, component: ComponentId, incarnation: Incarnation) -> bool:
-        return incarnation in self._of.get(component, {})
+        return self._get(component, incarnation) is not None
+
+    def _get(self, component: ComponentId, incarnation: Incarnation) -> _Surplus | None:
+        return self._of.get(component, {}).get(incarnation)
 
     def add(
         self,
@@ -51,45 +55,43 @@ class Orphans:
         token: bool = False,
     ) -> None:
         """This incarnation must end. It has, if its host is gone."""
-        orphans = self._of.setdefault(component, {})
-        if host in self._state.alive and incarnation not in orphans and len(orphans) < MAX_ORPHANS:
-            orphans[incarnation] = Orphan(host, start_until, token)
-            self._stop(component, incarnation, orphans[incarnation])
+        known = self._of.setdefault(component, {})
+        if host in self._state.alive and incarnation not in known and len(known) < MAX_SURPLUS:
+            known[incarnation] = one = _Surplus(host, start_until, token)
+            self._stop(component, incarnation, one)
         self._set_timer(component)
 
     def start_answered(self, component: ComponentId, incarnation: Incarnation) -> bool:
-        """Whether it is an orphan. It is stopped once more: the first stop may have come before its start."""
-        orphan = self._of.get(component, {}).get(incarnation)
-        if orphan is None:
-            return False
-        if orphan.start_until is not None:
-            orphan.start_until = None
-            self._stop(component, incarnation, orphan)
+        """Whether it is surplus. It is stopped once more: the first stop may have come before its start."""
+        one = self._get(component, incarnation)
+        if one is not None and one.start_until is not None:
+            one.start_until = None
+            self._stop(component, incarnation, one)
             self._set_timer(component)
-        return True
+        return one is not None
 
     def stop_answered(self, component: ComponentId, incarnation: Incarnation, *, done: bool) -> None:
-        orphan = self._of.get(component, {}).get(incarnation)
-        if orphan is None:
+        one = self._get(component, incarnation)
+        if one is None:
             return
-        orphan.stop_confirmed = done
-        if done and orphan.start_until is None and not orphan.token:
+        one.stop_confirmed = done
+        if not done:
+            one.tries += 1
+            one.due = self._state.now + self._state.back_off_time(one.tries)
+        elif one.start_until is None and not one.token:
             self.ended(component, incarnation)
-        elif done:
-            orphan.due = self._state.now + SECOND
         else:
-            orphan.tries += 1
-            orphan.due = self._state.now + self._state.back_off_time(orphan.tries)
+            one.due = self._state.now + SECOND
         self._set_timer(component)
 
     def token(self, component: ComponentId, incarnation: Incarnation, *, alive: bool) -> None:
         """Its liveliness token appeared or vanished."""
-        orphan = self._of.get(component, {}).get(incarnation)
-        if orphan is not None:
-            orphan.token = alive
+        one = self._get(component, incarnation)
+        if one is not None:
+            one.token = alive
             if alive:
-                orphan.start_until = None
-            elif orphan.stop_confirmed:
+                one.start_until = None
+            elif one.stop_confirmed:
                 self.ended(component, incarnation)
 
     def ended(self, component: ComponentId, incarnation: Incarnation) -> None:
@@ -100,36 +102,35 @@ class Orphans:
         self._set_timer(component)
 
     def host_lost(self, host: HostName) -> list[ComponentId]:
-        """Whose orphans were lost with the host."""
+        """The components of which surplus incarnations were lost with the host."""
         found = []
-        for component, orphans in list(self._of.items()):
-            there = [incarnation for incarnation, orphan in orphans.items() if orphan.host == host]
-            for incarnation in there:
-                del orphans[incarnation]
-            if there:
+        for component, known in list(self._of.items()):
+            left = {incarnation: one for incarnation, one in known.items() if one.host != host}
+            if len(left) < len(known):
+                self._of[component] = left
+                self._set_timer(component)
                 found.append(component)
-            self._set_timer(component)
         return found
 
     def timer(self, component: ComponentId) -> None:
         now = self._state.now
-        for incarnation, orphan in self._of.get(component, {}).items():
-            if orphan.due <= now:
-                if orphan.start_until is not None and orphan.start_until <= now:
-                    orphan.start_until = None
-                self._stop(component, incarnation, orphan)
+        for incarnation, one in self._of.get(component, {}).items():
+            if one.due <= now:
+                if one.start_until is not None and one.start_until <= now:
+                    one.start_until = None
+                self._stop(component, incarnation, one)
         self._set_timer(component)
 
-    def _stop(self, component: ComponentId, incarnation: Incarnation, orphan: Orphan) -> None:
-        orphan.due = self._state.now + STOP_TIMEOUT
-        self._state.stop(component, incarnation, orphan.host)
+    def _stop(self, component: ComponentId, incarnation: Incarnation, one: _Surplus) -> None:
+        one.due = self._state.now + STOP_TIMEOUT
+        self._state.stop(component, incarnation, one.host)
 
     def _set_timer(self, component: ComponentId) -> None:
-        orphans = self._of.get(component)
-        if not orphans:
+        known = self._of.get(component, {})
+        if not known:
             self._of.pop(component, None)
-        due = min((orphan.due for orphan in orphans.values()), default=None) if orphans else None
-        self._state.timers.set(TimerKind.ORPHANS, component, due)
+        due = min((one.due for one in known.values()), default=None)
+        self._state.timers.set(TimerKind.SURPLUS, component, due)
 
 
 class Probes:
