@@ -31,8 +31,8 @@ from zscout.scheduling.model import (
     Tick,
     Vote,
     VoteOverdue,
+    check_patterns,
 )
-from zscout.scheduling.patterns import check_patterns
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, NamedTuple, TypeAlias
 
-from zscout.keyexpr import is_pattern, matcher
+from zscout.keyexpr import check_need, is_pattern, matcher
 from zscout.scheduling.reason import Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
@@ -27,8 +27,10 @@ Rank: TypeAlias = tuple[int, Ns, Place, ArcId]
 class ArcRequest:
     """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0).
 
-    A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`). Raises ValueError where
-    there are no needs, the minimum runtime is not positive, or a parameter is negative."""
+    A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`).
+
+    Raises ValueError where there are no needs, the minimum runtime is not positive, a parameter is negative,
+    and as `check_patterns` does."""
 
     arc: ArcId
     client: ClientId
@@ -46,6 +48,7 @@ class ArcRequest:
             raise ValueError(f"ARC {self.arc}: the minimum runtime must be positive")
         if any(value < 0 for params in self.needs.values() for value in params.values()):
             raise ValueError(f"ARC {self.arc}: bandwidth parameters must not be negative")
+        check_patterns(self.needs)
 
     @property
     def name(self) -> str:
@@ -95,6 +98,20 @@ TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
     ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),
     ArcState.ENDED: (),
 }
+
+
+def check_patterns(needs: Mapping[Need, Params]) -> None:
+    """Raises ValueError (BadName) for a pattern that is none, and where the choice of RCs would decide what
+    is asked of one: its votes must not depend on that."""
+    asked: dict[str, Params] = {}
+    for need, params in needs.items():
+        if not is_pattern(need):
+            continue
+        kind = check_need(need).partition("/")[0]
+        if asked.setdefault(kind, params) != params:
+            raise ValueError(f"patterns of the kind {kind} have different parameters; give all the same")
+    if any(is_pattern(kind) for kind in asked) and any(asked.values()):
+        raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
 
 
 @dataclass(slots=True, eq=False)

@@ -15,15 +15,12 @@ wait for by name: they have no other choice.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import IntEnum
 
-from zscout.keyexpr import check_need, is_pattern
 from zscout.scheduling.model import Arc, Rc
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import SchedulerState
-from zscout.types import Need, Params
 
 
 class Fitness(IntEnum):
@@ -108,20 +105,6 @@ def no_match(state: SchedulerState, arc: Arc) -> Reason:
     # Those without any; else there are some for each, but not enough for all.
     short = sorted(need for need, count in there.items() if not count) or sorted(there)
     return of_rcs(ReasonCode.NO_MATCH, short)
-
-
-def check_patterns(needs: Mapping[Need, Params]) -> None:
-    """Raises ValueError (BadName) for a pattern that is none, and where the choice of RCs would decide what
-    is asked of one: its votes must not depend on that."""
-    asked: dict[str, Params] = {}
-    for need, params in needs.items():
-        if not is_pattern(need):
-            continue
-        kind = check_need(need).partition("/")[0]
-        if asked.setdefault(kind, params) != params:
-            raise ValueError(f"patterns of the kind {kind} have different parameters; give all the same")
-    if any(is_pattern(kind) for kind in asked) and any(asked.values()):
-        raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
 
 
 def _by_fitness(option: tuple[tuple[int, float], Rc]) -> tuple[tuple[int, float], int]:

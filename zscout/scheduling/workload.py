@@ -37,7 +37,6 @@ from zscout.config.strict import (
 )
 from zscout.keyexpr import is_pattern
 from zscout.scheduling.model import ArcRequest
-from zscout.scheduling.patterns import check_patterns
 from zscout.types import (
     ArcId,
     Ns,
@@ -162,10 +161,9 @@ def _arrival(arc: _Arc, where: Where) -> Arrival:
         _check_texts(parameters, where / "needs" / rc)
         needs[rc] = amounts(parameters, where / "needs" / rc)
     try:
-        check_patterns(needs)
+        return Arrival(at, ArcRequest(arc.name, arc.name, needs, arc.priority, min_runtime))
     except ValueError as error:
         raise (where / "needs").bad(str(error), "see zscout request --help") from None
-    return Arrival(at, ArcRequest(arc.name, arc.name, needs, arc.priority, min_runtime))
 
 
 def _check_texts(names: Iterable[str], where: Where) -> None:

@@ -11,7 +11,7 @@ from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet
 from zscout.messages import Release
 from zscout.scheduling.forecast import forecast
-from zscout.services.rcm import forecasts
+from zscout.services.rcm import registry
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         times.append(asyncio.get_running_loop().time())
         return real(*args)
 
-    monkeypatch.setattr(forecasts, "forecast", counted)
+    monkeypatch.setattr(registry, "forecast", counted)
     return times
 
 

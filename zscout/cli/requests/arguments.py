@@ -14,7 +14,7 @@ from zscout import types
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern
 from zscout.messages import MAX_NEEDS, MAX_PARAMS
-from zscout.scheduling.patterns import check_patterns
+from zscout.scheduling.model import check_patterns
 
 Needs = dict[str, dict[str, Decimal]]
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
@@ -25,33 +24,24 @@ NEAR_END: Ns = SECOND // 20
 """A hold with less than this left may have ended at its RC already: clocks differ a little."""
 
 
-@dataclass(frozen=True, slots=True)
-class RcSeen:
-    """An RC that is there reported its state: its holds may not be those that the core knows."""
-
-    rc: RcName
-    state: RcState
-
-
-@dataclass(frozen=True, slots=True)
-class NewerTerm:
-    """An RC obeys a higher term: this reign is over."""
-
-    term: Term
-
-
 class Membership:
     """Follows the clients and RCs of one fleet for one reign."""
 
     def __init__(
-        self, mesh: Mesh, fleet: Fleet, term: Term, supervisor: Supervisor, emit: Callable[..., None]
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        term: Term,
+        supervisor: Supervisor,
+        emit: Callable[[Event], None],
+        on_reported: Callable[[RcName, RcState], None],
+        on_newer: Callable[[Term], None],
     ) -> None:
         self.mesh, self.term = mesh, term
         self._lease = fleet.mesh.lease
         self._timeout = fleet.timing.rebuild / SECOND
         self._supervisor = supervisor
-        self._emit = emit
-        """Takes core events of one instant, RcSeen and NewerTerm."""
+        self._emit, self._on_reported, self._on_newer = emit, on_reported, on_newer
         self._clients: dict[ClientId, set[str]] = {}
         """Instances alive of each client."""
         self._unseen: dict[ClientId, asyncio.TimerHandle] = {}
@@ -151,7 +141,7 @@ class Membership:
                     self._joined[token.name] = state
                     if state.health == "ok":
                         self._emit(RcJoined(token.name, state.sharable))
-                    self._emit(RcSeen(token.name, state))
+                    self._on_reported(token.name, state)
                     return
             # No answer can come at once, and again and again: a token may stand for nothing.
             await asyncio.sleep(self._timeout)
@@ -176,11 +166,11 @@ class Membership:
             self._emit(RcJoined(name, state.sharable))
         if state.rules != known.rules:
             self._emit(RcReported(name, rules_changed=True))
-        self._emit(RcSeen(name, state))
+        self._on_reported(name, state)
 
     def _see(self, term: Term) -> None:
         if term > self.term:
-            self._emit(NewerTerm(term))
+            self._on_newer(term)
 
 
 def discrepancies(

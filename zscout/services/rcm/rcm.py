@@ -12,19 +12,23 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Operation, RcmState, RcState, StateAsk
+from zscout.messages import Grants, Holder, Operation, RcmState, RcState, Revocation, StateAsk
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     ClientLost,
+    Effect,
     Event,
+    Granted,
     HandedOver,
+    HoldEnded,
     LeadTaken,
+    Propose,
     RcReported,
     Requested,
     Tick,
@@ -32,13 +36,10 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rcm import convert
-from zscout.services.rcm.history import ArcHistory
-from zscout.services.rcm.membership import Membership, NewerTerm, RcSeen, discrepancies
-from zscout.services.rcm.notices import Notices
-from zscout.services.rcm.publisher import GrantsPublisher
+from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.services.rcm.registry import RequestRegistry
-from zscout.services.rcm.request_handler import FindClient, Renotify, RequestHandler
+from zscout.services.rcm.request_handler import RequestHandler
 from zscout.services.rcm.voting import Voting
 from zscout.types import SECOND, Ns, RcName, Term
 
@@ -61,21 +62,15 @@ class Rcm:
         on_failure: Callable[[Exception], object],
     ) -> None:
         self.mesh, self.fleet, self.term = mesh, fleet, term
-        self._on_newer = on_newer
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         self.core = Core(STRATEGIES[fleet.strategy](), fleet.scheduling)
-        # What is known
-        self.history = ArcHistory(mesh, self.supervisor)
-        self.registry = RequestRegistry(mesh, self.core, term)
-        # In
         supervisor, receive = self.supervisor, self._receive
+        self.registry = RequestRegistry(mesh, self.core, term, supervisor)
+        self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer)
         self.requests = RequestHandler(
-            mesh, fleet, self.core, self.registry, self.history, supervisor, receive
+            mesh, fleet, self.core, self.registry, self.membership, supervisor, receive
         )
-        self.membership = Membership(mesh, fleet, term, supervisor, receive)
-        # Out
         self.publisher = GrantsPublisher(mesh, fleet, self.core, self.registry)
-        self.notices = Notices(mesh, self.core, self.registry, self.history, supervisor)
         self.voting = Voting(mesh, fleet, self.core, supervisor, receive)
         self._declared: list[Declaration] = []
         self._wake: asyncio.TimerHandle | None = None
@@ -110,39 +105,26 @@ class Rcm:
             declared.close()
         self._declared = []
         self.supervisor.cancel()
-        self.notices.flush()
-        self.history.flush()
+        self.registry.close()
         self.requests.close()
         self.publisher.close()
 
     # In
 
-    def _receive(self, *inputs: Event | FindClient | Renotify | RcSeen | NewerTerm) -> None:
+    def _receive(self, *events: Event) -> None:
         """What has happened; events that come together are one instant."""
-        if not self.supervisor.active:
-            return
-        events: list[Event] = []
-        for one in inputs:
-            match one:
-                case FindClient(client, then):
-                    self.membership.find(client, then)
-                case Renotify(arcs):
-                    self.notices.publish(arcs)
-                case RcSeen(rc, state):
-                    self._compare(rc, state)
-                case NewerTerm(term):
-                    self._on_newer(term)
-                case ClientLost(client) if not self.core.arcs_of(client):
-                    pass
-                case _:
-                    events.append(one)
-        if events:
+        match events:
+            case [ClientLost(client)] if not self.core.arcs_of(client):
+                return
+        if self.supervisor.active:
             # What was asked before is decided before.
             self.requests.flush()
             self._decide(events)
 
     def _compare(self, rc: RcName, state: RcState) -> None:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
+        if not self.supervisor.active:
+            return
         current = state.term == self.term and self.publisher.is_current(rc, state.seq)
         ended, superfluous = discrepancies(state, self.core.holders(rc), self.mesh.now(), current=current)
         if ended:
@@ -162,12 +144,16 @@ class Rcm:
                     self.membership.expect(client)
         effects = self.core.handle(self.mesh.now(), *events)
         self.publisher.publish(effects, named)
-        self.notices.report(effects, self.requests.waiting, self.requests.given_up)
+        self.registry.report(effects, self.requests.waiting, self.requests.given_up)
         self.requests.answer(effects)
-        self.voting.propose(effects)
         for effect in effects:
-            if isinstance(effect, WakeAt):
-                self._set_wake(effect.at)
+            match effect:
+                case Propose():
+                    self.voting.propose(effect)
+                case WakeAt(at):
+                    self._set_wake(at)
+                case _:
+                    pass
         if news := self.core.strategy.news():
             log.info("%s", news)
 
@@ -199,7 +185,7 @@ class Rcm:
         if asked.holds_only:
             query.answer(RcmState(self.term, self.publisher.seq, self.mesh.me.host, holds))
             return
-        starts = self.registry.forecasts.starts(now) if asked.forecast else {}
+        starts = self.registry.starts() if asked.forecast else {}
         query.answer(
             RcmState(
                 term=self.term,
@@ -208,7 +194,64 @@ class Rcm:
                 holds=holds,
                 queue=[convert.wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
                 rcs=convert.rc_views(status.rcs),
-                story=self.history.of(asked.arc) if asked.arc is not None else [],
+                story=self.registry.story(asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
             )
         )
+
+
+class GrantsPublisher:
+    """Publishes one reign's grants and revocations, and its heartbeat."""
+
+    def __init__(self, mesh: Mesh, fleet: Fleet, core: Core, registry: RequestRegistry) -> None:
+        self.mesh, self.core = mesh, core
+        self._registry = registry
+        self._heartbeat = fleet.timing.heartbeat
+        self._publisher = mesh.publisher(mesh.keys.grants, Grants)
+        self.seq = 0
+        """The last number that was published."""
+        self._at: Ns = 0
+        self._named: dict[RcName, int] = {}
+        """The number of the last publication that named an RC."""
+
+    def publish(self, effects: Iterable[Effect], rcs: Collection[RcName] | None = None) -> None:
+        """Publishes all holders of the RCs that were granted or revoked, if any were; with `rcs` in any case,
+        and those of `rcs` as well."""
+        changed = [effect for effect in effects if isinstance(effect, (Granted, HoldEnded))]
+        if not changed and rcs is None:
+            return
+        revoked = [
+            convert.revocation(effect, self._registry.name(effect.arc))
+            for effect in changed
+            if isinstance(effect, HoldEnded)
+        ]
+        now = self.mesh.now()
+        number = self.core.seq if self.core.seq > self.seq else self.core.number()
+        names = sorted({*(rcs or ()), *(rc for effect in changed for rc in effect.rcs)})
+        self._named |= dict.fromkeys(names, number)
+        holders = {name: convert.holders(self.core.holders(name), name, now) for name in names}
+        self._put(number, holders, revoked)
+
+    def is_current(self, rc: RcName, seq: int) -> bool:
+        """Whether `seq` is not older than the last publication that named an RC."""
+        return seq >= self._named.get(rc, 0)
+
+    async def beat(self) -> None:
+        """Repeats the last number whenever nothing was published for a while."""
+        while True:
+            due = self._at + self._heartbeat - self.mesh.now()
+            if due > 0:
+                await asyncio.sleep(due / SECOND)
+            else:
+                self._put(self.seq, {}, [])
+
+    def close(self) -> None:
+        self._publisher.close()
+
+    def _put(self, number: int, rcs: dict[RcName, list[Holder]], revoked: list[Revocation]) -> None:
+        every = self._heartbeat / SECOND
+        term, previous = self.core.term, self.seq
+        self._publisher.put(
+            Grants(term=term, seq=number, prev=previous, every=every, rcs=rcs, revoked=revoked)
+        )
+        self.seq, self._at = number, self.mesh.now()

@@ -15,7 +15,6 @@ from decimal import Decimal
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState
 from zscout.scheduling.model import ArcRequest, RecoveredHold, RecoveredRequest
-from zscout.scheduling.patterns import check_patterns
 from zscout.services.rcm import convert
 from zscout.types import SECOND, Grant, Need, Ns, RcName, duration, exact_amounts
 
@@ -134,7 +133,6 @@ def _request(arc: str, client: str, needs: dict[str, Amounts], source: OpenReque
     for need in needs:
         check_need(need)
     wanted = {need: exact_amounts(params) for need, params in needs.items()}
-    check_patterns(wanted)
     return ArcRequest(
         arc=arc,
         client=client,

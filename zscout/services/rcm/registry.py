@@ -1,37 +1,67 @@
-"""How every request of one reign stands, and for a while how those that ended did, as notices."""
+"""How each request of one reign stands: its name and history, and the notices that its client gets.
+
+Every change that is not the answer to an operation is published on the client's key; requests that ended are
+remembered for a while. What happened to each ARC is kept as text, for `zscout why`, and written to the log.
+"""
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import logging
+from collections import OrderedDict, deque
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from msgspec.structs import replace
 
-from zscout.keyexpr import is_pattern
+from zscout.keyexpr import BadName, client_of, is_pattern
 from zscout.mesh import Mesh
-from zscout.messages import Notice, State
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import Notice, State, StoryLine
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcStatus, Dropped, HoldEnded, Outcome
+from zscout.scheduling.forecast import forecast
+from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.services.rcm import convert
-from zscout.services.rcm.forecasts import Forecasts
 from zscout.types import SECOND, ArcId, Ns, Term
+
+log = logging.getLogger(__name__)
 
 REMEMBER: Ns = 60 * SECOND
 """How long ended requests are known: longer than any query's timeout and a lease together."""
 MAX_REMEMBERED = 20_000
+REASONS_EVERY = 0.1
+"""Seconds at most until a changed reason to wait is published: in a busy queue every grant changes many
+reasons, and only the last is of use."""
+RECENT: Ns = SECOND
+"""Notices make do with a forecast of this age: each costs the RCM as much as many passes."""
+MAX_LINES = 20_000
+MAX_ANSWERED = 200
+"""Lines of history in one answer: the latest."""
+LOG_EVERY = 0.1
+"""Seconds that lines for the log are gathered: an entry of its own for each would cost as much as a grant."""
+MAX_LOGGED = 50
+"""Lines in one entry of the log; the history has them all."""
 
 
 class RequestRegistry:
-    """The names of requests, how those that ended lately ended, and the numbers of all notices."""
+    """The requests of one reign, those that ended lately included."""
 
-    def __init__(self, mesh: Mesh, core: Core, term: Term) -> None:
-        self._mesh, self._core, self._term = mesh, core, term
-        self.forecasts = Forecasts(core)
+    def __init__(self, mesh: Mesh, core: Core, term: Term, supervisor: Supervisor) -> None:
+        self._mesh, self._core, self._term, self._supervisor = mesh, core, term, supervisor
         self._step = 0
+        """The number of the last notice."""
         self._names: dict[ArcId, str] = {}
         self._ended: OrderedDict[ArcId, tuple[Ns, Notice]] = OrderedDict()
         self._estimated: set[ArcId] = set()
         """ARCs whose notices say when they will start."""
+        self._changed: set[ArcId] = set()
+        """Queued ARCs whose reason to wait has changed and has not been published yet."""
+        self._starts: Mapping[ArcId, Ns] = {}
+        """The last forecast."""
+        self._foreseen: tuple[int, Ns] | None = None
+        """After which batch of events, and when, it was made."""
+        self._lines: deque[tuple[Ns, ArcId, str, str]] = deque(maxlen=MAX_LINES)
+        """The history: when, ARC, its name, what happened."""
+        self._unlogged: list[str] = []
 
     def enter(self, arc: ArcId, name: str, *, estimate: bool = False) -> None:
         """From now on `arc` is called `name`; with `estimate` its notices say when it will start."""
@@ -46,44 +76,17 @@ class RequestRegistry:
         """Whether `arc` ended lately."""
         return arc in self._ended
 
+    # Notices
+
     def notice(self, arc_id: ArcId) -> Notice:
         """How a request stands now, or how it ended."""
         arc = self._core.arc(arc_id)
-        if arc is not None:
-            return self._open(arc)
-        if arc_id in self._ended:
-            return self._ended[arc_id][1]
-        return self._notice(arc_id, "ended", reason="no such request is open")
-
-    def handed_over(self, arc: ArcId, name: str) -> Notice:
-        """That a request goes on in another client, where no more than that is known."""
-        reason = "handed over to another client"
-        return replace(self._notice(arc, "ended", reason=reason, outcome=Outcome.HANDED_OVER), arc=name)
-
-    def close(self, effect: HoldEnded | Dropped) -> Notice:
-        """How a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
-        details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome}
-        details["why"] = convert.reason_info(effect.reason)
-        requeued = isinstance(effect, HoldEnded) and effect.requeued
-        if isinstance(effect, HoldEnded):
-            details |= {"by": effect.by, "grant": effect.grant, "rcs": list(effect.rcs)}
-        if requeued and (arc := self._core.arc(effect.arc)) is not None:
-            details["starts_in"] = self._starts_in(arc)
-        notice = self._notice(effect.arc, "queued" if requeued else "ended", **details)
-        if self._core.arc(effect.arc) is None:
-            self._remember(effect.arc, notice)
-        return notice
-
-    def _starts_in(self, arc: ArcStatus) -> float | None:
-        if arc.hold is not None or arc.id not in self._estimated:
-            return None
-        now = self._mesh.now()
-        start = self.forecasts.start(arc.id, arc.since, now)
-        return None if start is None else max(0, start - now) / SECOND
-
-    def _open(self, arc: ArcStatus) -> Notice:
+        if arc is None:
+            if arc_id in self._ended:
+                return self._ended[arc_id][1]
+            return self._notice(arc_id, "ended", reason="no such request is open")
         hold = arc.hold
-        # While it waits, what it is bound to is only what it was last looked at with.
+        # What a queued ARC is bound to is only what it was last checked with.
         rcs = arc.needs if hold is not None else [need for need in arc.request.needs if not is_pattern(need)]
         return self._notice(
             arc.id,
@@ -100,6 +103,11 @@ class RequestRegistry:
             starts_in=self._starts_in(arc),
         )
 
+    def handed_over(self, arc: ArcId, name: str) -> Notice:
+        """That a request goes on in another client, where no more than that is known."""
+        reason = "handed over to another client"
+        return replace(self._notice(arc, "ended", reason=reason, outcome=Outcome.HANDED_OVER), arc=name)
+
     def _notice(self, arc: ArcId, state: State, **details: Any) -> Notice:
         self._step += 1
         return Notice(
@@ -112,6 +120,63 @@ class RequestRegistry:
             **details,
         )
 
+    def report(
+        self, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]
+    ) -> None:
+        """Publishes what follows from an instant's effects. For the `answered` ARCs a grant, and for
+        the `given_up` ones the end of a hold, is the answer to an operation, and no notice."""
+        for effect in effects:
+            match effect:
+                case Granted(arc=arc, rcs=rcs):
+                    self.record(arc, f"granted {', '.join(rcs)}")
+                    if arc not in answered:
+                        self._put(self.notice(arc))
+                case HoldEnded(arc=arc) | Dropped(arc=arc):
+                    again = "; queued again" if isinstance(effect, HoldEnded) and effect.requeued else ""
+                    self.record(arc, f"{effect.outcome}: {effect.reason}{again}")
+                    notice = self._close(effect)
+                    if isinstance(effect, Dropped) or arc not in given_up:
+                        self._put(notice)
+                case Queued(arc=arc, settled=True) if self._core.is_queued(arc):
+                    if not self._changed:
+                        self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
+                    self._changed.add(arc)
+                case _:
+                    pass
+
+    def publish(self, arcs: Iterable[ArcId]) -> None:
+        """Publishes how these ARCs, as far as they are open, stand now."""
+        for arc in arcs:
+            if self._core.arc(arc) is not None:
+                self._changed.discard(arc)
+                self._put(self.notice(arc))
+
+    def _publish_reasons(self) -> None:
+        changed = [arc for arc in self._changed if self._core.is_queued(arc)]
+        self._record_reasons()
+        self.publish(changed)
+
+    def _put(self, notice: Notice) -> None:
+        try:
+            self._mesh.put(self._mesh.keys.notice(client_of(notice.client)), notice)
+        except BadName:
+            log.exception("a notice could not be addressed")
+
+    def _close(self, effect: HoldEnded | Dropped) -> Notice:
+        """How a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
+        details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome}
+        details["why"] = convert.reason_info(effect.reason)
+        requeued = isinstance(effect, HoldEnded) and effect.requeued
+        arc = self._core.arc(effect.arc)
+        if isinstance(effect, HoldEnded):
+            details |= {"by": effect.by, "grant": effect.grant, "rcs": list(effect.rcs)}
+        if requeued and arc is not None:
+            details["starts_in"] = self._starts_in(arc)
+        notice = self._notice(effect.arc, "queued" if requeued else "ended", **details)
+        if arc is None:
+            self._remember(effect.arc, notice)
+        return notice
+
     def _remember(self, arc: ArcId, notice: Notice) -> None:
         now = self._mesh.now()
         self._names.pop(arc, None)
@@ -122,3 +187,60 @@ class RequestRegistry:
             len(self._ended) > MAX_REMEMBERED or next(iter(self._ended.values()))[0] < now
         ):
             self._ended.popitem(last=False)
+
+    # Forecasts: one serves all that are wanted in the same instant
+
+    def starts(self) -> Mapping[ArcId, Ns]:
+        """When each queued ARC will start as things stand; those that are left out will not, or too late."""
+        if self._foreseen is None or self._foreseen[0] != self._core.batches:
+            now = self._mesh.now()
+            self._starts = forecast(self._core, now).starts
+            self._foreseen = self._core.batches, now
+        return self._starts
+
+    def _starts_in(self, arc: ArcStatus) -> float | None:
+        """Seconds until a queued ARC starts, by a forecast since it was queued and not older than RECENT."""
+        if arc.hold is not None or arc.id not in self._estimated:
+            return None
+        now = self._mesh.now()
+        made = self._foreseen[1] if self._foreseen is not None else None
+        recent = made is not None and arc.since < made and now - made < RECENT
+        start = (self._starts if recent else self.starts()).get(arc.id)
+        return None if start is None else max(0, start - now) / SECOND
+
+    # History
+
+    def record(self, arc: ArcId, text: str) -> None:
+        name = self.name(arc)
+        self._lines.append((self._mesh.now(), arc, name, text))
+        if not self._unlogged:
+            self._supervisor.call_later(LOG_EVERY, self._write_log)
+        self._unlogged.append(f"{name} {text}")
+
+    def story(self, arc: str) -> list[StoryLine]:
+        """The latest lines about an ARC (its name, id, or `<host>/<client>/<id>`), oldest first."""
+        now = self._mesh.now()
+        lines = [
+            StoryLine(ago=(now - at) / SECOND, text=text)
+            for at, full, name, text in self._lines
+            if arc in (name, full, convert.request_id(full))
+        ]
+        return lines[-MAX_ANSWERED:]
+
+    def close(self) -> None:
+        """Writes to the log what was gathered: nothing is published any more."""
+        self._record_reasons()
+        self._write_log()
+
+    def _record_reasons(self) -> None:
+        changed, self._changed = self._changed, set()
+        for arc in filter(None, map(self._core.arc, changed)):
+            if arc.hold is None:
+                self.record(arc.id, f"waits: {arc.reported}")
+
+    def _write_log(self) -> None:
+        lines, self._unlogged = self._unlogged, []
+        if len(lines) > MAX_LOGGED:
+            lines[MAX_LOGGED:] = [f"and {len(lines) - MAX_LOGGED} lines more; ask `zscout why`"]
+        if lines:
+            log.info("%s", "\n  ".join(lines))

@@ -7,18 +7,18 @@ ARC stay in their order.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
 
-from zscout.config.fleet import Fleet
-from zscout.keyexpr import Sender, check_name, client_of
+from zscout.config.fleet import Fleet, RcmLimits
+from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Operation, Release
+from zscout.messages import MAX_PARAMS, Ask, Cancel, Foresee, Foresight, HandOver, Operation, Release
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
+    ArcRequest,
     Cancelled,
     Dropped,
     Effect,
@@ -29,10 +29,9 @@ from zscout.scheduling.model import (
     Requested,
 )
 from zscout.services.rcm import convert
-from zscout.services.rcm.admission import admit
-from zscout.services.rcm.history import ArcHistory
+from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.registry import RequestRegistry
-from zscout.types import SECOND, ArcId, ClientId
+from zscout.types import SECOND, ArcId, ClientId, duration, exact_amounts
 
 Query: TypeAlias = IncomingQuery[Operation]
 
@@ -40,21 +39,7 @@ REPLY_SLACK = 0.1
 """Seconds after an overdue vote in which the first answer is given all the same."""
 MAX_BATCH = 64
 """Operations that are decided together at most."""
-
-
-@dataclass(frozen=True, slots=True)
-class FindClient:
-    """Is this client on the mesh? `then` is called with the answer."""
-
-    client: ClientId
-    then: Callable[[bool], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Renotify:
-    """The clients of these ARCs may have missed how they stand."""
-
-    arcs: tuple[ArcId, ...]
+MAX_PRIORITY = 1_000_000
 
 
 class RequestHandler:
@@ -66,16 +51,16 @@ class RequestHandler:
         fleet: Fleet,
         core: Core,
         registry: RequestRegistry,
-        history: ArcHistory,
+        membership: Membership,
         supervisor: Supervisor,
         emit: Callable[..., None],
     ) -> None:
         self.mesh, self.limits, self.core = mesh, fleet.limits, core
         self._patience = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
-        self._registry, self._history, self._supervisor = registry, history, supervisor
+        self._registry, self._membership, self._supervisor = registry, membership, supervisor
         self._flush_guarded = supervisor.guard(self.flush)
         self._emit = emit
-        """Takes core events of one instant, FindClient and Renotify."""
+        """Takes the events of one instant."""
         self.waiting: dict[ArcId, list[Query]] = {}
         """Operations that are not answered yet, by ARC."""
         self.given_up: set[ArcId] = set()
@@ -123,7 +108,7 @@ class RequestHandler:
             request = admit(ask, sender, arc, self.core, self.limits)
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
             needs = ", ".join(sorted(ask.needs))
-            self._history.record(arc, ask.arc, f"asked for {needs} at priority {ask.priority}")
+            self._registry.record(arc, f"asked for {needs} at priority {ask.priority}")
             since = None if ask.place is None else self.mesh.now() - round(ask.waited * SECOND)
             self._gather(query, arc, Requested(request, ask.place, since))
 
@@ -230,7 +215,7 @@ class RequestHandler:
         if len(self._moving) >= MAX_BATCH:
             raise Refused("busy", f"{MAX_BATCH} hand-overs wait here already; ask again")
         self._moving.add(query)
-        self._emit(FindClient(to, partial(self._on_new_client, query, operation, sender, to)))
+        self._membership.find(to, partial(self._on_new_client, query, operation, sender, to))
 
     def _on_new_client(
         self,
@@ -261,7 +246,7 @@ class RequestHandler:
         for move in moves:
             self._registry.enter(move.renamed, self._registry.name(move.arc))
         self._emit(*moves)
-        self._emit(Renotify(tuple(move.renamed for move in moves if self.core.is_queued(move.renamed))))
+        self._registry.publish(move.renamed for move in moves if self.core.is_queued(move.renamed))
         query.answer(self._registry.notice(moves[0].renamed))
 
     def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[HandedOver]:
@@ -285,5 +270,40 @@ class RequestHandler:
         if self.core.arc(goal) is None and not over:
             raise Refused("not_running", f"{operation.id} is not open at {sender}")
         # The new client may have missed it, where the RCM changed just then.
-        self._emit(Renotify(tuple(convert.arc_id(to, one) for one in (operation.id, *operation.others))))
+        self._registry.publish(convert.arc_id(to, one) for one in (operation.id, *operation.others))
         query.answer(self._registry.notice(goal))
+
+
+def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: RcmLimits) -> ArcRequest:
+    """The request, if it may be made. Raises Refused with what is wrong and how to mend it."""
+    if not ask.needs:
+        raise Refused("bad_request", "needs is empty; name at least one RC")
+    if len(ask.needs) > limits.max_needs:
+        raise Refused("bad_request", f"{len(ask.needs)} needs; at most {limits.max_needs} are allowed")
+    if not -MAX_PRIORITY <= ask.priority <= MAX_PRIORITY:
+        raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
+    place = ask.place if isinstance(ask, Ask) else None
+    if place is not None and place.term > core.term:
+        raise Refused("bad_request", "place is of a term that has not been; leave it out")
+    if place is not None and (place.arrival < 1 or not core.given(place)):
+        raise Refused("bad_request", "place was never given; leave it out")
+    try:
+        check_name(ask.arc, "arc")
+        for name, params in ask.needs.items():
+            check_need(name)
+            if len(params) > MAX_PARAMS:
+                raise ValueError(f"{name} has more than {MAX_PARAMS} parameters")
+            for parameter in params:
+                check_name(parameter, f"parameter of {name}")
+        needs = {name: exact_amounts(params) for name, params in ask.needs.items()}
+        return ArcRequest(
+            arc=arc,
+            client=str(sender),
+            needs=needs,
+            priority=ask.priority,
+            min_runtime=duration(ask.min_runtime, "min_runtime"),
+            keep=ask.keep,
+            label=ask.arc,
+        )
+    except (BadName, ValueError) as error:
+        raise Refused("bad_request", str(error)) from None

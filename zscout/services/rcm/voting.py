@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 
 from zscout.config.fleet import Fleet
@@ -12,7 +12,7 @@ from zscout.mesh import Mesh, MeshError, Reply
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Ballot, Proposal
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Effect, Propose, Vote, VoteOverdue
+from zscout.scheduling.model import Propose, Vote, VoteOverdue
 from zscout.services.rcm import convert
 from zscout.types import SECOND, RcName
 
@@ -40,12 +40,7 @@ class Voting:
         self._voted = supervisor.guard(self._on_ballot)
         self._late = max(LATE_VOTE, 2 * self._timeout)
 
-    def propose(self, effects: Iterable[Effect]) -> None:
-        for effect in effects:
-            if isinstance(effect, Propose):
-                self._propose(effect)
-
-    def _propose(self, effect: Propose) -> None:
+    def propose(self, effect: Propose) -> None:
         arcs = ((self.core.arc(arc), params) for arc, params in effect.holders.items())
         holders = [convert.proposed(arc, params) for arc, params in arcs if arc is not None]
         proposal = Proposal(proposal=effect.proposal, term=self.core.term, holders=holders)
