@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import pytest
-
-from zscout.behaviors.perception.events import Event, EventTracker, around
-from zscout.behaviors.perception.motion import Box, Seen
+from zscout.behaviors.perception.motion import Box, Event, EventTracker, Seen, around
 
 STILL = Seen(False)
 A, B, BIG = Box(10, 10, 5, 8), Box(40, 20, 4, 4), Box(12, 10, 30, 30)
@@ -67,8 +64,3 @@ def test_what_was_not_over_says_so() -> None:
 def test_boxes_around() -> None:
     assert around((A, B)) == Box(10, 10, 34, 14)
     assert around(()) == Box(0, 0, 0, 0)
-
-
-def test_a_gap_is_above_nothing() -> None:
-    with pytest.raises(ValueError, match="above 0"):
-        EventTracker(0.0)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from tests.behaviors.perception.rooms import room, sofa
 from tests.thorough import times
 from zscout.behaviors.perception.hiding.hider import BadCheckpoint, Hider
-from zscout.behaviors.perception.hiding.state import MAX_CHECKPOINT
-from zscout.behaviors.perception.hiding.wheels import WheelCommand
+from zscout.behaviors.perception.hiding.state import MAX_CHECKPOINT, WheelCommand
 from zscout.behaviors.perception.lens import Picture
 from zscout.lab.building.bodies import Pose
 from zscout.lab.building.drawn import drawn_plan

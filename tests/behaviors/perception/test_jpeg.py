@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from zscout.behaviors.perception.jpeg import MAX_PIXELS, grey_picture
+from zscout.behaviors.perception.lens import MAX_PIXELS, grey_picture
 
 PICTURE = np.arange(120 * 160, dtype=np.uint8).reshape(120, 160)
 JPEG = cv2.imencode(".jpg", PICTURE)[1].tobytes()

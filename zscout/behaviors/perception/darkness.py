@@ -14,27 +14,25 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zscout.behaviors.perception.lens import (
-    COLUMNS,
-    EYE,
-    FOCAL,
-    RISE,
-    ROWS,
-    Picture,
-    bearing,
-    linear,
-)
+from zscout.behaviors.perception.lens import COLUMNS, EYE, FOCAL, RISE, ROWS, Picture, bearing, linear
 
 LEVELS: Final = (0.04, 0.08, 0.15, 0.25)
 """Shares of the lit floor's brightness, below which something is dark: from the depth of a gap to shade."""
-_BELOW: Final = ROWS // 2
-"""First row below the horizon."""
 LOWEST: Final = 0.055
 """Metres: a lower gap is closed to the robot, or is a mark on the floor."""
 HIGHEST: Final = 0.27
 """Metres: what is dark to a greater height is a dark face, or a shadow."""
 NARROWEST: Final = 0.16
 """Metres: a narrower gap is no way in for a robot of 0.12 m."""
+MOST_CONTRAST: Final = 120.0
+_BELOW: Final = ROWS // 2
+"""First row below the horizon."""
+_ROOF: Final = 14
+"""Rows at the top of the picture."""
+_THINNEST: Final = 3
+"""Columns less one of a place that counts: the narrowest way in, 6 m off."""
+_CLOSE: Final = 0.3
+"""Metres; nearer than that, a gap's upper edge may be out of the picture."""
 
 
 class DarkPlace(NamedTuple):
@@ -53,7 +51,7 @@ class DarkPlace(NamedTuple):
 
 
 class View(NamedTuple):
-    """What one picture tells about light and dark. Brightness is linear, 0 to 1."""
+    """The light and dark of one picture. Brightness is linear, 0 to 1."""
 
     lit: float
     """The lit floor of this picture."""
@@ -75,41 +73,24 @@ class View(NamedTuple):
     """What is above, at the top of the picture: a roof is dark where it is dark below, a wall is not."""
 
 
-_ROOF: Final = 14
-"""Rows at the top of the picture."""
-MOST_CONTRAST: Final = 120.0
-_DOWN: Final = ROWS - _BELOW
-_COUNT: Final = np.arange(ROWS)[:, None]
-_THINNEST: Final = 3
-"""Columns less one of a place that counts: the narrowest way in, 6 m off."""
-_COLUMN: Final = np.arange(COLUMNS)
-_CLOSE: Final = 0.3
-"""Metres; nearer than that, a gap's upper edge may be out of the picture."""
-
-
 def analyse(picture: Picture) -> View:
     """Light and dark places of one picture of shape (120, 160)."""
     light = linear(picture)
-    floor = light[_BELOW + 3 :]
-    lit = max(float(np.percentile(floor, 80)), 1e-4)
+    lit = max(float(np.percentile(light[_BELOW + 3 :], 80)), 1e-4)
     near = _middle(light[110:, 20:140])
     # The fourth brightest row: floor, not a line of light at its end.
     top = np.partition(light[_BELOW + 1 : 104], -4, axis=0)[-4]
-    contrast = np.minimum(top / max(near, 2e-4), MOST_CONTRAST)
-    outside = float(np.percentile(top, 75))
-    above = _middle(light[:_ROOF])
     band = light[_BELOW - 16 : _BELOW + 4]
-    sides = _middle(band[:, : COLUMNS // 2]), _middle(band[:, COLUMNS // 2 :])
     return View(
         lit=lit,
         near=near,
         middling=_middle(light[::3, ::3]),
         ahead=_middle(band[:, 60:100]),
-        sides=sides,
+        sides=(_middle(band[:, : COLUMNS // 2]), _middle(band[:, COLUMNS // 2 :])),
         places=_places(light, lit),
-        contrast=contrast,
-        outside=outside,
-        above=above,
+        contrast=np.minimum(top / max(near, 2e-4), MOST_CONTRAST),
+        outside=float(np.percentile(top, 75)),
+        above=_middle(light[:_ROOF]),
     )
 
 
@@ -128,18 +109,19 @@ def _places(light: NDArray[np.float32], lit: float) -> tuple[DarkPlace, ...]:
                 place.darkness > 1.6 * other.darkness + 0.02 or place.width < other.width for other in rivals
             ):
                 continue
-            found = [other for other in found if other not in rivals]
-            found.append(place)
+            found = [*(other for other in found if other not in rivals), place]
     return tuple(sorted(found, key=lambda place: place.distance))
 
 
 def _at_level(light: NDArray[np.float32], lit: float, level: float) -> list[DarkPlace]:
     dark = light < level * lit
-    light_below, below = _run(dark[_BELOW : _BELOW + _DOWN])
+    light_below, below = _run(dark[_BELOW:])
     light_above, above = _run(dark[_BELOW - 1 :: -1])
     # Through a gap that is open behind one may see a strip of the lit room, at the horizon.
     inside = (2 * light_below <= below) & (2 * light_above <= above) & (below >= 1) & (above >= 1)
-    exact = _exact(light, below)
+    # Rows below the horizon at which the dark ends, between the pixels: the row where it ends is part dark.
+    end, column = np.minimum(_BELOW + below, ROWS - 2), np.arange(COLUMNS)
+    exact = below + 1 - np.clip(light[end, column] / np.maximum(light[end + 1, column], 1e-5), 0, 1)
     places = []
     for first, last in _stretches(inside, below):
         if last - first < _THINNEST:
@@ -164,8 +146,7 @@ def _at_level(light: NDArray[np.float32], lit: float, level: float) -> list[Dark
         if lintel.size and _middle(lintel) < max(2 * darkness, 0.5 * level) * lit:
             # No edge above: the lower part of a dark face.
             continue
-        centre = bearing((first + last) / 2)
-        places.append(DarkPlace(centre, distance, width, height, darkness, first, last))
+        places.append(DarkPlace(bearing((first + last) / 2), distance, width, height, darkness, first, last))
     return places
 
 
@@ -179,31 +160,17 @@ def _run(dark: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Per column: how many rows come before the first dark one, and before the first light one after that.
     Both are 0 if none is dark."""
     first = np.argmax(dark, axis=0)
-    light = ~dark & (_COUNT[: len(dark)] > first)
+    light = ~dark & (np.arange(len(dark))[:, None] > first)
     last = np.where(light.any(axis=0), np.argmax(light, axis=0), len(dark))
     none = ~dark.any(axis=0)
     first[none], last[none] = 0, 0
     return first, last
 
 
-def _exact(light: NDArray[np.float32], below: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Rows below the horizon at which the dark ends, between the pixels: the row where it ends is part
-    dark."""
-    end = np.minimum(_BELOW + below, ROWS - 2)
-    part, whole = light[end, _COLUMN], light[end + 1, _COLUMN]
-    result: NDArray[np.float32] = below + 1 - np.clip(part / np.maximum(whole, 1e-5), 0, 1)
-    return result
-
-
 def _stretches(inside: NDArray[np.bool_], below: NDArray[np.intp]) -> list[tuple[int, int]]:
     """Columns that belong together: next to each other (two may be missing), at like distances."""
     columns = np.flatnonzero(inside)
-    if not len(columns):
-        return []
     rows = below[columns]
-    apart = np.diff(columns) > 3
     jump = np.abs(np.diff(rows)) > 1.5 + 0.3 * np.minimum(rows[1:], rows[:-1])
-    cuts = np.flatnonzero(apart | jump) + 1
-    starts = np.concatenate(([0], cuts))
-    ends = np.concatenate((cuts, [len(columns)])) - 1
-    return [(int(columns[a]), int(columns[b])) for a, b in zip(starts, ends, strict=True)]
+    cuts = np.flatnonzero((np.diff(columns) > 3) | jump) + 1
+    return [(int(run[0]), int(run[-1])) for run in np.split(columns, cuts) if len(run)]

@@ -1,6 +1,6 @@
-"""A Scout's camera: where a pixel looks, and how bright it is. Pure.
+"""A Scout's camera: its pictures, where a pixel looks, and how bright it is. Pure.
 
-A pinhole, 4 cm above the floor, level: row `HORIZON` looks straight ahead, a point of the floor at distance d
+A pinhole, 4 cm above the floor, level: row 59.5 looks straight ahead, a point of the floor at distance d
 appears `RISE / d` rows below it. Bearings are radians, to the left positive; distances metres along the axis.
 """
 
@@ -9,8 +9,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from zscout.drivers.image_size import jpeg_size
 
 ROWS: Final = 120
 COLUMNS: Final = 160
@@ -18,14 +21,14 @@ FIELD: Final = math.radians(65.0)
 """Horizontal field of view."""
 FOCAL: Final = COLUMNS / 2 / math.tan(FIELD / 2)
 """Pixels."""
-HORIZON: Final = ROWS / 2 - 0.5
-"""Row of the horizon, counted from the centre of row 0."""
 MIDDLE: Final = COLUMNS / 2 - 0.5
 EYE: Final = 0.04
 """Metres of the camera above the floor."""
 RISE: Final = FOCAL * EYE
-"""Rows below the horizon, times metres: a floor point at distance d is `RISE / d` rows below the horizon."""
+"""Rows below the horizon, times metres."""
 GAMMA: Final = 2.2
+MAX_PIXELS: Final = 4_000_000
+"""Of a JPEG picture; a larger one is not decoded."""
 
 Picture = NDArray[np.uint8]
 """Grey, shape (120, 160), row 0 at the top, gamma 2.2."""
@@ -33,9 +36,14 @@ Picture = NDArray[np.uint8]
 _LINEAR: Final = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 
 
-def is_picture(picture: NDArray[np.uint8]) -> bool:
-    """Whether it has the form of a picture of this camera."""
-    return picture.shape == (ROWS, COLUMNS) and picture.dtype == np.uint8
+def grey_picture(data: bytes) -> NDArray[np.uint8] | None:
+    """A JPEG picture from outside, grey, of shape (height, width); None for what is none or has over
+    MAX_PIXELS."""
+    size = jpeg_size(data)
+    if size is None or size[0] * size[1] > MAX_PIXELS:
+        return None
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return None if picture is None else np.asarray(picture, np.uint8)
 
 
 def linear(picture: Picture) -> NDArray[np.float32]:
@@ -46,18 +54,3 @@ def linear(picture: Picture) -> NDArray[np.float32]:
 def bearing(column: float) -> float:
     """Radians to the left of the axis."""
     return -math.atan((column - MIDDLE) / FOCAL)
-
-
-def column(bearing: float) -> float:
-    """The column that looks there; outside 0 to 159 if it is out of the picture."""
-    return MIDDLE - FOCAL * math.tan(bearing)
-
-
-def floor_distance(row: float) -> float:
-    """Metres along the axis to the floor seen in this row; endless at the horizon and above."""
-    return RISE / (row - HORIZON) if row > HORIZON else math.inf
-
-
-def floor_row(distance: float) -> float:
-    """The row that sees the floor at this distance."""
-    return HORIZON + RISE / distance

@@ -1,7 +1,8 @@
-"""Whether something moves in a camera's picture, and where. Pure: time and pictures in.
+"""Whether something moves in a camera's picture, where, and from when to when. Pure: time and pictures in.
 
-    detector = MotionDetector()
+    detector, tracker = MotionDetector(), EventTracker()
     seen = detector.see(time, picture)      # seen.moving, seen.boxes
+    event = tracker.see(time, seen)         # one that is over, or None
 
 A background of running means and variances per pixel (Wren et al., "Pfinder", 1997; the two thresholds are
 Canny's hysteresis), with what a real camera needs beside it:
@@ -15,7 +16,7 @@ Canny's hysteresis), with what a real camera needs beside it:
 - Something moves once it was seen in two of three pictures, in about the same place.
 
 What stays is learned as that pixel's noise: whoever stops is no motion any more after a second or two, and
-leaves no ghost behind when he goes. The background itself follows within half a minute.
+leaves no ghost behind on leaving. The background itself follows within half a minute.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ ABSORB: Final = 30.0
 """Seconds in which it follows what is. The variance is fed by the square of it, and so
 follows much sooner."""
 WARM: Final = 1.0
-"""Seconds of the first look: all is background, and nothing is told."""
+"""Seconds of the first look: all is background, and nothing is reported."""
 WARM_PICTURES: Final = 4
 STRONG: Final = 6.5
 """Standard deviations that begin a region."""
@@ -63,6 +64,8 @@ RECENT: Final = 3
 MEMORY: Final = 1.2
 """Seconds after which an earlier sighting confirms nothing."""
 MAX_BOXES: Final = 16
+GAP: Final = 1.0
+"""Seconds without motion that end an event; what moves again sooner goes on with it."""
 
 Picture = NDArray[np.uint8]
 _Plane = NDArray[np.float32]
@@ -84,25 +87,43 @@ class Seen(NamedTuple):
     boxes: tuple[Box, ...] = ()
     """Where, largest first; of a sighting that is not sure yet as well."""
     learning: bool = False
-    """Nothing can be told yet, or not any more: the background is new."""
+    """Nothing is known yet, or not any more: the background is new."""
+
+
+class Event(NamedTuple):
+    """A stretch of motion. Times are seconds of the clock by which the pictures came."""
+
+    start: float
+    """Of the first picture in which what moves was seen."""
+    end: float
+    """Of the last one."""
+    peak: float
+    """Of the picture in which it covered most."""
+    boxes: tuple[Box, ...]
+    """All that moved at the peak, largest first, in pixels of the source."""
+    area: Box
+    """Around all that moved from start to end."""
+    frames: int
+    """Pictures with motion."""
+    going_on: bool = False
+    """It was not over when the watch was."""
 
 
 class MotionDetector:
     """The memory of one camera."""
 
     def __init__(self) -> None:
-        self._mean: _Plane | None = None
-        self._variance: _Plane
-        self._begun = 0.0
+        self._mean: _Plane = np.empty((0, 0), np.float32)
+        self._variance = self._mean
+        self._begun = self._last = 0.0
         self._pictures = 0
-        self._last = 0.0
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
         """Takes a picture of shape (height, width), or (height, width, 3) in BGR, made at `time` in seconds
         of any clock. Raises ValueError for what is no picture."""
         grey, across, down = reduced(picture)
-        if self._mean is None or self._mean.shape != grey.shape:
+        if self._mean.shape != grey.shape:
             return self._begin(time, grey)
         passed = min(1.0, max(0.0, time - self._last))
         self._last = time
@@ -112,15 +133,22 @@ class MotionDetector:
         if self._pictures < WARM_PICTURES or time - self._begun < WARM:
             self._learn(away, None, 1.0 / self._pictures, 1.0)
             return Seen(False, learning=True)
-        score, middle = self._score(level, self._mean)
-        if middle > ALL_OFF:
-            return self._begin(time, grey)
-        mask = self._regions(score, level, self._mean)
-        share = float(np.count_nonzero(mask)) / mask.size
-        if share > UPHEAVAL:
+        score, middle = self._score(away)
+        mask, regions = self._regions(score, level)
+        if middle > ALL_OFF or np.count_nonzero(mask) / mask.size > UPHEAVAL:
             return self._begin(time, grey)
         self._learn(away, mask, passed / LEARN, passed / ABSORB)
-        boxes = _boxes(mask, across, down, picture.shape[1], picture.shape[0])
+        largest = sorted(regions.tolist(), key=lambda one: -one[cv2.CC_STAT_AREA])[:MAX_BOXES]
+        height, width = picture.shape[:2]
+        boxes = tuple(
+            Box(
+                min(width - 1, round(x * across)),
+                min(height - 1, round(y * down)),
+                max(1, min(width, round((x + w) * across)) - round(x * across)),
+                max(1, min(height, round((y + h) * down)) - round(y * down)),
+            )
+            for x, y, w, h, _ in largest
+        )
         return Seen(self._sure(time, mask), boxes)
 
     def _begin(self, time: float, grey: _Plane) -> Seen:
@@ -131,12 +159,12 @@ class MotionDetector:
         self._sightings.clear()
         return Seen(False, learning=True)
 
-    def _score(self, level: _Plane, mean: _Plane) -> tuple[_Plane, float]:
+    def _score(self, away: _Plane) -> tuple[_Plane, float]:
         """By how many standard deviations of its noise each pixel is off, smoothed, in terms of what this
         picture's pixels are off in general. And that median."""
         # Neighbours are alike noisy: their mean is a floor under what few pictures tell of one pixel.
         spread = np.sqrt(np.maximum(np.maximum(self._variance, cv2.blur(self._variance, (5, 5))), FLOOR**2))
-        score = np.abs(cv2.GaussianBlur(level - mean, (3, 3), 0)) / spread
+        score = np.abs(cv2.GaussianBlur(away, (3, 3), 0)) / spread
         # Smoothing leaves about 0.4 of independent noise; what is left of it is judged by its own measure.
         middle = float(np.median(score))
         score /= middle / 0.674 if middle > 0.3 else 0.45
@@ -144,8 +172,6 @@ class MotionDetector:
 
     def _learn(self, away: _Plane, mask: NDArray[np.uint8] | None, still: float, moved: float) -> None:
         """Follows the picture, by `still` and where something moves by `moved` (shares, 0 to 1)."""
-        if self._mean is None:
-            return
         rate: _Plane | float = min(1.0, still)
         if mask is not None:
             # Around what moves its shadow and its blur are, too.
@@ -154,8 +180,9 @@ class MotionDetector:
         self._mean += rate * away
         self._variance += rate * (away * away - self._variance)
 
-    def _regions(self, score: _Plane, level: _Plane, mean: _Plane) -> NDArray[np.uint8]:
-        """Where the score is above WEAK, connected, and somewhere in it above STRONG: 255, elsewhere 0."""
+    def _regions(self, score: _Plane, level: _Plane) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+        """Where the score is above WEAK, connected, and somewhere in it above STRONG: 255, elsewhere 0. And
+        left, top, width, height and area of each region."""
         weak = (score > WEAK).astype(np.uint8)
         # A line that is torn, or a single hot pixel, is thinner than anything that moves.
         thick = cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8))
@@ -168,9 +195,9 @@ class MotionDetector:
         for region in np.flatnonzero(keep & (stats[:, cv2.CC_STAT_HEIGHT] <= THIN * score.shape[0])):
             top, high = stats[region, cv2.CC_STAT_TOP], stats[region, cv2.CC_STAT_HEIGHT]
             wide = stats[region, cv2.CC_STAT_WIDTH] > BAND * high
-            keep[region] = not (wide or _torn(level[top : top + high], mean[top : top + high]))
+            keep[region] = not (wide or _torn(level[top : top + high], self._mean[top : top + high]))
         keep[0] = False
-        return np.where(keep[labels], np.uint8(255), np.uint8(0))
+        return np.where(keep[labels], np.uint8(255), np.uint8(0)), np.asarray(stats[keep], np.int32)
 
     def _sure(self, time: float, mask: NDArray[np.uint8]) -> bool:
         """Whether what is seen was seen lately, near there."""
@@ -183,12 +210,9 @@ class MotionDetector:
 def reduced(picture: Picture) -> tuple[_Plane, float, float]:
     """The picture grey and WIDTH columns wide at most, and by what its columns and rows are multiplied for
     those of the source. Raises ValueError."""
-    grey_shape = picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3)
-    if (
-        picture.dtype != np.uint8
-        or not grey_shape
-        or not all(8 <= side <= MAX_SIDE for side in picture.shape[:2])
-    ):
+    planes = picture.ndim in (2, 3) and picture.shape[2:] in ((), (3,))
+    sides = all(8 <= side <= MAX_SIDE for side in picture.shape[:2])
+    if picture.dtype != np.uint8 or not planes or not sides:
         raise ValueError(
             f"no picture: {picture.dtype} of shape {picture.shape}; sides of 8 to {MAX_SIDE} are taken"
         )
@@ -207,7 +231,7 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
     now = cv2.resize(grey, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
     was = cv2.resize(mean, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
     # Black and white have no gain.
-    fits = (now > 4) & (now < 250)
+    fits = lit = (now > 4) & (now < 250)
     gain, offset = 1.0, 0.0
     for _ in range(3):
         if np.count_nonzero(fits) < 12:
@@ -218,7 +242,7 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
         gain = min(2.5, max(0.4, gain))
         offset = float(y.mean() - gain * x.mean())
         off = np.abs(now - gain * was - offset)
-        fits = (now > 4) & (now < 250) & (off <= max(1.5, 2.5 * float(np.median(off[fits]))))
+        fits = lit & (off <= max(1.5, 2.5 * float(np.median(off[fits]))))
     return ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
 
 
@@ -231,16 +255,57 @@ def _torn(lines: _Plane, mean: _Plane) -> bool:
     return bool(np.min(aside, axis=0).sum() < 0.5 * aside[0].sum())
 
 
-def _boxes(mask: NDArray[np.uint8], across: float, down: float, width: int, height: int) -> tuple[Box, ...]:
-    """The regions of a mask in pixels of the source, largest first."""
-    _, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    found = sorted(stats[1:].tolist(), key=lambda one: -one[cv2.CC_STAT_AREA])[:MAX_BOXES]
-    return tuple(
-        Box(
-            min(width - 1, round(x * across)),
-            min(height - 1, round(y * down)),
-            max(1, min(width, round((x + w) * across)) - round(x * across)),
-            max(1, min(height, round((y + h) * down)) - round(y * down)),
+class EventTracker:
+    """Takes what a MotionDetector sees. Each event comes back once, when it is over."""
+
+    def __init__(self) -> None:
+        self.current: Event | None = None
+        """The event that is not over yet, as far as it goes."""
+        self._most = 0
+        self._first: tuple[float, tuple[Box, ...]] | None = None
+        """A sighting that the next picture may confirm."""
+
+    def see(self, time: float, seen: Seen) -> Event | None:
+        """Takes what was seen at `time`, which never goes back. The event that had ended before, if any."""
+        ended = self.quiet(time)
+        recent = self._first is not None and time - self._first[0] <= MEMORY
+        if not seen.moving:
+            if seen.boxes and self.current is None and not recent:
+                self._first = time, seen.boxes
+            return ended
+        if self.current is None:
+            # What is certain only now began with the sighting that it confirms.
+            start, boxes = self._first if self._first is not None and recent else (time, ())
+            frames = 1 if boxes else 0
+            self.current = Event(start, time, time, seen.boxes, around((*boxes, *seen.boxes)), frames)
+            self._most, self._first = -1, None
+        area = sum(box.width * box.height for box in seen.boxes)
+        if area > self._most:
+            self._most = area
+            self.current = self.current._replace(peak=time, boxes=seen.boxes)
+        self.current = self.current._replace(
+            end=time, area=around((self.current.area, *seen.boxes)), frames=self.current.frames + 1
         )
-        for x, y, w, h, _ in found
-    )
+        return ended
+
+    def quiet(self, time: float) -> Event | None:
+        """No picture came until `time`. The event that is over by that, if any."""
+        event = self.current
+        if event is None or time - event.end <= GAP:
+            return None
+        self.current = self._first = None
+        return event
+
+    def close(self) -> Event | None:
+        """The watch is over. The event that was going on, if any."""
+        event, self.current = self.current, None
+        return event._replace(going_on=True) if event is not None else None
+
+
+def around(boxes: tuple[Box, ...]) -> Box:
+    """The box around all of these; an empty one around none."""
+    if not boxes:
+        return Box(0, 0, 0, 0)
+    left, top = min(box.x for box in boxes), min(box.y for box in boxes)
+    right = max(box.x + box.width for box in boxes)
+    return Box(left, top, right - left, max(box.y + box.height for box in boxes) - top)

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.perception.jpeg import grey_picture
-from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture
+from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture, grey_picture
 from zscout.mesh import FrameWatch
 from zscout.types import Grant, Ns
 

@@ -22,7 +22,7 @@ from zscout.types import SECOND
 if TYPE_CHECKING:
     from rich.live import Live
 
-    from zscout.behaviors.perception.events import Event
+    from zscout.behaviors.perception.motion import Event
     from zscout.cli.operator.watch_source import Source
     from zscout.services.recorder.watch_recording import WatchRecording
 
@@ -104,8 +104,7 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
 
 
 def _watch(source: Source, report: _WatchReport, ending: _Ending, limit: float | None) -> None:
-    from zscout.behaviors.perception.events import EventTracker
-    from zscout.behaviors.perception.motion import MotionDetector
+    from zscout.behaviors.perception.motion import EventTracker, MotionDetector
 
     detector, tracker = MotionDetector(), EventTracker()
     for time, picture in source.shots():

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from zscout.behaviors.perception.hiding.hider import Hider
-from zscout.behaviors.perception.hiding.wheels import WheelCommand
+from zscout.behaviors.perception.hiding.state import WheelCommand
 from zscout.behaviors.perception.lens import Picture
 from zscout.drivers.packets import (
     CameraPacket,

@@ -1,4 +1,4 @@
-"""How far a robot turned between two pictures: the picture's own shift, whatever the wheels did.
+"""How far a robot turned between two pictures: the picture's own shift, whatever the wheels did. Pure.
 
 A turn on the spot moves everything by the same angle, near or far. So each picture is laid out by angle
 instead of by pixel, reduced to a few bands of rows without their slow changes (light, exposure), and the
@@ -9,20 +9,13 @@ Cross-Correlation" (1995), here along one axis, by FFT.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zscout.behaviors.perception.lens import (
-    COLUMNS,
-    FIELD,
-    FOCAL,
-    GAMMA,
-    MIDDLE,
-    Picture,
-)
+from zscout.behaviors.perception.lens import COLUMNS, FIELD, FOCAL, GAMMA, MIDDLE, Picture
 
 STEP: Final = FIELD / COLUMNS
 """Radians between two columns of a strip."""
@@ -31,7 +24,6 @@ _TOP, _BOTTOM = 4, 84
 """Rows used. Below them the floor is so near that a turn about the wheels is not one about the camera."""
 _NEAR: Final = 80
 """First row of the near floor: 25 cm ahead."""
-_PADDED: Final = 2 * COLUMNS
 _OVERLAP: Final = 36
 """Columns that two strips must share at least: a turn of up to 50 degrees is measured."""
 _SLOW: Final = 31
@@ -39,8 +31,8 @@ _SLOW: Final = 31
 _GREY: Final = 1.5
 """Grey levels of noise that a band carries anyway: less than this is no texture."""
 
-_ANGLES: Final = (MIDDLE - np.arange(COLUMNS)) * STEP
-_SOURCE: Final = np.clip(MIDDLE - FOCAL * np.tan(_ANGLES), 0, COLUMNS - 1)
+_SOURCE: Final = np.clip(MIDDLE - FOCAL * np.tan((MIDDLE - np.arange(COLUMNS)) * STEP), 0, COLUMNS - 1)
+"""The column of the picture, between two pixels, that each column of a strip shows."""
 _LEFT: Final = np.minimum(_SOURCE.astype(np.intp), COLUMNS - 2)
 _SHARE: Final = (_SOURCE - _LEFT).astype(np.float32)
 
@@ -58,15 +50,11 @@ class Turn(NamedTuple):
     """Correlation at that shift: near 1 is sure, below about 0.4 is a guess."""
 
 
-def strip(picture: Picture) -> Strip:
-    """What `turned` compares: whole numbers, so that a checkpoint keeps it exactly."""
+def strip_and_tones(picture: Picture) -> tuple[Strip, Tones]:
+    """What `turned` compares, in whole numbers, so that a checkpoint keeps it exactly; and the same part of
+    the picture as it is, to compare exposures."""
     by_angle = _by_angle(picture[_TOP:_BOTTOM])
-    return _whole(by_angle - cv2.blur(by_angle, (_SLOW, 1), borderType=cv2.BORDER_REFLECT))
-
-
-def tones(picture: Picture) -> Tones:
-    """The same part as it is, to compare exposures."""
-    return np.rint(_by_angle(picture[_TOP:_BOTTOM])).astype(np.uint8)
+    return _off_the_mean(by_angle, (_SLOW, 1)), np.rint(by_angle).astype(np.uint8)
 
 
 def brighter(old: Tones, new: Tones, angle: float) -> float:
@@ -87,8 +75,7 @@ def brighter(old: Tones, new: Tones, angle: float) -> float:
 def floor_strip(picture: Picture) -> Strip:
     """The near floor's grain, laid out likewise. It stays as it is while the robot turns on the spot or
     pushes in vain, and is another one after a few centimetres of way."""
-    fine = cv2.blur(_by_angle(picture[_NEAR:]), (3, 1))
-    return _whole(fine - cv2.blur(fine, (25, 7), borderType=cv2.BORDER_REFLECT))
+    return _off_the_mean(cv2.blur(_by_angle(picture[_NEAR:]), (3, 1)), (25, 7))
 
 
 def _by_angle(rows: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -97,8 +84,9 @@ def _by_angle(rows: NDArray[np.uint8]) -> NDArray[np.float32]:
     return result
 
 
-def _whole(levels: NDArray[np.float32]) -> Strip:
-    result: Strip = np.rint(np.clip(levels * SCALE, -127, 127)).astype(np.int8)
+def _off_the_mean(levels: NDArray[Any], around: tuple[int, int]) -> Strip:
+    off = levels - cv2.blur(levels, around, borderType=cv2.BORDER_REFLECT)
+    result: Strip = np.rint(np.clip(off * SCALE, -127, 127)).astype(np.int8)
     return result
 
 
@@ -108,24 +96,21 @@ def turned(old: Strip, new: Strip, expected: float = 0.0, spread: float = math.r
     `expected` and `spread` (radians) say where to look first: a turn that is off by `spread` has to be more
     alike by 0.15. The angle is a whole number of columns (0.4 degrees)."""
     after, before = new.astype(np.float32), old.astype(np.float32)
-    fast, slow = np.fft.rfft(after, _PADDED, axis=1), np.fft.rfft(before, _PADDED, axis=1)
-    common = np.fft.irfft((fast * np.conj(slow)).sum(axis=0), _PADDED)
-    reach = COLUMNS - _OVERLAP
-    shifts = np.arange(-reach, reach + 1)
-    product = common[shifts]
-    energy_before = _ends((before**2).sum(axis=0), -shifts)
-    energy_after = _ends((after**2).sum(axis=0), shifts)
+    fast, slow = (np.fft.rfft(one, 2 * COLUMNS, axis=1) for one in (after, before))
+    common = np.fft.irfft((fast * np.conj(slow)).sum(axis=0), 2 * COLUMNS)
+    shifts = np.arange(_OVERLAP - COLUMNS, COLUMNS - _OVERLAP + 1)
     noise = (_GREY * SCALE) ** 2 * BANDS * (COLUMNS - np.abs(shifts))
-    likeness = product / np.sqrt((energy_before + noise) * (energy_after + noise))
+    energy = (_ends(before, -shifts) + noise) * (_ends(after, shifts) + noise)
+    likeness = common[shifts] / np.sqrt(energy)
     # Content that moves to the right in the picture (a positive shift) is a turn to the left.
     off = (shifts * STEP - expected) / spread
     best = int(np.argmax(likeness - 0.15 * off**2))
     return Turn(float(shifts[best]) * STEP, float(likeness[best]))
 
 
-def _ends(energy: NDArray[np.float32], shifts: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Sum of the part of `energy` that a shift leaves in the picture: from `shift` on, or up to its end."""
-    running = np.concatenate(([0.0], np.cumsum(energy, dtype=np.float64)))
+def _ends(strip: NDArray[np.float32], shifts: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Energy of the part of a strip that a shift leaves in the picture: from `shift` on, or up to its end."""
+    running = np.concatenate(([0.0], np.cumsum((strip**2).sum(axis=0), dtype=np.float64)))
     result: NDArray[np.float64] = np.where(
         shifts >= 0, running[-1] - running[np.maximum(shifts, 0)], running[COLUMNS + np.minimum(shifts, 0)]
     )

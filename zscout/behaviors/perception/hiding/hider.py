@@ -5,75 +5,63 @@
 
 The paper's Place Sensor Net, per robot: locate the dark place, servo to it, handle collisions, turn to the
 light. There is no odometry and no answer from the robot: turns are measured in the pictures (`compass`),
-drives are dead-reckoned and corrected by what comes into view. The phases stand in `PHASES`, each a class
-of its own; everything they remember is one `HidingState`.
+drives are dead-reckoned and corrected by what comes into view. The phases stand in `PHASES`; everything they
+remember is one `HidingState`.
 """
 
 from __future__ import annotations
 
-from typing import Final
+import zlib
+from collections.abc import Callable
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from zscout.behaviors.perception.darkness import analyse
+from zscout.behaviors.perception.darkness import View, analyse
 from zscout.behaviors.perception.garble import garbled
-from zscout.behaviors.perception.hiding.approaching import Approach, Enter
-from zscout.behaviors.perception.hiding.compass import (
-    BANDS,
-    Strip,
-    Tones,
-    strip,
-    tones,
-)
-from zscout.behaviors.perception.hiding.controller import (
-    HidingController,
-    HidingPhase,
-    print_of,
-    thumb_of,
-)
-from zscout.behaviors.perception.hiding.facing import (
-    Check,
-    Face,
-    Hidden,
-    Settle,
-)
-from zscout.behaviors.perception.hiding.freeing import Back, Dodge, Leave
-from zscout.behaviors.perception.hiding.searching import Aim, Roam, Scan
-from zscout.behaviors.perception.hiding.state import (
-    FORM,
-    MAX_CHECKPOINT,
-    HidingState,
-    Phase,
-)
-from zscout.behaviors.perception.hiding.wheels import SCOUT, BodyModel, WheelCommand
-from zscout.behaviors.perception.lens import COLUMNS, Picture, is_picture
+from zscout.behaviors.perception.hiding import entering, searching
+from zscout.behaviors.perception.hiding.compass import BANDS, strip_and_tones
+from zscout.behaviors.perception.hiding.controller import HidingController, Step, thumb_of
+from zscout.behaviors.perception.hiding.state import FORM, MAX_CHECKPOINT, Phase, Thumb, WheelCommand
+from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture
 
-PHASES: Final[dict[Phase, HidingPhase]] = {
-    "scan": Scan(),
-    "aim": Aim(),
-    "roam": Roam(),
-    "approach": Approach(),
-    "enter": Enter(),
-    "face": Face(),
-    "settle": Settle(),
-    "back": Back(),
-    "dodge": Dodge(),
-    "leave": Leave(),
-    "hidden": Hidden(),
-    "check": Check(),
+
+class PhaseCode(NamedTuple):
+    """The functions of one phase of hiding. They keep nothing of their own: all is in the controller."""
+
+    step: Callable[[HidingController, View], Step]
+    """What to do on this picture. After a hop it is called when that is over and measured."""
+    begin: Callable[[HidingController], None] = lambda _: None
+    """The phase begins; nothing is commanded yet."""
+    cruises: bool = False
+    """It drives without waiting for a still picture."""
+    stuck: Callable[[HidingController, View], Step] = searching.stuck
+    """It drove, and nothing moved."""
+
+
+PHASES: Final[dict[Phase, PhaseCode]] = {
+    "scan": PhaseCode(searching.scan, searching.begin_scan),
+    "aim": PhaseCode(searching.aim),
+    "roam": PhaseCode(searching.roam, searching.begin_roam, True, searching.roam_stuck),
+    "approach": PhaseCode(entering.approach, entering.begin_approach, True),
+    "enter": PhaseCode(entering.enter, entering.begin_enter, True, entering.enter_stuck),
+    "face": PhaseCode(entering.face, entering.begin_face),
+    "settle": PhaseCode(entering.settle, entering.begin_settle),
+    "back": PhaseCode(searching.back, searching.begin_back),
+    "dodge": PhaseCode(searching.dodge),
+    "leave": PhaseCode(searching.leave, searching.begin_leave, True),
+    "hidden": PhaseCode(entering.hidden),
+    "check": PhaseCode(entering.check, entering.begin_check),
 }
 RESUMES: Final[dict[Phase, Phase]] = {"hidden": "check", "check": "check", "face": "face", "settle": "face"}
-"""Where those go on that were in the dark when the hold was lost; others search anew."""
-CRUISES: Final = {"roam", "approach", "enter", "leave"}
-"""Phases that drive without waiting for a still picture."""
+"""Where a phase goes on that was in the dark when the hold was lost; all others search anew."""
 LONGEST_GAP: Final = 5.0
 """Seconds that count between two pictures at most: longer ones, and clocks that go back, are another
 host's."""
 BLIND: Final = 0.8
 """Seconds without a good picture after which the robot stands."""
-TELLS: Final = 2.0
+REPORTS: Final = 2.0
 """Seconds of spoiled pictures after which it reports that."""
 
 
@@ -84,136 +72,130 @@ class BadCheckpoint(ValueError):
 class Hider:
     """Hides one robot."""
 
-    def __init__(self, body: BodyModel = SCOUT, *, seed: int = 0) -> None:
-        self._controller = HidingController(body, HidingState(dice=seed & 0xFFFFFFFFFFFFFFFF), PHASES)
+    def __init__(self, *, seed: int = 0) -> None:
+        self._robot = HidingController(dice=seed & 0xFFFFFFFFFFFFFFFF)
 
     @property
     def state(self) -> str:
         """search, approach, unstick, enter, turn or hidden."""
-        return self._controller.word
+        return self._robot.word
 
     def see(self, now: float, picture: Picture | None, defect: str | None = "") -> WheelCommand:
         """What to do now. `now` in seconds of any clock that runs; `picture` of shape (120, 160), or None if
         there is no newer one; `defect`: what `garbled` gave for it, if the caller knows. Raises ValueError
         for an array of another form."""
-        if picture is not None and not is_picture(picture):
+        if picture is not None and (picture.shape != (ROWS, COLUMNS) or picture.dtype != np.uint8):
             raise ValueError(
                 f"a picture is uint8 of shape (120, 160), not {picture.dtype} of {picture.shape}"
             )
-        controller = self._controller
-        memory = controller.memory
+        robot = self._robot
         passed = self._passed(now)
-        if memory.stopped:
-            return controller.stand("waits for its robot")
-        how = self._spoiled(picture, defect)
-        if picture is None or how:
+        if robot.stopped:
+            return robot.stand("waits for its robot")
+        if picture is None:
+            return self._blind("")
+        crc = zlib.crc32(picture.tobytes())
+        how = "frozen" if crc == robot.print else garbled(picture) if defect == "" else defect
+        if how:
             return self._blind(how)
-        memory.interval += 0.2 * (min(1.0, memory.clock - memory.last_good) - memory.interval)
-        memory.last_good, memory.spoiled_since = memory.clock, None
-        print_, bands, shades, thumb = print_of(picture), strip(picture), tones(picture), thumb_of(picture)
-        act = self._decide(passed, picture, bands, shades, thumb)
-        memory.print, memory.previous, memory.tones = print_, bands.tobytes(), shades.tobytes()
+        robot.interval += 0.2 * (min(1.0, robot.clock - robot.last_good) - robot.interval)
+        robot.last_good, robot.spoiled_since = robot.clock, None
+        act = self._decide(passed, picture)
+        robot.print = crc
         return act
 
-    def _decide(
-        self, passed: float, picture: Picture, bands: Strip, shades: Tones, thumb: NDArray[np.uint8]
-    ) -> WheelCommand:
-        controller = self._controller
-        memory = controller.memory
-        phase = PHASES[memory.phase]
-        if memory.phase == "hidden":
-            return controller.stand(memory.note)
-        if memory.hopping:
-            over = controller.settled(bands, shades, thumb)
-            controller.keep(thumb)
-            if not over:
-                return controller.rest(memory.why)
-            memory.previous, memory.tones = bands.tobytes(), shades.tobytes()
-            return phase.step(controller, analyse(picture))
-        if memory.phase in CRUISES:
-            controller.advanced(passed, bands)
-            memory.previous, memory.tones = bands.tobytes(), shades.tobytes()
-            view = analyse(picture)
-            if memory.ends > memory.clock - passed and controller.blocked(picture):
-                return phase.stuck(controller, view)
-            return phase.step(controller, view)
-        memory.previous, memory.tones = bands.tobytes(), shades.tobytes()
-        return phase.step(controller, analyse(picture))
+    def _decide(self, passed: float, picture: Picture) -> WheelCommand:
+        robot, phase = self._robot, PHASES[self._robot.phase]
+        strip, tones = strip_and_tones(picture)
+        over, waits = True, robot.phase != "hidden" and robot.hopping
+        if waits:
+            thumb = thumb_of(picture)
+            over = robot.settled(strip, tones, thumb)
+            robot.thumbs = [Thumb(robot.clock, thumb.tobytes())]
+        elif phase.cruises:
+            robot.advanced(passed, strip)
+        robot.previous, robot.tones = strip.tobytes(), tones.tobytes()
+        if robot.phase == "hidden":
+            return robot.stand(robot.note)
+        if not over:
+            return robot.rest(robot.why)
+        view = analyse(picture)
+        drove = phase.cruises and not waits and robot.ends > robot.clock - passed
+        stuck = drove and robot.blocked_by(picture)
+        return self._follow((phase.stuck if stuck else phase.step)(robot, view), view)
+
+    def _follow(self, step: Step, view: View) -> WheelCommand:
+        """Changes the phase, if that is the step, and takes its first step on the same picture."""
+        if isinstance(step, WheelCommand):
+            return step
+        self._go(step)
+        return self._follow(PHASES[step].step(self._robot, view), view)
+
+    def _go(self, phase: Phase) -> None:
+        self._robot.go(phase)
+        PHASES[phase].begin(self._robot)
 
     def _passed(self, now: float) -> float:
-        memory = self._controller.memory
-        last = memory.last_now if memory.last_now is not None else now
+        """Seconds since the last call."""
+        robot = self._robot
+        last = robot.last_now if robot.last_now is not None else now
         passed = min(LONGEST_GAP, max(0.0, now - last))
-        memory.last_now = now
-        memory.clock += passed
+        robot.last_now = now
+        robot.clock += passed
         return passed
 
-    def _spoiled(self, picture: Picture | None, defect: str | None) -> str:
-        """What is wrong with the picture, "" if nothing is."""
-        if picture is None:
-            return ""
-        if print_of(picture) == self._controller.memory.print:
-            return "frozen"
-        return (garbled(picture) if defect == "" else defect) or ""
-
     def _blind(self, how: str) -> WheelCommand:
-        """Nothing to see: what was commanded may run out, then the robot stands."""
-        controller = self._controller
-        memory = controller.memory
+        """Nothing to see, `how` the picture is spoiled if there is one: what was commanded may run out, then
+        the robot stands."""
+        robot = self._robot
         if how:
-            memory.spoiled_how = how
-            if memory.spoiled_since is None:
-                memory.spoiled_since = memory.clock
-        unseen = memory.clock - memory.last_good
-        if memory.phase == "hidden":
-            return controller.stand(memory.note)
-        why = memory.why
-        if unseen > TELLS:
-            why = (
-                f"pictures are {memory.spoiled_how}: waits"
-                if memory.spoiled_since is not None
-                else "no picture: waits"
-            )
-        if memory.hopping:
-            return controller.rest(why)
-        if how not in ("", "frozen") or unseen > BLIND:
-            return controller.stand(why)
-        return controller.rest(why)
+            robot.spoiled_how = how
+            if robot.spoiled_since is None:
+                robot.spoiled_since = robot.clock
+        unseen = robot.clock - robot.last_good
+        if robot.phase == "hidden":
+            return robot.stand(robot.note)
+        why = robot.why
+        if unseen > REPORTS:
+            spoiled = robot.spoiled_since is not None
+            why = f"pictures are {robot.spoiled_how}: waits" if spoiled else "no picture: waits"
+        if not robot.hopping and (how not in ("", "frozen") or unseen > BLIND):
+            return robot.stand(why)
+        return robot.rest(why)
 
     def interrupted(self, now: float) -> None:
         """The hold was lost: the robot has stopped, and a human may move it."""
         self._passed(now)
-        self._controller.memory.stopped = True
+        self._robot.stopped = True
 
     def resumed(self, now: float) -> None:
-        """The hold is back. Whoever was hidden, or about to, looks whether it still is; others search
-        anew."""
+        """The hold is back. A robot that was hidden, or about to be, looks whether it still is; any other
+        searches anew."""
         self._passed(now)
-        controller = self._controller
-        memory = controller.memory
-        memory.stopped = False
-        memory.last_good = memory.clock
-        memory.bad, memory.target = [], None
-        memory.previous, memory.tones = b"", b""
-        controller.go(RESUMES.get(memory.phase, "scan"))
+        robot = self._robot
+        robot.stopped = False
+        robot.last_good = robot.clock
+        robot.bad, robot.target = [], None
+        robot.previous, robot.tones = b"", b""
+        self._go(RESUMES.get(robot.phase, "scan"))
 
     def checkpoint(self) -> bytes:
         """All that it remembers; `restore` gives one that does exactly the same from here on."""
-        return msgspec.msgpack.encode(self._controller.memory)
+        return msgspec.msgpack.encode(self._robot)
 
     @classmethod
-    def restore(cls, data: bytes, body: BodyModel = SCOUT) -> Hider:
+    def restore(cls, data: bytes) -> Hider:
         """Raises BadCheckpoint."""
         if len(data) > MAX_CHECKPOINT:
             raise BadCheckpoint(f"a checkpoint of {len(data)} bytes is more than {MAX_CHECKPOINT}")
         try:
-            memory = msgspec.msgpack.decode(data, type=HidingState)
+            robot = msgspec.msgpack.decode(data, type=HidingController)
         except (msgspec.MsgspecError, UnicodeDecodeError) as problem:
             raise BadCheckpoint(f"is no checkpoint of a hider: {problem}") from problem
-        if memory.form != FORM:
-            raise BadCheckpoint(f"a checkpoint of form {memory.form}, not {FORM}: start anew")
-        if {len(memory.tones), len(memory.anchor_tones)} - {0, BANDS * COLUMNS}:
+        if robot.form != FORM:
+            raise BadCheckpoint(f"a checkpoint of form {robot.form}, not {FORM}: start anew")
+        if {len(robot.tones), len(robot.anchor_tones)} - {0, BANDS * COLUMNS}:
             raise BadCheckpoint("a checkpoint whose pictures have another size: start anew")
-        hider = cls(body)
-        hider._controller.memory = memory
+        hider = cls()
+        hider._robot = robot
         return hider

@@ -1,4 +1,4 @@
-"""Looking around for a dark place, turning to the best one, and driving elsewhere if there is none."""
+"""Looking around for a dark place, driving elsewhere if there is none, and getting free again."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ import math
 from typing import Final
 
 from zscout.behaviors.perception.darkness import View
-from zscout.behaviors.perception.hiding.controller import HOP, HidingController, HidingPhase
-from zscout.behaviors.perception.hiding.facing import sheltered, to_light
+from zscout.behaviors.perception.hiding.controller import FULL_TURN, HOP, HidingController, Step
+from zscout.behaviors.perception.hiding.entering import sheltered, to_light
 from zscout.behaviors.perception.hiding.state import (
     MAX_SIGHTINGS,
     HidingState,
     Opening,
     Sighting,
     Spot,
+    distance,
     wrapped,
 )
-from zscout.behaviors.perception.hiding.wheels import WheelCommand
 
-FULL_TURN: Final = math.tau - math.radians(20)
 MOST_HOPS: Final = 24
 """Of a scan: turns that the picture does not show do not count for ever."""
 AIMED: Final = math.radians(7)
@@ -29,52 +28,47 @@ FORGETS: Final = 6
 MAX_VISITED: Final = 24
 BAD_NEAR: Final = 0.45
 """Metres around a spot where hiding failed."""
+MOST_BLOCKED: Final = 4
+"""Sides of a scan that may be tried."""
 
 
-class Scan(HidingPhase):
+def begin_scan(robot: HidingController) -> None:
+    robot.turned, robot.opened, robot.faces = 0.0, 1.0, 0
+    robot.sightings, robot.openings = [], []
+    robot.scans += 1
+    robot.visited = [*robot.visited, Spot(robot.x, robot.y)][-MAX_VISITED:]
+    if robot.scans % FORGETS == 0:
+        robot.bad = []
+    robot.tries, robot.target, robot.blocked = 0, None, []
+
+
+def scan(robot: HidingController, view: View) -> Step:
     """A full turn in steps; at its end the best dark place is chosen."""
-
-    def begin(self, controller: HidingController) -> None:
-        memory = controller.memory
-        memory.turned, memory.hops, memory.opened, memory.faces = 0.0, 0, 1.0, 0
-        memory.sightings, memory.openings = [], []
-        memory.scans += 1
-        memory.visited = [*memory.visited, Spot(memory.x, memory.y)][-MAX_VISITED:]
-        if memory.scans % FORGETS == 0:
-            memory.bad = []
-        memory.tries, memory.target, memory.blocked = 0, None, []
-
-    def step(self, controller: HidingController, view: View) -> WheelCommand:
-        memory = controller.memory
-        controller.sight(view)
-        memory.sightings = memory.sightings[-MAX_SIGHTINGS:]
-        if abs(memory.turned) < FULL_TURN and memory.hops < MOST_HOPS:
-            seen = len(memory.sightings)
-            return controller.hop(
-                HOP, f"looks around, {math.degrees(abs(memory.turned)):.0f} degrees, {seen} dark seen"
-            )
-        if sheltered(memory.openings):
-            memory.faces = 1
-
-            return to_light(controller, view)
-        target = best(memory)
-        if target is None:
-            return controller.then("roam", view)
-        memory.target, memory.seen_target = target, memory.clock
-        memory.goal, memory.next_phase = target.heading, "approach"
-        left = math.degrees(wrapped(target.heading - memory.heading))
-        side = "left" if left > 0 else "right"
-        memory.note = f"{len(memory.sightings)} dark places seen, best {abs(left):.0f} degrees {side}"
-        return controller.then("aim", view)
+    robot.sight(view)
+    robot.sightings = robot.sightings[-MAX_SIGHTINGS:]
+    if abs(robot.turned) < FULL_TURN and robot.hops < MOST_HOPS:
+        degrees, seen = math.degrees(abs(robot.turned)), len(robot.sightings)
+        return robot.hop(HOP, f"looks around, {degrees:.0f} degrees, {seen} dark seen")
+    if sheltered(robot.openings):
+        robot.faces = 1
+        return to_light(robot)
+    target = best(robot)
+    if target is None:
+        return "roam"
+    robot.target, robot.seen_target = target, robot.clock
+    robot.goal, robot.next_phase = target.heading, "approach"
+    left = math.degrees(wrapped(target.heading - robot.heading))
+    side = "left" if left > 0 else "right"
+    robot.note = f"{len(robot.sightings)} dark places seen, best {abs(left):.0f} degrees {side}"
+    return "aim"
 
 
 def worth(sighting: Sighting, memory: HidingState) -> float:
     """How promising a dark place is; 0: not at all. Wide, low, dark and near is best."""
     if sighting.darkness > 0.5 or sighting.width < 0.2:
         return 0.0
-    for spot in memory.bad:
-        if math.hypot(spot.x - sighting.x, spot.y - sighting.y) < BAD_NEAR + 0.15 * sighting.distance:
-            return 0.0
+    if any(distance(spot, sighting) < BAD_NEAR + 0.15 * sighting.distance for spot in memory.bad):
+        return 0.0
     wide = min(sighting.width, 0.8) / 0.8
     dark = min(1.0, 0.12 / max(sighting.darkness, 0.02))
     low = 1.0 if 0.07 <= sighting.height <= 0.24 else 0.5
@@ -85,72 +79,121 @@ def best(memory: HidingState) -> Sighting | None:
     """The most promising sighting of the scan; one seen in several pictures counts more."""
     chosen, most = None, 0.04 / (1 + memory.scans)
     for sighting in memory.sightings:
-        again = sum(
-            math.hypot(other.x - sighting.x, other.y - sighting.y) < 0.3 + 0.15 * sighting.distance
-            for other in memory.sightings
-        )
+        near = 0.3 + 0.15 * sighting.distance
+        again = sum(distance(other, sighting) < near for other in memory.sightings)
         value = worth(sighting, memory) * (1.3 if again > 1 else 1.0)
         if value > most:
             chosen, most = sighting, value
     return chosen
 
 
-class Aim(HidingPhase):
+def aim(robot: HidingController, _: View) -> Step:
     """Turns to `goal` in measured hops, then goes on to `next_phase`."""
-
-    def begin(self, controller: HidingController) -> None:
-        controller.memory.hops = 0
-
-    def step(self, controller: HidingController, view: View) -> WheelCommand:
-        memory = controller.memory
-        off = wrapped(memory.goal - memory.heading)
-        if abs(off) > AIMED and memory.hops < 10:
-            return controller.hop(off, memory.note)
-        return controller.then(memory.next_phase, view)
+    off = wrapped(robot.goal - robot.heading)
+    if abs(off) > AIMED and robot.hops < 10:
+        return robot.hop(off, robot.note)
+    return robot.next_phase
 
 
-class Roam(HidingPhase):
+def begin_roam(robot: HidingController) -> None:
+    if robot.next_phase == "roam":
+        robot.next_phase = "scan"
+        return
+    side = most_open(robot)
+    robot.goal, robot.next_phase = side.heading, "roam"
+    robot.left_to_go = max(0.5, min(LEG, 1.2 * side.open_for))
+    robot.note = f"no dark place in view, drives {robot.left_to_go:.1f} m to where it is open"
+
+
+def roam(robot: HidingController, _: View) -> Step:
     """No dark place in view: drives to the most open side. Where that is blocked, to the next."""
-
-    def begin(self, controller: HidingController) -> None:
-        memory = controller.memory
-        memory.hops = 0
-        if memory.next_phase == "roam":
-            memory.next_phase = "scan"
-            return
-        side = most_open(controller)
-        memory.goal, memory.next_phase = side.heading, "roam"
-        memory.left_to_go = max(0.5, min(LEG, 1.2 * side.open_for))
-        memory.note = f"no dark place in view, drives {memory.left_to_go:.1f} m to where it is open"
-
-    def step(self, controller: HidingController, view: View) -> WheelCommand:
-        memory = controller.memory
-        if memory.next_phase == "roam":
-            return controller.then("aim", view)
-        if controller.pace * controller.here_for >= memory.left_to_go:
-            return controller.then("scan", view)
-        return controller.cruise(controller.pace, 0.0, memory.note)
-
-    def stuck(self, controller: HidingController, view: View) -> WheelCommand:
-        memory = controller.memory
-        memory.blocked = [*memory.blocked, memory.heading]
-        memory.note = "bumped on the way to where it is open"
-        return controller.then("back", view)
+    if robot.next_phase == "roam":
+        return "aim"
+    if robot.cruised(robot.left_to_go):
+        return "scan"
+    return robot.cruise(robot.pace, 0.0, robot.note)
 
 
-def most_open(controller: HidingController) -> Opening:
+def roam_stuck(robot: HidingController, _: View) -> Step:
+    robot.blocked = [*robot.blocked, robot.heading]
+    robot.note = "bumped on the way to where it is open"
+    return "back"
+
+
+def most_open(robot: HidingController) -> Opening:
     """One of the scan's sides, none near one that was blocked, by a little luck."""
-    memory = controller.memory
-    best, most = Opening(memory.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -99.0
-    for one in memory.openings:
-        value = min(one.open_for, 2.5) + 0.6 * controller.roll()
-        near = [abs(wrapped(one.heading - other)) < math.radians(50) for other in memory.blocked]
-        for spot in memory.bad:
-            to = math.atan2(spot.y - memory.y, spot.x - memory.x)
+    best, most = Opening(robot.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -99.0
+    for one in robot.openings:
+        value = min(one.open_for, 2.5) + 0.6 * robot.roll()
+        near = [abs(wrapped(one.heading - other)) < math.radians(50) for other in robot.blocked]
+        for spot in robot.bad:
+            to = math.atan2(spot.y - robot.y, spot.x - robot.x)
             if abs(wrapped(to - one.heading)) < 0.6:
                 value -= 0.5
-        x, y = memory.x + 0.9 * math.cos(one.heading), memory.y + 0.9 * math.sin(one.heading)
-        value -= 0.7 * sum(math.hypot(x - spot.x, y - spot.y) < 0.7 for spot in memory.visited[:-1])
+        ahead = Spot(*robot.point(one.heading, 0.9))
+        value -= 0.7 * sum(distance(ahead, spot) < 0.7 for spot in robot.visited[:-1])
         if value > most and not any(near):
             best, most = one, value
     return best
+
+
+# Out of a bump, and out of a place that is no good
+
+
+def stuck(robot: HidingController, _: View) -> Step:
+    """It drove, and nothing moved."""
+    robot.note, robot.at_edge = "bumped", False
+    return "back"
+
+
+def begin_back(robot: HidingController) -> None:
+    robot.bumps += 1
+
+
+def back(robot: HidingController, _: View) -> Step:
+    """Backs off from what it pushed against, then turns aside."""
+    if robot.hops == 0:
+        return robot.step_straight(-0.14, f"{robot.note or 'bumped'}: backs off")
+    if robot.target is None and robot.blocked and len(robot.blocked) <= MOST_BLOCKED:
+        robot.next_phase = "scan"
+        return "roam"
+    return "dodge"
+
+
+def dodge(robot: HidingController, view: View) -> Step:
+    """Turns aside and looks around anew."""
+    target = robot.target
+    if robot.hops == 0:
+        robot.goal = side_of(robot, view) * math.radians(40 + 20 * robot.roll())
+        return robot.hop(robot.goal, "turns aside")
+    if robot.hops == 1:
+        return robot.step_straight(0.18 + 0.1 * robot.tries, "goes around")
+    if target is not None and robot.tries < 3:
+        robot.tries += 1
+        robot.goal = math.atan2(target.y - robot.y, target.x - robot.x)
+        robot.next_phase = "approach"
+        robot.note = "turns back to the dark place"
+        return "aim"
+    if target is not None:
+        # There is no way from here.
+        robot.note_bad(target.x, target.y)
+    return "scan"
+
+
+def side_of(robot: HidingController, view: View) -> int:
+    """1 left, -1 right: at the edge of the dark where it goes on, else by turns."""
+    left, right = view.sides
+    if robot.at_edge and max(left, right) > 1.5 * min(left, right):
+        return 1 if left < right else -1
+    return 1 if robot.bumps % 2 else -1
+
+
+def begin_leave(robot: HidingController) -> None:
+    robot.left_to_go = 0.6
+
+
+def leave(robot: HidingController, _: View) -> Step:
+    """Out of a place that is no hiding place, towards the light."""
+    if robot.cruised(robot.left_to_go):
+        return "scan"
+    return robot.cruise(robot.pace, 0.0, f"{robot.note}: leaves")

@@ -1,4 +1,4 @@
-"""All that a hider remembers, in one structure: a checkpoint is this, as MessagePack.
+"""All that a hider remembers, in one structure: a checkpoint is this, as MessagePack. And what it commands.
 
 Times are seconds of the hider's own clock, which begins at 0 and counts only what passed between pictures:
 after a move to another host, whose clock reads otherwise, it goes on. Places are dead-reckoned from where
@@ -8,6 +8,7 @@ the hider began: metres, x along its first heading.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import msgspec
@@ -22,6 +23,26 @@ FORM: Final = 1
 Phase = Literal[
     "scan", "aim", "roam", "approach", "enter", "face", "settle", "back", "dodge", "leave", "hidden", "check"
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class WheelCommand:
+    """What the wheels are to do now, and why."""
+
+    left: float
+    right: float
+    """Shares of top speed, -1 to 1."""
+    lasts: float
+    """Seconds that the wheels may turn without a newer command; 0 with wheels that stand."""
+    doing: str
+    """One word, the hider's state: search, approach, unstick, enter, turn or hidden."""
+    why: str
+    """A few words for an operator."""
+    hidden: bool = False
+
+    @property
+    def moves(self) -> bool:
+        return self.left != 0 or self.right != 0
 
 
 class Sighting(msgspec.Struct, frozen=True):
@@ -116,7 +137,7 @@ class HidingState(msgspec.Struct):
     halted: int = 0
     """Pictures in a row that showed the same floor in spite of driving."""
     print: int = 0
-    """CRC of the last picture: the same again is a frozen one."""
+    """CRC of the last picture: the same again is a frozen picture."""
     spoiled_since: float | None = None
     spoiled_how: str = ""
     last_good: float = 0.0
@@ -153,6 +174,11 @@ class HidingState(msgspec.Struct):
     """Why this phase."""
     why: str = ""
     """As last reported."""
+
+
+def distance(one: Spot | Sighting | HidingState, other: Spot | Sighting | HidingState) -> float:
+    """Metres from one to the other."""
+    return math.hypot(one.x - other.x, one.y - other.y)
 
 
 def wrapped(angle: float) -> float:

@@ -1,0 +1,232 @@
+"""Driving to a dark place under sight, and in; there turning to the light, checking that it is a hiding place
+at all, and keeping still."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from zscout.behaviors.perception.darkness import DarkPlace, View
+from zscout.behaviors.perception.hiding.controller import FULL_TURN, HOP, HidingController, Step
+from zscout.behaviors.perception.hiding.state import Opening, distance, wrapped
+from zscout.behaviors.perception.lens import COLUMNS
+
+AT_EDGE: Final = 0.17
+"""Metres to the dark, from where on the way in is driven blind."""
+DEEP: Final = 0.30
+"""Metres to go beyond the edge of the dark."""
+OUTSIDE: Final = 3.0
+"""How many times brighter than the median of the picture the floor ahead is, outside."""
+DARK_AHEAD: Final = 0.3
+"""Share of the lit floor's light, below which a place that was lost must lie ahead."""
+TO_MIDDLE: Final = 0.15
+LOST: Final = 1.6
+"""Seconds without sight of the place."""
+LONGEST: Final = 25
+"""Seconds of an approach."""
+MOST_HOPS: Final = 22
+DARK: Final = 0.12
+"""Share of the lit floor's light that the floor here may have. The promise is a quarter of the room's
+median, and the floor that is seen may be twice as bright as that."""
+DARK_ENOUGH: Final = 0.19
+"""The same where it gets no darker further in."""
+DARKISH: Final = 0.4
+"""Share up to which it may be darker further in."""
+ROOFED: Final = 0.28
+"""Share up to which what is above counts as dark: 0.03 to 0.2 beneath furniture, 0.45 and more on a dark
+rug."""
+DEEPER: Final = 0.18
+"""Metres to back further in at once."""
+NEARER: Final = 0.1
+MOST_FACES: Final = 3
+"""Full turns in one place, each further in."""
+AS_LIGHT: Final = 0.6
+"""Share of the lightest side's light that is taken for the same side."""
+CHECKED: Final = 5
+"""Pictures by which it is judged whether it is still hidden."""
+STILL_DARK: Final = 0.3
+STILL_SEES: Final = 0.15
+SEES_OUT: Final = 0.45
+"""Share of columns that must show lit floor."""
+
+
+def begin_approach(robot: HidingController) -> None:
+    robot.seen_target = robot.clock
+
+
+def approach(robot: HidingController, view: View) -> Step:
+    """Keeps the place ahead and drives; re-centred at every picture."""
+    target = robot.target
+    if target is None:
+        return "scan"
+    rough = distance(target, robot)
+    expected = wrapped(target.heading - robot.heading)
+    place = match(view, expected, rough)
+    if place is None:
+        in_half_light = target.distance < 1 and view.ahead < DARK_AHEAD * view.lit
+        if rough < 0.3 or target.distance < 0.45 or in_half_light:
+            # So near that the place fills the picture, or its edge is below it, or in its own half-light.
+            return "enter"
+        if robot.clock - robot.seen_target > LOST:
+            robot.note = "lost sight of the dark place"
+            return "scan"
+        return robot.cruise(0.4 * robot.pace, expected, "looks for the dark place it came for")
+    turn = aim_at(place, expected)
+    heading = robot.heading + turn
+    x, y = robot.point(heading, place.distance)
+    robot.seen_target = robot.clock
+    robot.target = msgspec.structs.replace(target, heading=heading, distance=place.distance, x=x, y=y)
+    if place.distance <= AT_EDGE:
+        return "enter"
+    if robot.here_for > LONGEST:
+        robot.note_bad(*robot.point(robot.heading, place.distance))
+        robot.note = "does not get there"
+        return "back"
+    why = f"dark place {place.distance:.1f} m ahead, {place.width:.1f} m wide"
+    slow = 0.5 if abs(turn) > 0.35 else 1.0
+    return robot.cruise(robot.pace * slow, max(-1.2, min(1.2, 1.6 * turn)), why)
+
+
+def match(view: View, expected: float, distance: float) -> DarkPlace | None:
+    """The place of this picture that is most like the one expected there."""
+    found, least = None, 1.0
+    for place in view.places:
+        # Radians from the bearing to the nearest part of the place.
+        near = max(0.0, abs(place.bearing - expected) - math.atan2(place.width / 2, place.distance))
+        off = near / 0.25 + 0.6 * abs(math.log(place.distance / max(distance, 0.08)))
+        if off < least:
+            found, least = place, off
+    return found
+
+
+def aim_at(place: DarkPlace, expected: float) -> float:
+    """The part of the place nearest to where it was headed for, well away from its ends: feet stand there."""
+    margin = min(0.45 * place.width, 0.28)
+    # Where the picture cuts it off, it goes on.
+    left = place.width / 2 - (margin if place.left > 1 else 0.05)
+    right = place.width / 2 - (margin if place.right < COLUMNS - 2 else 0.05)
+    most = place.bearing + math.atan2(left, place.distance)
+    least = place.bearing - math.atan2(right, place.distance)
+    kept = max(least, min(most, expected))
+    # A little towards the middle each time, or a wheel that slips more leads to the end in the end.
+    return kept + TO_MIDDLE * (place.bearing - kept)
+
+
+def begin_enter(robot: HidingController) -> None:
+    ahead = robot.target.distance if robot.target is not None else AT_EDGE
+    robot.left_to_go, robot.faces = min(ahead, 0.8) + DEEP, 0
+
+
+def enter(robot: HidingController, view: View) -> Step:
+    """Straight on into the dark: a few lengths of the body from where the floor ahead is dark."""
+    if robot.cruised(robot.left_to_go):
+        return enter_stuck(robot, view)
+    return robot.cruise(robot.pace, 0.0, "drives in")
+
+
+def enter_stuck(robot: HidingController, view: View) -> Step:
+    if view.near > OUTSIDE * view.middling:
+        # The floor just ahead is lit and all the rest dark: it is in front of the dark, not in it.
+        robot.note, robot.at_edge = "bumped at the edge of the dark", True
+        return "back"
+    return "face"
+
+
+def begin_face(robot: HidingController) -> None:
+    robot.turned, robot.opened = 0.0, 1.0
+    robot.openings = []
+    robot.faces += 1
+
+
+def face(robot: HidingController, view: View) -> Step:
+    """A full turn in the dark; then to the side that shows most lit floor."""
+    robot.sight(view)
+    if abs(robot.turned) < FULL_TURN and robot.hops < MOST_HOPS:
+        return robot.hop(HOP, "in the dark, looks for the light")
+    return to_light(robot)
+
+
+def to_light(robot: HidingController) -> Step:
+    """Turns to the lightest side of the full turn just made."""
+    robot.goal, robot.next_phase = lightest(robot.openings).heading, "settle"
+    robot.note = "turns to the light"
+    return "aim"
+
+
+def shelter(openings: list[Opening]) -> tuple[float, bool]:
+    """By the full turn: the floor all around over the lit floor; and whether what is above is dark on most
+    sides, as beneath a sofa. Most sides count: at the edge some are lit."""
+    lit = max(one.outside for one in openings)
+    near, above = np.percentile([(one.near, one.above) for one in openings], 75, axis=0).tolist()
+    return near / max(lit, 1e-4), above <= ROOFED * lit
+
+
+def sheltered(openings: list[Opening]) -> bool:
+    """Whether this is beneath something, if maybe not deep enough in."""
+    share, roof = shelter(openings)
+    return share <= DARKISH and roof
+
+
+def lightest(openings: list[Opening]) -> Opening:
+    """The direction that shows most lit floor; what its neighbours show counts as well, each side once."""
+
+    def value(one: Opening) -> float:
+        beside = [max(0.0, 1 - abs(wrapped(other.heading - one.heading)) / 0.9) for other in openings]
+        return one.bright + sum(w * o.bright for w, o in zip(beside, openings, strict=True)) / sum(beside)
+
+    return max(openings, key=value)
+
+
+def begin_settle(robot: HidingController) -> None:
+    robot.shifted = False
+
+
+def settle(robot: HidingController, view: View) -> Step:
+    """Turned to the light: is it dark here, and lit there?"""
+    if robot.shifted:
+        # It came nearer to the light, or went further in: how is it here?
+        return "face"
+    here = robot.opening(view)
+    if here.bright < AS_LIGHT * lightest(robot.openings).bright and robot.hops < MOST_HOPS:
+        # Commands were lost, or too little was seen to measure the turn.
+        return robot.hop(HOP, "turns on to the light")
+    share, roof = shelter(robot.openings)
+    dark = share <= DARK or (share <= DARK_ENOUGH and robot.faces > 1)
+    if roof and dark and here.sees_out >= SEES_OUT:
+        robot.note = f"hidden: {100 * share:.0f} % of the light outside"
+        return "hidden"
+    if roof and share <= DARKISH and robot.faces < MOST_FACES:
+        robot.shifted = True
+        if share <= DARK:
+            return robot.step_straight(NEARER, "sees too little: comes nearer to the light")
+        return robot.step_straight(-DEEPER, "not dark enough yet: backs further in")
+    robot.note_bad(robot.x, robot.y)
+    robot.note = "not dark enough here"
+    if share <= DARK_ENOUGH:
+        robot.note = "sees nothing lit from here" if roof else "a dark floor in the light"
+    return "leave"
+
+
+def hidden(robot: HidingController, _: View) -> Step:
+    """Keeps still."""
+    return robot.stand(robot.note)
+
+
+def begin_check(robot: HidingController) -> None:
+    robot.openings = []
+
+
+def check(robot: HidingController, view: View) -> Step:
+    """Back after a loss of the hold: is it still hidden? By what it sees as it stands, and not as strictly as
+    when it hid: nothing moves unless the place is another one."""
+    robot.openings = [*robot.openings, robot.opening(view)]
+    if len(robot.openings) < CHECKED:
+        return robot.stand("back: is it still hidden?")
+    ratio = np.median([one.near / max(one.outside, 1e-4) for one in robot.openings])
+    if ratio <= STILL_DARK and np.median([one.sees_out for one in robot.openings]) >= STILL_SEES:
+        return "hidden"
+    robot.note = "no longer hidden"
+    return "scan"
