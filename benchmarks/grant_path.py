@@ -23,7 +23,7 @@ RC = "robot/x"
 IDLE = 3.0
 """Seconds of which what runs in them counts as no part of a grant."""
 MS = 1_000_000
-ASKING = ("zscout.behaviors.client.request_sender", "RequestSender.ask")
+ASKING = ("zscout.behaviors.client.rcm_link", "RcmLink.ask")
 """Where the request leaves the client."""
 
 

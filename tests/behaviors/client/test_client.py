@@ -306,7 +306,7 @@ def test_a_client_whose_own_work_fails_ends_its_holds_and_leaves() -> None:
 
             async def work() -> None:
                 async with hold(one, "first", {RC: {}}, min_runtime=600):
-                    one._sender.ask = broken  # type: ignore[method-assign, assignment]
+                    one._rcm.ask = broken  # type: ignore[method-assign, assignment]
                     await asyncio.sleep(3600)
 
             with pytest.raises(Revoked, match="this client failed: RuntimeError"):

@@ -11,7 +11,7 @@ from decimal import Decimal
 from typing import Any, Generic, Self, TypeVar
 
 from zscout.behaviors.client.handover import Handover
-from zscout.behaviors.client.leader_tracker import LeaderTracker
+from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN, RcmLink
 from zscout.behaviors.client.request import (
     CommandRefused,
     Needs,
@@ -19,13 +19,6 @@ from zscout.behaviors.client.request import (
     RequestRefused,
     RequestStore,
     amounts,
-)
-from zscout.behaviors.client.request_sender import (
-    BACKOFF,
-    QUERY_TIMEOUT,
-    TRY_AGAIN,
-    RequestSender,
-    answered,
 )
 from zscout.config.fleet import Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
@@ -65,9 +58,8 @@ class Client:
         self.mesh, self.fleet = mesh, fleet
         self._supervisor = Supervisor(f"client {mesh.me}", self._failed)
         self._store = RequestStore(mesh.now)
-        self._tracker = LeaderTracker(mesh, fleet, self._store)
-        self._sender = RequestSender(mesh, self._store, self._tracker)
-        self._handover = Handover(mesh, self._store, self._tracker, self._sender, self._supervisor)
+        self._rcm = RcmLink(mesh, fleet, self._store)
+        self._handover = Handover(mesh, self._store, self._rcm, self._supervisor)
         self._may_end = asyncio.Event()
         """Set unless the client is paused, and once it has left."""
         self._may_end.set()
@@ -102,11 +94,11 @@ class Client:
         keys, mesh = self.mesh.keys, self.mesh
         self._declared = [
             mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice),
-            *self._tracker.start(),
+            *self._rcm.start(),
             mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance())),
         ]
-        self._supervisor.spawn(self._sender.keep_asking())
-        self._supervisor.spawn(self._tracker.watch_lease())
+        self._supervisor.spawn(self._rcm.keep_asking())
+        self._supervisor.spawn(self._rcm.watch_lease())
         return self
 
     async def close(self) -> None:
@@ -135,7 +127,7 @@ class Client:
         finally:
             for declared in reversed(self._declared):
                 declared.close()
-            self._tracker.stop()
+            self._rcm.stop()
             await self.mesh.close()
 
     def _failed(self, error: Exception) -> None:
@@ -148,12 +140,12 @@ class Client:
     @property
     def term(self) -> Term:
         """The highest term received or promised; what is of an older one is ignored."""
-        return self._tracker.term
+        return self._rcm.term
 
     @property
     def leader(self) -> str | None:
         """The host whose node leads, or None where no RCM is seen."""
-        return self._tracker.leader
+        return self._rcm.leader
 
     # Requests
 
@@ -190,12 +182,12 @@ class Client:
         )
         self._store.add(arc)
         try:
-            await self._sender.submit(arc)
+            await self._rcm.submit(arc)
         except BaseException as error:
             self._store.forget(arc)
             if not isinstance(error, RequestRefused):
                 # The RCM may have it.
-                self._supervisor.spawn(self._sender.give_back(Cancel(id=arc.id)))
+                self._supervisor.spawn(self._rcm.give_back(Cancel(id=arc.id)))
             raise
         return arc
 
@@ -253,7 +245,7 @@ class Client:
         if arc.state == "moved":
             self._store.forget(arc)
             return
-        await self._sender.end(arc)
+        await self._rcm.end(arc)
 
     def complete(self, arc: OpenArc) -> None:
         """An ARC has had its time by this host's clock; RCs and RCM end it by theirs."""
@@ -264,7 +256,7 @@ class Client:
     async def hand_over(self, arc: OpenArc, to: Sender) -> None:
         """Lets one ARC, queued or running, go on in another client. Raises RequestRefused."""
         operation = HandOver(id=arc.id, to=str(to))
-        reply = await self.mesh.ask_one(self._sender.key, operation, Notice, timeout=QUERY_TIMEOUT)
+        reply = await self._rcm.query(operation)
         if reply is None or reply.message is None:
             unknown = Problem("unknown", "the RCM did not answer; ask how the ARC stands")
             raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
@@ -336,11 +328,8 @@ class Client:
         """The RCM's state, with the history of `arc` if one is named, and with a `forecast` of when those who
         wait will start; None if no RCM answered."""
         asked = StateAsk(arc=arc, forecast=forecast)
-        replies = await self.mesh.ask(
-            self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout, enough=answered
-        )
-        states = [reply.message for reply in replies if reply.message is not None]
-        return max(states, key=lambda state: state.term, default=None)
+        reply = await self.mesh.ask_one(self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout)
+        return reply.message if reply is not None else None
 
     async def foresee(
         self, name: str, needs: Needs, *, priority: int, min_runtime: Decimal, keep: bool = False
@@ -354,7 +343,7 @@ class Client:
             min_runtime=min_runtime,
             keep=keep,
         )
-        reply = await self.mesh.ask_one(self._sender.key, asked, Foresight, timeout=QUERY_TIMEOUT)
+        reply = await self.mesh.ask_one(self._rcm.key, asked, Foresight, timeout=QUERY_TIMEOUT)
         if reply is not None and reply.problem is not None:
             raise RequestRefused(reply.problem)
         return reply.message if reply is not None else None
@@ -373,14 +362,14 @@ class Client:
         return reply.message
 
     def _on_notice(self, _key: str, notice: Notice) -> None:
-        if not self._tracker.accept(notice.term):
+        if not self._rcm.accept(notice.term):
             return
         arc = self._store.arcs.get(notice.id)
         if arc is not None:
             self._store.take(arc, notice)
         elif not self._handover.take(notice) and notice.state == "running":
             # A grant that nobody here asked for, or gave up meanwhile, is given back.
-            self._supervisor.spawn(self._sender.give_back(Release(id=notice.id)))
+            self._supervisor.spawn(self._rcm.give_back(Release(id=notice.id)))
 
 
 C = TypeVar("C", bound=Client)

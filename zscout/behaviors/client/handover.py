@@ -10,15 +10,8 @@ import asyncio
 import logging
 from collections.abc import Sequence
 
-from zscout.behaviors.client.leader_tracker import LeaderTracker
+from zscout.behaviors.client.rcm_link import BACKOFF, TRY_AGAIN, RcmLink
 from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStore
-from zscout.behaviors.client.request_sender import (
-    BACKOFF,
-    QUERY_TIMEOUT,
-    TRY_AGAIN,
-    RequestSender,
-    answered,
-)
 from zscout.keyexpr import Sender
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
@@ -41,16 +34,8 @@ CLAIM = 10.0
 class Handover:
     """What one client hands over, and what it expects to be handed over to it."""
 
-    def __init__(
-        self,
-        mesh: Mesh,
-        store: RequestStore,
-        tracker: LeaderTracker,
-        sender: RequestSender,
-        supervisor: Supervisor,
-    ) -> None:
-        self.mesh, self.store, self.tracker, self.sender = mesh, store, tracker, sender
-        self._supervisor = supervisor
+    def __init__(self, mesh: Mesh, store: RequestStore, rcm: RcmLink, supervisor: Supervisor) -> None:
+        self.mesh, self.store, self.rcm, self._supervisor = mesh, store, rcm, supervisor
         self.came = asyncio.Event()
         self._unclaimed: dict[str, OpenArc] = {}
         """What is expected, come or not, and was not asked for yet."""
@@ -124,7 +109,7 @@ class Handover:
             del self._unclaimed[arc.id]
             if arc.open:
                 log.warning("%s was handed over and nobody asked for it: it is given back", arc.name)
-                await self.sender.end(arc)
+                await self.rcm.end(arc)
 
     # The old client
 
@@ -142,8 +127,8 @@ class Handover:
         """What stands is asked once; what was lost or taken back until there is an answer."""
         try:
             if arc.state != "asking":
-                await self.sender.ask(arc)
-            await self.sender.submit(arc)
+                await self.rcm.ask(arc)
+            await self.rcm.submit(arc)
         except RequestRefused as refused:
             log.warning("%s is not taken back: %s", arc.name, refused)
             self.store.notify(arc)
@@ -169,33 +154,30 @@ class Handover:
 
     async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:
         """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
-        term = self.tracker.term
+        term = self.rcm.term
         pause, longest = BACKOFF
         known_by = self.mesh.now() + round(JUST_COME * SECOND)
         while arcs := [arc for arc in arcs if arc.open]:
             first, *others = arcs
             operation = HandOver(id=first.id, to=str(to), others=[arc.id for arc in others])
-            self.tracker.leader_came.clear()
-            replies = await self.mesh.ask(
-                self.sender.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=answered
-            )
-            notices = [reply.message for reply in replies if reply.message is not None]
-            notice = next((notice for notice in notices if self.tracker.accept(notice.term)), None)
-            if notice is not None:
+            self.rcm.leader_came.clear()
+            reply = await self.rcm.query(operation)
+            notice = reply.message if reply is not None else None
+            if notice is not None and self.rcm.accept(notice.term):
                 # An RCM that came in between answers for the first alone: it may not know of the others.
                 for arc in arcs if notice.term == term else [first]:
                     self.store.move(arc, notice)
                 continue
-            problem = next((reply.problem for reply in replies if reply.problem is not None), None)
+            problem = reply.problem if reply is not None else None
             if problem is not None and problem.code == "not_running":
                 # It is over, or an RCM that has just taken the lead has not heard of it: this settles which.
-                await self.sender.ask(first)
+                await self.rcm.ask(first)
             elif problem is not None and problem.code == "unknown_client" and self.mesh.now() < known_by:
                 # It sees the RCM; the RCM may not have seen its token yet.
                 pause = BACKOFF[0]
             elif problem is not None and problem.code not in TRY_AGAIN:
                 raise RequestRefused(problem)
-            if not await self.tracker.leader_within(pause):
+            if not await self.rcm.leader_within(pause):
                 pause = min(longest, pause * 2)
 
     def take_back(self) -> None:

@@ -8,8 +8,8 @@ from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Final, Self, TypeVar
 
+from zscout.behaviors.client.rcm_link import TRY_AGAIN
 from zscout.behaviors.client.request import RequestRefused
-from zscout.behaviors.client.request_sender import TRY_AGAIN
 from zscout.mesh import Mesh
 from zscout.messages import (
     ComponentSpec,

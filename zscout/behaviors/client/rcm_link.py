@@ -1,0 +1,194 @@
+"""A client's link to the RCM: who leads, in which term, and the client's requests on their way there.
+
+A request is sent until an RCM answers, and again every few seconds; without any publication of an RCM for the
+hold lease, holds end here as they do at their RCs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from typing import NoReturn
+
+import msgspec
+
+from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStore
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import Role, Token
+from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
+from zscout.mesh.stall import StallWatch
+from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd
+from zscout.types import NO_TERM, SECOND, Ns, Term
+
+QUERY_TIMEOUT = 1.0
+ASK_AGAIN = 5.0
+"""Seconds between two askings of an open request, give or take a fifth."""
+BACKOFF = (0.05, 1.0)
+"""Seconds before a question that nobody answered is repeated: first, and at most."""
+END_TRIES = 3
+TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full"})
+LOOKS = 10
+"""How often within a hold lease a client checks whether an RCM published."""
+
+
+class _TermOnly(msgspec.Struct, frozen=True):
+    """What a client reads of the RCM's publications."""
+
+    term: Term
+
+
+class RcmLink:
+    """Follows the RCM for one client, answers it when it takes the lead, and sends it what is requested
+    and withdrawn."""
+
+    def __init__(self, mesh: Mesh, fleet: Fleet, store: RequestStore) -> None:
+        self.mesh, self.fleet, self.store = mesh, fleet, store
+        self.key = mesh.keys.schedule(mesh.me)
+        self.term: Term = NO_TERM
+        """The highest term received or promised; what is of an older one is ignored."""
+        self.leader_came = asyncio.Event()
+        self._leaders: set[Token] = set()
+        self._last_contact: Ns = mesh.now()
+        self._stall = StallWatch(mesh.now)
+
+    def start(self) -> list[Declaration]:
+        self._stall.start()
+        keys, mesh = self.mesh.keys, self.mesh
+        self._published = mesh.overhear(keys.grants, _TermOnly)
+        return [
+            mesh.serve(keys.requests(mesh.me), RcAsk, self._on_requests),
+            self._published,
+            mesh.watch(keys.alive_any(Role.RCM), self._on_leader),
+        ]
+
+    def stop(self) -> None:
+        self._stall.stop()
+
+    # Who leads
+
+    @property
+    def leader(self) -> str | None:
+        """The host whose node leads, or None where no RCM is seen."""
+        return next((token.host for token in sorted(self._leaders)), None)
+
+    def accept(self, term: Term) -> bool:
+        """Whether what is of `term` counts; the highest term is kept."""
+        if term < self.term or absurd(term, self.term):
+            return False
+        self.term = term
+        return True
+
+    async def leader_within(self, seconds: float) -> bool:
+        """Waits so long for a leader to appear since `leader_came` was cleared. False: none did."""
+        try:
+            async with asyncio.timeout(seconds):
+                return await self.leader_came.wait()
+        except TimeoutError:
+            return False
+
+    def _on_requests(self, request: IncomingQuery[RcAsk]) -> None:
+        promise = request.message.promise
+        if promise is not None and not self.accept(promise):
+            raise Refused("old_term", f"this client obeys term {self.term.counter}", self.term)
+        request.answer(ClientRequests(client=str(self.mesh.me), requests=self.store.open_requests()))
+
+    def _on_leader(self, token: Token, alive: bool) -> None:
+        if alive:
+            self._leaders.add(token)
+            self.leader_came.set()
+        else:
+            self._leaders.discard(token)
+
+    async def watch_lease(self) -> NoReturn:
+        """Ends holds when no RCM published for the hold lease: their RCs have ended them as well."""
+        lease = self.fleet.timing.hold_lease
+        while True:
+            await asyncio.sleep(lease / SECOND / LOOKS)
+            now = self.mesh.now()
+            # As at the RCs: an RCM that was replaced, or whose term is absurd, keeps no hold alive.
+            terms = [one.term for one in self._published.take()]
+            if any(term >= self.term and not absurd(term, self.term) for term in terms):
+                # It may have published right after the last check.
+                self._last_contact = now - lease // LOOKS
+            if now - self._last_contact < lease or self._stall.fresh():
+                continue
+            for arc in self.store.open:
+                if arc.state == "running":
+                    arc.lose("no RCM was heard for the hold lease", now)
+                    self.store.notify(arc)
+
+    # Requests
+
+    async def query(self, operation: Operation) -> Reply[Notice] | None:
+        """An RCM's answer to an operation; None: none came, and it was carried out or not."""
+        return await self.mesh.ask_one(self.key, operation, Notice, timeout=QUERY_TIMEOUT)
+
+    async def submit(self, arc: OpenArc) -> None:
+        """Asks until the RCM has answered; not while the client is paused. Raises RequestRefused."""
+        pause, longest = BACKOFF
+        while arc.state == "asking":
+            await self.store.resumed.wait()
+            self.leader_came.clear()
+            problem = await self.ask(arc)
+            if arc.state != "asking":
+                return
+            if problem is not None and problem.code not in TRY_AGAIN:
+                arc.state, arc.reason = "refused", problem.message
+                raise RequestRefused(problem)
+            if problem is not None:
+                arc.reason = problem.message
+            elif self.leader is None:
+                arc.reason = "no RCM is on the mesh; start zscout-node"
+            self.store.notify(arc)
+            if not await self.leader_within(pause * random.uniform(0.8, 1.2)):  # noqa: S311
+                pause = min(longest, pause * 2)
+
+    async def ask(self, arc: OpenArc) -> Problem | None:
+        """Asks once, and applies the answer. Returns why it was refused, if it was."""
+        reply = await self.query(arc.ask(self.mesh.now()))
+        if reply is None:
+            return None
+        if reply.message is not None and self.accept(reply.message.term):
+            self.store.take(arc, reply.message)
+        return reply.problem
+
+    async def keep_asking(self) -> NoReturn:
+        """Asks for all that is open again, and withdraws what was given up, at every change of RCM and every
+        few seconds."""
+        while True:
+            self.leader_came.clear()
+            await self.leader_within(ASK_AGAIN * random.uniform(0.8, 1.2))  # noqa: S311
+            for arc in self.store.open:
+                if arc.open and self.store.resumed.is_set():
+                    await self.ask(arc)
+            for request_id in list(self.store.withdrawn):
+                if not await self._withdraw(request_id):
+                    break
+
+    async def end(self, arc: OpenArc) -> None:
+        """Gives back a hold, or leaves the queue: returns when that was answered, or was tried a few times.
+        `keep_asking` goes on with it then."""
+        running = arc.state == "running"
+        self.store.withdrawn[arc.id] = Release(id=arc.id) if running else Cancel(id=arc.id)
+        arc.finish("released" if running else "cancelled", "given up by this client", self.mesh.now())
+        self.store.notify(arc)
+        for _ in range(END_TRIES):
+            if await self._withdraw(arc.id) or self.leader is None:
+                break
+        self.store.forget(arc)
+
+    async def give_back(self, operation: Release | Cancel) -> None:
+        """Withdraws what nobody here asks for any more."""
+        self.store.withdrawn[operation.id] = operation
+        await self._withdraw(operation.id)
+
+    async def _withdraw(self, request_id: str) -> bool:
+        """Sends once what is to be withdrawn; whether that was answered."""
+        operation = self.store.withdrawn.get(request_id)
+        if operation is None:
+            return True
+        reply = await self.query(operation)
+        if reply is None or (reply.problem is not None and reply.problem.code in TRY_AGAIN):
+            return False
+        self.store.withdrawn.pop(request_id, None)
+        return True
