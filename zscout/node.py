@@ -79,7 +79,7 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
             log.info("runs %s (%s)", spec.name, type(spec).__struct_config__.tag)
         components = ComponentHost(mesh, node.fleet, node.components, fail)
         if node.load:
-            reporter = LoadReporter(mesh, node.labels, components, tree=node.load == "tree")
+            reporter = LoadReporter(mesh, node.labels, components.running, tree=node.load == "tree")
             reporter.start()
             stack.push_async_callback(reporter.stop)
         if node.recorder is not None:

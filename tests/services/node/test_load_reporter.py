@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
@@ -36,16 +36,6 @@ print(child.pid, flush=True)
 child.wait()
 """
 PAIR = PARENT.replace("child.wait()", SPIN)
-
-
-@dataclass
-class Listed:
-    """A registry of what it was told."""
-
-    components: list[RunningComponent] = field(default_factory=list)
-
-    def running(self) -> list[RunningComponent]:
-        return self.components
 
 
 @dataclass
@@ -80,8 +70,8 @@ class Proc:
         (task / "schedstat").write_text(text)
 
     def meter(self, *pids: int) -> UseMeter:
-        registry = Listed([RunningComponent(f"c{pid}", "camera", 1, pid) for pid in pids])
-        return UseMeter(registry, proc=self.folder, now=lambda: self.at)
+        listed = [RunningComponent(f"c{pid}", "camera", 1, pid) for pid in pids]
+        return UseMeter(lambda: listed, proc=self.folder, now=lambda: self.at)
 
 
 @pytest.fixture
@@ -220,7 +210,7 @@ def compute(pid: int, seconds: float) -> None:
 
 def test_a_real_tree_is_what_psutil_says(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PARENT)
-    meter = UseMeter(Listed([RunningComponent("one", "spinner", 3, pid)]))
+    meter = UseMeter(lambda: [RunningComponent("one", "spinner", 3, pid)])
     cores = Bounds(pid)
     with cores.look():
         meter.measure()
@@ -239,7 +229,7 @@ def test_two_that_share_a_core_have_at_most_half_of_it(
     started: list[subprocess.Popen[str]],
 ) -> None:
     pid = start(started, PAIR, core=min(os.sched_getaffinity(0)))
-    meter = UseMeter(Listed([RunningComponent("two", "spinner", 0, pid)]))
+    meter = UseMeter(lambda: [RunningComponent("two", "spinner", 0, pid)])
     compute(pid, 0.1)
     meter.measure()
     compute(pid, 0.6)
@@ -253,7 +243,7 @@ def test_the_report_of_this_host_is_all_that_the_balancer_knows(
     started: list[subprocess.Popen[str]],
 ) -> None:
     pid = start(started, PARENT)
-    gauge = Gauge("anvil", ("gpu", "arm64"), Listed([RunningComponent("anvil/one", "spinner", 2, pid)]))
+    gauge = Gauge("anvil", ("gpu", "arm64"), lambda: [RunningComponent("anvil/one", "spinner", 2, pid)])
     gauge.report()
     sent = gauge.report()
     report: LoadReport = messages.decode(messages.encode(sent), LoadReport)

@@ -22,7 +22,7 @@ from tests.services.node.test_load_reporter import (
 )
 from zscout.messages import LoadReport
 from zscout.services.node.load_reporter import Gauge, TreeLoad
-from zscout.services.node.process_use import PAGE, LoadAverage, TreeMeter
+from zscout.services.node.process_use import PAGE, TreeMeter, faded
 
 BUSY_NODE = """
 import os, subprocess, sys
@@ -115,16 +115,13 @@ def test_without_proc_there_is_one_clear_line(tmp_path: Path) -> None:
 
 
 def test_averages_fade_as_the_kernels_do() -> None:
-    load = LoadAverage()
-    assert load.averages == (0.0, 0.0, 0.0)
+    averages = 0.0, 0.0, 0.0
     for _ in range(60):
-        load.add(2.0, 1.0)
+        averages = faded(averages, 2.0, 1.0)
     # A minute on, the share 1 - 1/e is in the first; how often one looks changes nothing.
-    assert load.averages == pytest.approx((1.2642, 0.3625, 0.1290), abs=1e-4)
-    rare = LoadAverage()
-    rare.add(2.0, 60.0)
-    assert rare.averages == pytest.approx(load.averages)
-    assert load.add(0.0, 3_600.0)[0] < 1e-9
+    assert averages == pytest.approx((1.2642, 0.3625, 0.1290), abs=1e-4)
+    assert faded((0.0, 0.0, 0.0), 2.0, 60.0) == pytest.approx(averages)
+    assert faded(averages, 0.0, 3_600.0)[0] < 1e-9
 
 
 def test_a_real_tree_reports_itself_alone() -> None:

@@ -16,9 +16,9 @@ from typing import Final
 import msgspec
 
 from zscout import terminal
+from zscout.behaviors import launch
 from zscout.cli import common
 from zscout.config.strict import BadInput
-from zscout.services.node import launch
 from zscout.services.recorder.process import BAD_SETTINGS, Recording
 
 START: Final = 20.0

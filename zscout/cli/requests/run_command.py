@@ -21,9 +21,9 @@ from typing import Any, Final, Self
 
 import msgspec
 
+from zscout.behaviors import launch
 from zscout.cli.common import Failed
 from zscout.keyexpr import Sender
-from zscout.services.node import launch
 from zscout.types import Grant
 
 LAUNCHER: Final = Path(str(launch.__file__))

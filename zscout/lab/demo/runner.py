@@ -14,11 +14,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from zscout.behaviors import launch
 from zscout.config.fleet import Fleet, load_fleet
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.lab import LabError
 from zscout.mesh import Mesh, Supervisor, clock
-from zscout.services.node import launch
 from zscout.types import SECOND, Ns
 
 HOSTS: Final = ("anvil", "bellows", "crucible")

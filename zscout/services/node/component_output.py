@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import codecs
 import os
 from typing import Final
 
@@ -15,6 +16,9 @@ BURST: Final = 262_144
 CHUNK: Final = 65_536
 LAST_READS: Final = 32
 """Chunks that are read of what is left when a component has ended."""
+
+
+_UTF8: Final = codecs.getincrementaldecoder("utf-8")
 
 
 class OutputRing:
@@ -43,27 +47,15 @@ class OutputRing:
         """What there is from byte `start` on: where it begins and ends, and the text, with U+FFFD for what is
         no UTF-8. A character that is not whole yet is left for the next time."""
         first = min(max(start, self.start), self.end)
-        data = bytes(self._bytes[first - self.start :])
-        if not self.over:
-            data = data[: len(data) - _unfinished(data)]
-        return first, first + len(data), data.decode("utf-8", "replace")
+        decoder = _UTF8("replace")
+        text = decoder.decode(self._bytes[first - self.start :], final=self.over)
+        unfinished, _ = decoder.getstate()
+        return first, self.end - len(unfinished), text
 
     def tail(self) -> str:
         """The last MAX_TAIL characters."""
         _, _, text = self.read(self.end - 4 * MAX_TAIL)
         return text[-MAX_TAIL:]
-
-
-def _unfinished(data: bytes) -> int:
-    """How many bytes at the end of `data` begin a character that needs more of them."""
-    for back in range(1, min(3, len(data)) + 1):
-        byte = data[-back]
-        if byte >= 0xC0:
-            length = 2 if byte < 0xE0 else 3 if byte < 0xF0 else 4
-            return back if length > back else 0
-        if byte < 0x80:
-            break
-    return 0
 
 
 class OutputReader:
@@ -79,32 +71,29 @@ class OutputReader:
         self._loop.add_reader(fd, self._readable)
 
     def _readable(self) -> None:
-        data = self._read()
-        if data is None:
-            return
-        if not data:
-            # Nobody holds the other end any more.
-            self._loop.remove_reader(self._fd)
+        count = self._read()
+        if count is None:
             return
         now = self._loop.time()
-        self._credit = min(BURST, self._credit + (now - self._at) * RATE) - len(data)
+        self._credit = min(BURST, self._credit + (now - self._at) * RATE) - count
         self._at = now
-        if self._credit < 0:
+        if not count or self._credit < 0:
             self._loop.remove_reader(self._fd)
+        if count and self._credit < 0:
             self._again = self._loop.call_later(-self._credit / RATE, self._resume)
 
     def _resume(self) -> None:
         self._again = None
         self._loop.add_reader(self._fd, self._readable)
 
-    def _read(self) -> bytes | None:
-        """None: nothing is there now."""
+    def _read(self) -> int | None:
+        """How many bytes were read; None: nothing is there now, 0: nobody holds the other end any more."""
         try:
             data = os.read(self._fd, CHUNK)
         except BlockingIOError:
             return None
         self._ring.write(data)
-        return data
+        return len(data)
 
     def finish(self) -> None:
         """Reads what is there still, and closes the pipe, whoever writes to it."""

@@ -41,7 +41,7 @@ class ComponentGroup:
         self.cpu = cpu
         """Cores; 0: no limit."""
         self.memory_set = self.cpu_set = False
-        self._throttle: tuple[Path, str] | None = None
+        self.throttle: tuple[Path, str] | None = None
         """The file, and what it is to say once the component is ready."""
 
     @property
@@ -59,15 +59,6 @@ class ComponentGroup:
             parts.append("cpu_limit can't be set")
         return f"{' and '.join(parts)}: this host lets its node make no control groups" if parts else ""
 
-    @property
-    def start_cpu(self) -> float:
-        """Cores that it may use until it is ready."""
-        return max(self.cpu, START_CORES)
-
-    def throttle_by(self, file: Path, text: str) -> None:
-        """What `settle` is to write."""
-        self._throttle = file, text
-
     def enter(self, pid: int) -> None:
         """Puts a process in, and all that it starts from now on. Raises OSError."""
         for folder in self.folders:
@@ -76,8 +67,8 @@ class ComponentGroup:
     def settle(self) -> None:
         """The component is ready: from now on its limit of processor time holds. Before, START_CORES do, so
         that one that may use little later is ready in time."""
-        if self._throttle is not None:
-            file, text = self._throttle
+        if self.throttle is not None:
+            file, text = self.throttle
             with suppress(OSError):  # it has ended meanwhile
                 _write(file, text)
 
@@ -119,9 +110,9 @@ class ControlGroups:
         group = ComponentGroup(memory, cpu)
         name = f"{PREFIX}{os.getpid()}.{name}"
         if memory:
-            group.memory_set = self._v1(group, "memory", name) or self._unified(group, "memory", name)
+            group.memory_set = self._limit(group, "memory", name)
         if cpu:
-            group.cpu_set = self._v1(group, "cpu", name) or self._unified(group, "cpu", name)
+            group.cpu_set = self._limit(group, "cpu", name)
         return group
 
     def sweep(self) -> None:
@@ -138,31 +129,29 @@ class ControlGroups:
         may be the host's."""
         return group_folders(self._root / controller, self._of.get(controller, ()))[-1]
 
-    def _v1(self, group: ComponentGroup, controller: str, name: str) -> bool:
-        own = self._own(controller)
-        if not (own / "tasks").is_file():
-            return False
-        folder = own / name
-        if controller == "memory":
-            # The second counts swap as well; not every kernel has it, and it can't be below the first.
-            wanted = {"memory.limit_in_bytes": str(group.memory)}
-            also = {"memory.memsw.limit_in_bytes": str(group.memory)}
-        else:
-            wanted = {"cpu.cfs_period_us": str(PERIOD_US), "cpu.cfs_quota_us": str(_quota(group.start_cpu))}
-            also = {}
-            group.throttle_by(folder / "cpu.cfs_quota_us", str(_quota(group.cpu)))
-        return _make(group, folder, wanted, also)
-
-    def _unified(self, group: ComponentGroup, controller: str, name: str) -> bool:
-        base = self._base()
+    def _limit(self, group: ComponentGroup, controller: str, name: str) -> bool:
+        """Limits memory or processor time by a group of v1, or else of v2."""
+        own, base, memory = self._own(controller), self._base(), str(group.memory)
+        first, later = _quota(max(group.cpu, START_CORES)), _quota(group.cpu)
+        also: dict[str, str] = {}
+        if (own / "tasks").is_file():
+            if controller == "memory":
+                # The second counts swap as well; not every kernel has it, and it can't be below the first.
+                wanted = {"memory.limit_in_bytes": memory}
+                also = {"memory.memsw.limit_in_bytes": memory}
+            else:
+                wanted = {"cpu.cfs_period_us": str(PERIOD_US), "cpu.cfs_quota_us": str(first)}
+                group.throttle = own / name / "cpu.cfs_quota_us", str(later)
+            if _make(group, own / name, wanted, also):
+                return True
         if not _may_delegate(base, controller):
             return False
         if controller == "memory":
-            wanted = {"memory.max": str(group.memory)}
+            wanted = {"memory.max": memory}
             also = {"memory.swap.max": "0", "memory.oom.group": "1"}
         else:
-            wanted, also = {"cpu.max": f"{_quota(group.start_cpu)} {PERIOD_US}"}, {}
-            group.throttle_by(base / name / "cpu.max", f"{_quota(group.cpu)} {PERIOD_US}")
+            wanted = {"cpu.max": f"{first} {PERIOD_US}"}
+            group.throttle = base / name / "cpu.max", f"{later} {PERIOD_US}"
         return _make(group, base / name, wanted, also)
 
     def _base(self) -> Path:

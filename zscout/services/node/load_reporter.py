@@ -12,23 +12,8 @@ from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Mesh, Supervisor
 from zscout.messages import LoadReport
 from zscout.services.node.cgroup import Cgroup, HostMemory
-from zscout.services.node.host_figures import (
-    CpuMeter,
-    Paced,
-    clock,
-    cores,
-    memory,
-    speed,
-    temperature,
-)
-from zscout.services.node.process_use import (
-    ComponentProcesses,
-    LoadAverage,
-    NoComponents,
-    TreeMeter,
-    TreeUse,
-    UseMeter,
-)
+from zscout.services.node.host_figures import CpuMeter, Paced, clock, cores, memory, speed, temperature
+from zscout.services.node.process_use import Running, TreeMeter, TreeUse, UseMeter, faded
 
 log = logging.getLogger("zscout.load")
 
@@ -49,7 +34,7 @@ TREE_SHARE: Final = 0.004
 
 
 class LoadReporter:
-    """Publishes this host's load until stopped. `labels` are the host's; `processes` its components. With
+    """Publishes this host's load until stopped. `labels` are the host's; `running` its components. With
     `tree` only the load of this process and its descendants, as if the host had no other programs.
 
     One that fails is logged, and withdraws its liveliness token: the host is seen to report no load. It
@@ -59,14 +44,13 @@ class LoadReporter:
         self,
         mesh: Mesh,
         labels: Iterable[str] = (),
-        processes: ComponentProcesses | None = None,
+        running: Running = tuple,
         *,
         tree: bool = False,
     ) -> None:
         self.mesh = mesh
         self._tree = tree
-        self._labels = tuple(labels)
-        self._processes = processes or NoComponents()
+        self._labels, self._running = tuple(labels), running
         self._pause = RESTARTS[0]
         self._restart: asyncio.TimerHandle | None = None
 
@@ -116,7 +100,7 @@ class LoadReporter:
 
     def _gauge(self) -> Gauge:
         load = TreeLoad(TreeMeter()) if self._tree else None
-        return Gauge(self.mesh.me.host, self._labels, self._processes, load=load)
+        return Gauge(self.mesh.me.host, self._labels, self._running, load=load)
 
 
 class HostLoadFigures(NamedTuple):
@@ -129,34 +113,23 @@ class HostLoadFigures(NamedTuple):
     """Bytes of memory."""
 
 
-class HostLoad:
-    """The load of the whole host, or of the container where that has limits."""
-
-    def __init__(self, cgroup: Cgroup) -> None:
-        self._cpu = CpuMeter(cgroup)
-
-    def __call__(self, size: float, ram: HostMemory) -> HostLoadFigures:
-        """Of so many cores, with this memory; CPU use since the last call."""
-        return HostLoadFigures(os.getloadavg(), self._cpu.percent(size), ram.available)
-
-
 class TreeLoad:
     """The load of one process tree, as if there were no other programs."""
 
     def __init__(self, meter: TreeMeter) -> None:
         self._meter = meter
-        self._average = LoadAverage()
+        self._averages = 0.0, 0.0, 0.0
         self._uses = Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
 
     def __call__(self, size: float, ram: HostMemory) -> HostLoadFigures:
         """Of so many cores, with this memory; CPU use since the tree was last looked at."""
         use = self._uses()
         percent = min(100.0, 100 * use.cores / size)
-        return HostLoadFigures(self._average.averages, percent, max(0, ram.total - use.memory))
+        return HostLoadFigures(self._averages, percent, max(0, ram.total - use.memory))
 
     def _measure(self) -> TreeUse:
         use = self._meter.measure()
-        self._average.add(use.wanted, use.elapsed)
+        self._averages = faded(self._averages, use.wanted, use.elapsed)
         return use
 
 
@@ -167,22 +140,21 @@ class Gauge:
         self,
         host: str,
         labels: tuple[str, ...] = (),
-        processes: ComponentProcesses | None = None,
-        cgroup: Cgroup | None = None,
+        running: Running = tuple,
         *,
         load: TreeLoad | None = None,
     ) -> None:
         self._host, self._labels = host, labels
-        self._cgroup = cgroup or Cgroup()
-        self._load = load or HostLoad(self._cgroup)
+        self._cgroup = Cgroup()
+        self._cpu = CpuMeter(self._cgroup)
+        self._load = load or self._host_load
         self._number = 0
         self._speed = speed()
         self._fresh = True
         self._speeds = Paced(self._measure_speed, least=SPEED_EVERY, share=1.0)
         self._clocks = Paced(clock, least=SENSORS_EVERY, share=SENSORS_SHARE)
         self._temperatures = Paced(temperature, least=SENSORS_EVERY, share=SENSORS_SHARE)
-        meter = UseMeter(processes or NoComponents())
-        self._uses = Paced(meter.measure, least=PERIOD / 2, share=USES_SHARE)
+        self._uses = Paced(UseMeter(running).measure, least=PERIOD / 2, share=USES_SHARE)
 
     def report(self) -> LoadReport:
         """The host's load now; CPU use since the last call."""
@@ -206,6 +178,10 @@ class Gauge:
             labels=self._labels,
             components=self._uses(),
         )
+
+    def _host_load(self, size: float, ram: HostMemory) -> HostLoadFigures:
+        """Of the whole host, or of the container where that has limits; CPU use since the last call."""
+        return HostLoadFigures(os.getloadavg(), self._cpu.percent(size), ram.available)
 
     def _measure_speed(self) -> float:
         if self._fresh:

@@ -6,22 +6,26 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, TypeAlias
 
 from zscout.messages import MAX_COMPONENTS, ComponentUse
+from zscout.types import SECOND
 
 TICK: Final = 1 / os.sysconf("SC_CLK_TCK")
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 MAX_THREADS: Final = 4_096
 """Of one tree whose waiting for a processor is looked at."""
-SECOND: Final = 1_000_000_000
+PROC: Final = Path("/proc")
 
 
-@dataclass(frozen=True, slots=True)
-class RunningComponent:
+def since_boot() -> float:
+    """Seconds since the host's start."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+class RunningComponent(NamedTuple):
     """A component that runs on this host. `pid` is its root process: a child that was not waited for yet, so
     that the number can't have passed to another."""
 
@@ -31,17 +35,8 @@ class RunningComponent:
     pid: int
 
 
-class ComponentProcesses(Protocol):
-    """The components of a node; may be asked from any thread."""
-
-    def running(self) -> Iterable[RunningComponent]: ...
-
-
-class NoComponents:
-    """The registry of a node without components."""
-
-    def running(self) -> Iterable[RunningComponent]:
-        return ()
+Running: TypeAlias = Callable[[], Iterable[RunningComponent]]
+"""The components of a node; may be called from any thread."""
 
 
 class _Process(NamedTuple):
@@ -61,65 +56,84 @@ class _Wanted(NamedTuple):
     waited: int
 
 
-@dataclass(slots=True)
-class _Last:
+class _Tree(NamedTuple):
+    """A process and all its descendants at one moment, `at` in seconds since the host's start."""
+
     at: float
-    cpu: float
-    threads: Mapping[int, _Wanted] = field(default_factory=dict)
+    cpu: float = 0.0
+    """Seconds of processor time so far."""
+    memory: int = 0
+    pids: Sequence[int] = ()
+    threads: Mapping[int, _Wanted] = {}
+
+    def cores(self, before: _Tree) -> float:
+        """What it had on average since. What leaves the tree for another parent takes its time with it."""
+        elapsed = self.at - before.at
+        return max(0.0, self.cpu - before.cpu) / elapsed if elapsed > 0 else 0.0
+
+
+class _Processes:
+    """All processes at one moment; with `ended` also those that nobody has waited for yet."""
+
+    def __init__(self, proc: Path, at: float, *, ended: bool = False) -> None:
+        self._proc, self._at = proc, at
+        self.table: dict[int, _Process] = {}
+        self._children: dict[int, list[int]] = {}
+        for name in _names(str(proc)):
+            if name.isascii() and name.isdigit():
+                process = _parse(_read(f"{proc}/{name}/stat"))
+                if process is not None and (ended or process.state not in "ZXx"):
+                    self.table[int(name)] = process
+                    self._children.setdefault(process.parent, []).append(int(name))
+
+    def tree(self, root: int) -> _Tree:
+        """Raises KeyError. Processes come and go while the table is read: it may hold a circle of parents."""
+        pids = {root: self.table[root]}
+        queue = [root]
+        for pid in queue:
+            for child in self._children.get(pid, ()):
+                if child not in pids:
+                    pids[child] = self.table[child]
+                    queue.append(child)
+        cpu, memory = sum(one.cpu for one in pids.values()), sum(one.memory for one in pids.values())
+        return _Tree(self._at, cpu, memory, queue, _threads(self._proc, queue))
 
 
 class UseMeter:
     """Measures what components use; a figure over time is that since the last call, or since the start of
-    the component. `proc` and `now` (seconds since the host's start) are the system's own."""
+    the component. `proc` and `now` are the system's own."""
 
-    def __init__(
-        self,
-        processes: ComponentProcesses,
-        *,
-        proc: Path = Path("/proc"),
-        now: Callable[[], float] | None = None,
-    ) -> None:
-        self._processes, self._proc = processes, proc
-        self._now = now or _since_boot
-        self._last: dict[tuple[str, int, int], _Last] = {}
+    def __init__(self, running: Running, *, proc: Path = PROC, now: Callable[[], float] = since_boot) -> None:
+        self._running, self._proc, self._now = running, proc, now
+        self._last: dict[RunningComponent, _Tree] = {}
 
     def measure(self) -> tuple[ComponentUse, ...]:
         """One entry for each component whose root process lives, MAX_COMPONENTS at most."""
-        running = list(self._processes.running())[:MAX_COMPONENTS]
+        running = list(self._running())[:MAX_COMPONENTS]
         last, self._last = self._last, {}
         if not running:
             return ()
-        now, table = self._now(), _table(self._proc)
-        children = _children(table)
+        processes = _Processes(self._proc, self._now())
         found = []
         for one in running:
-            root = table.get(one.pid)
-            if root is not None:
-                key = (one.component, one.incarnation, one.pid)
-                before = last.get(key) or _Last(root.started, 0.0)
-                tree = _tree(one.pid, children)
-                use, self._last[key] = self._use(one, [table[pid] for pid in tree], tree, before, now)
-                found.append(use)
+            if one.pid in processes.table:
+                before = last.get(one) or _Tree(processes.table[one.pid].started)
+                self._last[one] = tree = processes.tree(one.pid)
+                found.append(_use(one, before, tree))
         return tuple(found)
 
-    def _use(
-        self, one: RunningComponent, processes: list[_Process], pids: list[int], before: _Last, now: float
-    ) -> tuple[ComponentUse, _Last]:
-        cpu = sum(process.cpu for process in processes)
-        threads = _threads(self._proc, pids)
-        elapsed = now - before.at
-        # A process that left the tree for another parent takes its time with it.
-        cores = max(0.0, cpu - before.cpu) / elapsed if elapsed > 0 else 0.0
-        use = ComponentUse(
-            component=one.component,
-            kind=one.kind,
-            incarnation=one.incarnation,
-            cpu=round(cores, 4),
-            memory=sum(process.memory for process in processes),
-            processes=len(processes),
-            served=_served(before.threads, threads),
-        )
-        return use, _Last(now, cpu, threads)
+
+def _use(one: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
+    ran, waited = _demand(before.threads, tree.threads)
+    return ComponentUse(
+        component=one.component,
+        kind=one.kind,
+        incarnation=one.incarnation,
+        cpu=round(tree.cores(before), 4),
+        memory=tree.memory,
+        processes=len(tree.pids),
+        served=round(ran / (ran + waited), 4) if ran + waited > 0 else None,
+    )
 
 
 class TreeUse(NamedTuple):
@@ -142,72 +156,41 @@ class TreeMeter:
     it from one thread at a time. Raises OSError where there is no /proc."""
 
     def __init__(
-        self,
-        root: int | None = None,
-        *,
-        proc: Path = Path("/proc"),
-        now: Callable[[], float] | None = None,
+        self, root: int | None = None, *, proc: Path = PROC, now: Callable[[], float] = since_boot
     ) -> None:
         self._root = os.getpid() if root is None else root
-        self._proc = proc
-        self._now = now or _since_boot
-        self._last, _, _ = self._look()
+        self._proc, self._now = proc, now
+        self._last = self._look()
 
     def measure(self) -> TreeUse:
-        before = self._last
-        self._last, memory, pids = self._look()
-        elapsed = self._last.at - before.at
+        before, self._last = self._last, self._look()
+        tree, elapsed = self._last, self._last.at - before.at
         if elapsed <= 0:
-            return TreeUse(0.0, 0.0, 0.0, memory)
-        # What leaves the tree takes its time with it; what comes late from ended children is no use of now.
-        cores = min(max(0.0, self._last.cpu - before.cpu) / elapsed, float(os.cpu_count() or 1))
-        if self._last.threads:
-            ran, waited = _demand(before.threads, self._last.threads)
-            wanted = min((ran + waited) / SECOND / elapsed, float(len(self._last.threads)))
+            return TreeUse(0.0, 0.0, 0.0, tree.memory)
+        # What comes late from ended children is no use of now.
+        cores = min(tree.cores(before), float(os.cpu_count() or 1))
+        if tree.threads:
+            wanted = min(sum(_demand(before.threads, tree.threads)) / SECOND / elapsed, len(tree.threads))
         else:
-            wanted = float(_runnable(self._proc, pids))
-        return TreeUse(elapsed, cores, max(cores, wanted), memory)
+            wanted = float(_runnable(self._proc, tree.pids))
+        return TreeUse(elapsed, cores, max(cores, wanted), tree.memory)
 
-    def _look(self) -> tuple[_Last, int, list[int]]:
+    def _look(self) -> _Tree:
         # A child that ended keeps its time until somebody waits for it, and then hands it on.
-        now, table = self._now(), _table(self._proc, ended=True)
-        if self._root not in table:
+        processes = _Processes(self._proc, self._now(), ended=True)
+        if self._root not in processes.table:
             raise OSError(f"{self._proc} does not tell of process {self._root}; mount it, or set load = true")
-        pids = _tree(self._root, _children(table))
-        tree = [table[pid] for pid in pids]
-        last = _Last(now, sum(one.cpu for one in tree), _threads(self._proc, pids))
-        return last, sum(one.memory for one in tree), pids
+        return processes.tree(self._root)
 
 
-class LoadAverage:
-    """Averages over 1, 5 and 15 minutes in which the past fades, as the kernel's do; 0 at first."""
-
-    def __init__(self) -> None:
-        self.averages = 0.0, 0.0, 0.0
-
-    def add(self, wanted: float, seconds: float) -> tuple[float, float, float]:
-        """`wanted` cores, for so long; returns the averages."""
-        one, five, fifteen = (
-            wanted + (past - wanted) * math.exp(-seconds / (60 * minutes))
-            for past, minutes in zip(self.averages, (1, 5, 15), strict=True)
-        )
-        self.averages = one, five, fifteen
-        return self.averages
-
-
-def _since_boot() -> float:
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
-
-
-def _table(proc: Path, *, ended: bool = False) -> dict[int, _Process]:
-    """All processes that live; with `ended` also those that nobody has waited for yet."""
-    table = {}
-    for name in _names(str(proc)):
-        if name.isascii() and name.isdigit():
-            process = _parse(_read(f"{proc}/{name}/stat"))
-            if process is not None and (ended or process.state not in "ZXx"):
-                table[int(name)] = process
-    return table
+def faded(averages: tuple[float, ...], wanted: float, seconds: float) -> tuple[float, float, float]:
+    """Averages over 1, 5 and 15 minutes after `wanted` cores were wanted for so long; the past fades, as in
+    the kernel's."""
+    one, five, fifteen = (
+        wanted + (past - wanted) * math.exp(-seconds / (60 * minutes))
+        for past, minutes in zip(averages, (1, 5, 15), strict=True)
+    )
+    return one, five, fifteen
 
 
 def _parse(stat: bytes) -> _Process | None:
@@ -226,25 +209,6 @@ def _parse(stat: bytes) -> _Process | None:
         return None
 
 
-def _children(table: Mapping[int, _Process]) -> dict[int, list[int]]:
-    children: dict[int, list[int]] = {}
-    for pid, process in table.items():
-        children.setdefault(process.parent, []).append(pid)
-    return children
-
-
-def _tree(root: int, children: Mapping[int, list[int]]) -> list[int]:
-    """A process and all its descendants. Processes come and go while the table is read, so that it may hold
-    a circle of parents."""
-    tree, seen = [root], {root}
-    for pid in tree:
-        for child in children.get(pid, ()):
-            if child not in seen:
-                seen.add(child)
-                tree.append(child)
-    return tree
-
-
 def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Wanted]:
     """Of each thread: /proc/PID/schedstat is that of a process's first one only."""
     found: dict[int, _Wanted] = {}
@@ -259,13 +223,6 @@ def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Wanted]:
             except ValueError:
                 continue
     return found
-
-
-def _served(before: Mapping[int, _Wanted], now: Mapping[int, _Wanted]) -> float | None:
-    """The share of the time in which threads wanted a processor that they had one, from 0 to 1; None if they
-    wanted none, or the system does not tell."""
-    ran, waited = _demand(before, now)
-    return round(ran / (ran + waited), 4) if ran + waited > 0 else None
 
 
 def _demand(before: Mapping[int, _Wanted], now: Mapping[int, _Wanted]) -> _Wanted:

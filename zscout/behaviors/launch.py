@@ -1,4 +1,5 @@
-"""Becomes the command of `zscout request`: run as a program, in a process group of its own already.
+"""Becomes another command that ends with its parent, as that of `zscout request`: run as a program, in a
+process group of its own already.
 
     python -I -S launch.py PARENT TTY COMMAND [ARG]...
 
