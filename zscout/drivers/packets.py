@@ -12,6 +12,7 @@ wants to be sure that something else arrives sends it again under the same numbe
 from __future__ import annotations
 
 import binascii
+import struct
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -20,17 +21,14 @@ from zscout.types import MAX_CHANNEL, MAX_ROBOT
 SYNC: Final = 0x5A
 OVERHEAD: Final = 7
 """Bytes of a packet that are not its arguments."""
-MAX_ARGUMENTS: Final = 3
-MAX_PACKET: Final = OVERHEAD + MAX_ARGUMENTS
+MAX_PACKET: Final = OVERHEAD + 3
 """Bytes of the longest packet, a drive command."""
-MIN_BODY: Final = 3
 TICKS: Final = 50
 """`lasts` is carried in 1/50 s."""
 MAX_LASTS: Final = 255 / TICKS
 """Seconds that one drive command may last at most."""
 FULL: Final = 127
 """The byte for a wheel's top speed."""
-_START: Final = 0xFFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +41,8 @@ class Packet:
     number: int
 
     def __post_init__(self) -> None:
-        if not 0 <= self.robot <= MAX_ROBOT:
-            raise ValueError(f"robot id {self.robot} is not one of 0 to {MAX_ROBOT}")
-        if not 0 <= self.number <= 255:
-            raise ValueError(f"packet number {self.number} is not one of 0 to 255")
-
-    def arguments(self) -> bytes:
-        return b""
+        _check("robot id", self.robot, MAX_ROBOT)
+        _check("packet number", self.number, 255)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +64,6 @@ class DrivePacket(Packet):
         if not 0 < self.lasts <= MAX_LASTS:
             raise ValueError(f"lasts {self.lasts:g} is not above 0 and at most {MAX_LASTS:g} s")
 
-    def arguments(self) -> bytes:
-        wheels = (round(self.left * FULL) & 0xFF, round(self.right * FULL) & 0xFF)
-        return bytes((*wheels, max(1, round(self.lasts * TICKS))))
-
 
 @dataclass(frozen=True, slots=True)
 class StopPacket(Packet):
@@ -92,11 +81,7 @@ class CameraPacket(Packet):
 
     def __post_init__(self) -> None:
         Packet.__post_init__(self)
-        if not 0 <= self.channel <= MAX_CHANNEL:
-            raise ValueError(f"video channel {self.channel} is not one of 0 to {MAX_CHANNEL}")
-
-    def arguments(self) -> bytes:
-        return bytes((self.channel,))
+        _check("video channel", self.channel, MAX_CHANNEL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +93,23 @@ class HaltPacket(Packet):
 
 def encode(packet: Packet) -> bytes:
     """The packet as it goes over the air."""
-    body = bytes((packet.robot, packet.number, packet.operation)) + packet.arguments()
-    framed = bytes((len(body),)) + body
-    return bytes((SYNC,)) + framed + binascii.crc_hqx(framed, _START).to_bytes(2, "big")
+    arguments = b""
+    if isinstance(packet, DrivePacket):
+        lasts = max(1, round(packet.lasts * TICKS))
+        arguments = struct.pack("bbB", round(packet.left * FULL), round(packet.right * FULL), lasts)
+    elif isinstance(packet, CameraPacket):
+        arguments = bytes((packet.channel,))
+    framed = bytes((3 + len(arguments), packet.robot, packet.number, packet.operation)) + arguments
+    return bytes((SYNC,)) + framed + _crc(framed)
+
+
+def _check(what: str, value: int, most: int) -> None:
+    if not 0 <= value <= most:
+        raise ValueError(f"{what} {value} is not one of 0 to {most}")
+
+
+def _crc(framed: bytes) -> bytes:
+    return binascii.crc_hqx(framed, 0xFFFF).to_bytes(2, "big")
 
 
 class PacketDecoder:
@@ -130,12 +129,11 @@ class PacketDecoder:
             if len(self._rest) - at < 2:
                 break
             length = self._rest[at + 1]
-            if MIN_BODY <= length <= MIN_BODY + MAX_ARGUMENTS:
-                end = at + 2 + length + 2
+            if OVERHEAD <= length + 4 <= MAX_PACKET:
+                end = at + length + 4
                 if end > len(self._rest):
                     break
-                packet = self._read(bytes(self._rest[at + 1 : end]))
-                if packet is not None:
+                if (packet := _decode(bytes(self._rest[at + 1 : end]))) is not None:
                     found.append(packet)
                     at = end
                     continue
@@ -145,25 +143,23 @@ class PacketDecoder:
         del self._rest[: at if at >= 0 else len(self._rest)]
         return found
 
-    def _read(self, framed: bytes) -> Packet | None:
-        if binascii.crc_hqx(framed[:-2], _START) != int.from_bytes(framed[-2:], "big"):
-            return None
-        robot, number, operation, *arguments = framed[1:-2]
-        try:
-            match operation, arguments:
-                case DrivePacket.operation, [left, right, lasts]:
-                    return DrivePacket(robot, number, _wheel(left), _wheel(right), lasts / TICKS)
-                case StopPacket.operation, []:
-                    return StopPacket(robot, number)
-                case CameraPacket.operation, [channel]:
-                    return CameraPacket(robot, number, channel)
-                case HaltPacket.operation, []:
-                    return HaltPacket(robot, number)
-                case _:
-                    return None
-        except ValueError:
-            return None
 
-
-def _wheel(byte: int) -> float:
-    return (byte - 256 if byte > FULL else byte) / FULL
+def _decode(framed: bytes) -> Packet | None:
+    """The packet between sync byte and end; None: no valid one."""
+    if _crc(framed[:-2]) != framed[-2:]:
+        return None
+    robot, number, operation, *arguments = framed[1:-2]
+    try:
+        match operation, arguments:
+            case DrivePacket.operation, [_, _, ticks]:
+                left, right = struct.unpack_from("bb", framed, 4)
+                return DrivePacket(robot, number, left / FULL, right / FULL, ticks / TICKS)
+            case StopPacket.operation, []:
+                return StopPacket(robot, number)
+            case CameraPacket.operation, [channel]:
+                return CameraPacket(robot, number, channel)
+            case HaltPacket.operation, []:
+                return HaltPacket(robot, number)
+    except ValueError:
+        pass
+    return None

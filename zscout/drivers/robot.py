@@ -1,14 +1,14 @@
 """A robot that is driven through a radio, and stopped whenever nobody drives it.
 
-The robot receives packets and sends none. So all that this RC knows is what it has had sent: the robot
-counts as there once the radio has taken a halt for it, and as lost while its radio can't.
+The robot receives packets and sends none. So it counts as there once its radio has taken a halt for it, and
+as lost while its radio can't.
 """
 
 from __future__ import annotations
 
 import asyncio
 import statistics
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -36,20 +36,30 @@ HALT_ANSWER: Final = 0.25
 HALT_TRIES: Final = 4
 """Before the robot counts as lost; it is tried on all the same."""
 PAUSES: Final = (0.05, 2.0)
-"""Seconds between such tries: the first, and the longest."""
+"""Seconds between halts while its state is unknown: the first, and the longest."""
 MAX_WAITING: Final = 16
 RECENT: Final = 64
 """Answers of the radio over which the latency is measured."""
+COUNTED: Final = ("commands", "refused", "halts", "dead_man_stops")
 
 
 @dataclass(slots=True)
 class _Waiting:
-    """A command that the radio has not been asked to send yet, and who waits for the answer."""
+    """A command that the radio has not been asked to send yet."""
 
     order: RadioDrive | RadioCamera | RadioStop
     radio: str
     grant: Grant
     answer: asyncio.Future[Any]
+
+    def resolve(self, outcome: Any) -> None:
+        """Answers the command, unless nobody waits any more; a Refused refuses it."""
+        if self.answer.done():
+            return
+        if isinstance(outcome, Refused):
+            self.answer.set_exception(outcome)
+        else:
+            self.answer.set_result(outcome)
 
 
 class RobotDriver(Driver):
@@ -58,9 +68,9 @@ class RobotDriver(Driver):
     def __init__(
         self, robot: int, *, radio: str, channels: Mapping[str, int], warm_up: float, dead_man: float
     ) -> None:
-        """`robot`: its id on the air. `channels`: of its camera, by video RC. `warm_up`: seconds that the
-        camera needs once it is on. `dead_man`: seconds after which it is stopped where no drive command
-        follows, however long the last one may last."""
+        """`robot`: its id on the air. `channels`: of its camera, by video RC. `warm_up`: seconds until the
+        camera works. `dead_man`: seconds after which it is stopped where no drive command follows, however
+        long the last one may last."""
         self.activation = warm_up
         self._id, self._radio, self._channels = robot, radio, dict(channels)
         self._dead_man = dead_man
@@ -73,26 +83,28 @@ class RobotDriver(Driver):
         self._wake = asyncio.Event()
         self._queued = asyncio.Event()
         self._declared: list[Declaration] = []
-        self._commands = self._refused = self._halts = self._dead_man_stops = 0
+        self._counts = Counter(dict.fromkeys(COUNTED, 0))
         self._latencies: deque[float] = deque(maxlen=RECENT)
 
     async def open(self, rc: RcHandle) -> None:
         self._rc, self._mesh = rc, rc.mesh
         rc.fail(f"{self._radio} has not taken its halt yet")
         self._directory = RcDirectory(rc.mesh, self._on_directory_change)
-        self._declared.append(self._directory.watch())
-        keys = rc.mesh.keys
-        self._declared.append(rc.mesh.subscribe(keys.rc_state(self._radio), RcState, self._on_radio_state))
+        state = rc.mesh.keys.rc_state(self._radio)
+        self._declared = [
+            self._directory.watch(),
+            rc.mesh.subscribe(state, RcState, self._on_radio_state),
+        ]
         rc.supervisor.spawn(self._halt_until_sure())
         rc.supervisor.spawn(self._send_all())
 
     async def close(self) -> None:
         for declared in self._declared:
             declared.close()
-        self._drop_waiting()
+        self._drop(Refused("ended", "the hold ended before it was sent"))
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
-        """All of it: only the camera warms up, and not before a command switches it on."""
+        """Only the camera warms up, and not before a command switches it on."""
         return True
 
     # Commands
@@ -100,31 +112,25 @@ class RobotDriver(Driver):
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
         order = robot_command(do)
         radio = self._radio_of(holder)
-        self._commands += 1
+        self._counts["commands"] += 1
         sent: RadioDrive | RadioCamera | RadioStop
         if isinstance(order, RobotCamera):
             sent = RadioCamera(self._id, self._channel_of(holder) if order.on else 0)
         else:
-            # A newer command makes those void that wait: the newest is the true one.
-            for waiting in [waiting for waiting in self._waiting if isinstance(waiting.order, RadioDrive)]:
-                self._waiting.remove(waiting)
-                _resolve(waiting.answer, {"replaced": True})
+            self._drop({"replaced": True}, RadioDrive)  # the newest is the true one
+            sent = RadioStop(self._id)
             if isinstance(order, RobotDrive):
                 sent = RadioDrive(self._id, order.left, order.right, order.lasts)
-                self._restart_dead_man(turns=bool(order.left or order.right))
-            else:
-                sent = RadioStop(self._id)
-                self._restart_dead_man(turns=False)
+            self._restart_dead_man(turns=isinstance(order, RobotDrive) and bool(order.left or order.right))
         if len(self._waiting) >= MAX_WAITING:
             raise Refused("busy", f"{MAX_WAITING} commands wait for {radio}; send fewer")
-        answer: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        waiting = _Waiting(sent, radio, holder.grant, answer)
+        waiting = _Waiting(sent, radio, holder.grant, asyncio.get_running_loop().create_future())
         if isinstance(sent, RadioStop):
             self._waiting.appendleft(waiting)
         else:
             self._waiting.append(waiting)
         self._queued.set()
-        return answer
+        return waiting.answer
 
     def _radio_of(self, holder: Holder) -> str:
         """The radio of the robot's gang: its own, or the only one."""
@@ -142,10 +148,8 @@ class RobotDriver(Driver):
         if not videos:
             raise Refused("no_video", "your ARC holds no video channel to transmit on; ask also for video/*")
         if len(videos) > 1:
-            held = " and ".join(videos)
-            raise Refused(
-                "no_video", f"your ARC holds {held}, and the camera has one transmitter; ask for one"
-            )
+            why = f"your ARC holds {' and '.join(videos)}, and the camera has one transmitter; ask for one"
+            raise Refused("no_video", why)
         channel = self._channels.get(videos[0])
         if channel is None:
             known = ", ".join(sorted(self._channels)) or "none"
@@ -170,16 +174,13 @@ class RobotDriver(Driver):
             result = reply.message.result
             if isinstance(order, RadioDrive) and self._standing_at is None:
                 self._standing_at = self._mesh.now() + round((_after(result) + order.lasts) * SECOND)
-            _resolve(waiting.answer, result)
+            waiting.resolve(result)
             return
-        self._refused += 1
-        if reply is None or reply.problem is None:
-            refused = Refused("unknown", f"{waiting.radio} did not answer: it may have been sent or not")
-        else:
-            refused = Refused(
-                "radio_refused", f"{waiting.radio}: {reply.problem.message} ({reply.problem.code})"
-            )
-        _resolve(waiting.answer, refused)
+        self._counts["refused"] += 1
+        code, why = "unknown", f"{waiting.radio} did not answer: it may have been sent or not"
+        if reply is not None and reply.problem is not None:
+            code, why = "radio_refused", f"{waiting.radio}: {reply.problem.message} ({reply.problem.code})"
+        waiting.resolve(Refused(code, why))
 
     async def _ask_radio(
         self, radio: str, order: Any, grant: Grant | None, timeout: float
@@ -188,9 +189,11 @@ class RobotDriver(Driver):
         message = Command(do=msgspec.to_builtins(order), grant=grant, ttl=timeout)
         return await self._mesh.ask_one(key, message, Done, timeout=timeout)
 
-    def _drop_waiting(self) -> None:
-        while self._waiting:
-            _resolve(self._waiting.popleft().answer, Refused("ended", "the hold ended before it was sent"))
+    def _drop(self, outcome: Any, kind: type = object) -> None:
+        """Answers by `outcome` the commands of this kind that wait; they are not sent."""
+        for waiting in [waiting for waiting in self._waiting if isinstance(waiting.order, kind)]:
+            self._waiting.remove(waiting)
+            waiting.resolve(outcome)
 
     # Stopping
 
@@ -198,13 +201,11 @@ class RobotDriver(Driver):
         """The robot halts: wheels and transmitter. Where the radio does not take that, the RC counts as lost
         until it does."""
         self._restart_dead_man(turns=False)
-        self._drop_waiting()
-        problem = await self._send_urgent(RadioHalt(self._id, self._rc.name), HALT_TRIES)
-        if problem:
-            self._set_unsure(problem)
+        self._drop(Refused("ended", "the hold ended before it was sent"))
+        await self._send_urgent(RadioHalt(self._id, self._rc.name), HALT_TRIES)
 
     def _restart_dead_man(self, *, turns: bool) -> None:
-        """A command for the wheels came: the dead man's clock begins anew, or stands."""
+        """A command for the wheels arrived: the dead man's clock begins anew, or stands."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -217,32 +218,27 @@ class RobotDriver(Driver):
         self._timer = None
         if self._standing_at is not None and self._standing_at <= self._mesh.now():
             return
-        self._dead_man_stops += 1
-        for waiting in [waiting for waiting in self._waiting if isinstance(waiting.order, RadioDrive)]:
-            self._waiting.remove(waiting)
-            _resolve(waiting.answer, Refused("stale", "it waited too long for the radio"))
+        self._counts["dead_man_stops"] += 1
+        self._drop(Refused("stale", "it waited too long for the radio"), RadioDrive)
         self._standing_at = 0
-        self._rc.supervisor.spawn(self._stop())
+        self._rc.supervisor.spawn(self._send_urgent(RadioStop(self._id, self._rc.name), HALT_TRIES))
 
-    async def _stop(self) -> None:
-        problem = await self._send_urgent(RadioStop(self._id, self._rc.name), HALT_TRIES)
-        if problem:
-            self._set_unsure(problem)
-
-    async def _send_urgent(self, order: RadioStop | RadioHalt, tries: int) -> str:
-        """Has the robot's own radio send a stop or a halt. Returns what is wrong; empty if it is taken."""
+    async def _send_urgent(self, order: RadioStop | RadioHalt, tries: int) -> bool:
+        """Has the robot's own radio send a stop or a halt. False: it could not, and the RC counts as lost."""
         problem = ""
         for _ in range(tries):
             if not self._directory.hosts(self._radio):
-                return f"{self._radio} is not there"
+                problem = f"{self._radio} is not there"
+                break
             reply = await self._ask_radio(self._radio, order, None, HALT_ANSWER)
             if reply is not None and reply.message is not None:
-                self._halts += isinstance(order, RadioHalt)
-                return ""
+                self._counts["halts"] += isinstance(order, RadioHalt)
+                return True
             problem = f"{self._radio} does not answer"
             if reply is not None and reply.problem is not None:
                 problem = f"{self._radio}: {reply.problem.message}"
-        return problem
+        self._set_unsure(problem)
+        return False
 
     def _set_unsure(self, why: str) -> None:
         """The robot can't be stopped for now: nobody may drive it."""
@@ -256,15 +252,13 @@ class RobotDriver(Driver):
         while True:
             await self._unsure.wait()
             self._wake.clear()
-            problem = await self._send_urgent(RadioHalt(self._id, self._rc.name), 1)
-            if not problem:
+            if await self._send_urgent(RadioHalt(self._id, self._rc.name), 1):
                 self._unsure.clear()
                 self._rc.recover()
                 pause = PAUSES[0]
                 continue
-            self._set_unsure(problem)
             try:
-                # Not wait_for, which loses a cancellation that comes together with the news.
+                # Not wait_for, which loses a cancellation that coincides with the event.
                 async with asyncio.timeout(pause):
                     await self._wake.wait()
             except TimeoutError:
@@ -284,25 +278,11 @@ class RobotDriver(Driver):
             self._wake.set()
 
     def figures(self) -> Figures:
-        return {
-            "commands": float(self._commands),
-            "refused": float(self._refused),
-            "halts": float(self._halts),
-            "dead_man_stops": float(self._dead_man_stops),
-            "latency_ms": round(1000 * statistics.median(self._latencies), 2) if self._latencies else 0.0,
-        }
+        latency = round(1000 * statistics.median(self._latencies), 2) if self._latencies else 0.0
+        return {name: float(self._counts[name]) for name in COUNTED} | {"latency_ms": latency}
 
 
 def _after(result: Any) -> float:
     """Seconds until a packet is out, as the radio answered."""
     after = result.get("after") if isinstance(result, dict) else None
     return float(after) if isinstance(after, int | float) and 0 <= after < 60 else 0.0
-
-
-def _resolve(answer: asyncio.Future[Any], outcome: Any) -> None:
-    if answer.done():
-        return
-    if isinstance(outcome, Exception):
-        answer.set_exception(outcome)
-    else:
-        answer.set_result(outcome)
