@@ -1,8 +1,13 @@
 """What waits for a radio's line, and in which order it goes out. Pure: times are whole ns, passed in.
 
-First halts and stops, at once; then what is to be repeated, as far as the reserve reaches; then drive and
-camera packets, each holder's through its token bucket (`airtime`), first come first served. A drive packet
-that waits is replaced by the holder's next one for the same robot: the newest command is the true one.
+First halts and stops, at once; then repeats, as far as the reserve reaches; then drive and camera packets,
+each holder's through its token bucket (`airtime`), first come first served. A drive packet that waits is
+replaced by the holder's next one for the same robot: the newest command is the true one.
+
+Stop, camera and halt packets go out several times, since nobody acknowledges. A repeat has the number of its
+original, so that the robot obeys once. Where something else went to the robot in between, it gets a number of
+its own: it then repeats what still stands. What a newer packet has overtaken is not repeated: after a drive
+command nothing of a halt is left but "transmitter off".
 """
 
 from __future__ import annotations
@@ -10,9 +15,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Final, TypeAlias
+from itertools import chain
+from typing import Final
 
 from zscout.drivers.airtime import RESERVE, Bucket, Share, urgent_burst
 from zscout.drivers.commands import RadioCamera, RadioDrive
@@ -26,20 +32,14 @@ from zscout.drivers.packets import (
     StopPacket,
     encode,
 )
-from zscout.drivers.retransmit import Retransmission, RetransmitSchedule
-from zscout.types import (
-    SECOND,
-    Grant,
-    Ns,
-    Place,
-)
+from zscout.types import SECOND, Grant, Ns, Place
 
 MAX_WAITING: Final = 64
 """Packets of one holder that wait; one replaced by a newer does not count."""
-DRIVE_SIZE: Final = MAX_PACKET
-CAMERA_SIZE: Final = OVERHEAD + 1
-
-_Kind: TypeAlias = type[RadioDrive] | type[RadioCamera]
+TIMES: Final = 3
+"""How often a packet that is repeated goes out in all."""
+SPACING: Final[Ns] = SECOND // 20
+"""From one to the next: longer than most bursts of interference, short against a person's patience."""
 
 
 class QueueFull(Exception):
@@ -59,19 +59,80 @@ class QueuedPacket:
 
     @property
     def size(self) -> int:
-        return DRIVE_SIZE if isinstance(self.order, RadioDrive) else CAMERA_SIZE
+        return MAX_PACKET if isinstance(self.order, RadioDrive) else OVERHEAD + 1
 
 
 @dataclass(frozen=True, slots=True)
 class OutgoingPacket:
     """A packet to be written now. `through`: when the line has carried it; `entered`: when it stood in the
-    queue, its bucket passed; `arrived`: when it was asked for. Of a repeat, both are when it was due."""
+    queue, its bucket passed; of a repeat, when it was due."""
 
     packet: Packet
-    arrived: Ns
     entered: Fraction
     through: Fraction
-    repeat: bool = False
+    repeat: bool
+
+
+@dataclass(slots=True)
+class _Repeat:
+    """A packet that goes out `left` times more, next at `due`."""
+
+    packet: Packet
+    left: int
+    due: Ns
+
+
+class _Robot:
+    """What was sent to one robot: its numbers, and what of it is to be repeated."""
+
+    def __init__(self, first_number: int) -> None:
+        self._next = first_number
+        self._last: Packet | None = None
+        self._count = 0
+        self.repeats: list[_Repeat] = []
+
+    def number(self) -> int:
+        """The number for the next packet that is no repeat."""
+        self._next, number = (self._next + 1) % 256, self._next
+        return number
+
+    def sent(self, packet: Packet, now: Ns) -> None:
+        """`packet`, no repeat, went out: what it overtakes is not repeated."""
+        self.repeats = [kept for repeat in self.repeats if (kept := _remainder(repeat, packet)) is not None]
+        if not isinstance(packet, DrivePacket):
+            self.repeats.append(_Repeat(packet, TIMES - 1, now + SPACING))
+        self._last = packet
+        self._count += 1
+
+    def repeat(self, repeat: _Repeat, now: Ns) -> Packet:
+        """The packet that goes out now for `repeat`."""
+        # The very first number may by chance be the last that an earlier radio used: the robot then ignores
+        # it, and must be sent another.
+        if repeat.packet is not self._last or self._count == 1:
+            repeat.packet = replace(repeat.packet, number=self.number())
+        self._last = repeat.packet
+        self._count += 1
+        repeat.left -= 1
+        repeat.due = now + SPACING
+        if not repeat.left:
+            self.repeats.remove(repeat)
+        return repeat.packet
+
+
+def _remainder(repeat: _Repeat, newer: Packet) -> _Repeat | None:
+    """What of `repeat` still stands once `newer` was sent."""
+    match repeat.packet, newer:
+        case (
+            (_, HaltPacket())
+            | (StopPacket(), DrivePacket() | StopPacket())
+            | (CameraPacket(), CameraPacket())
+        ):
+            return None
+        case HaltPacket() as halt, DrivePacket() | StopPacket():
+            return _Repeat(CameraPacket(halt.robot, halt.number, 0), repeat.left, repeat.due)
+        case HaltPacket() as halt, CameraPacket():
+            return _Repeat(StopPacket(halt.robot, halt.number), repeat.left, repeat.due)
+    return repeat
 
 
 class _Member:
@@ -81,20 +142,19 @@ class _Member:
         self.share = share
         self.bucket = Bucket(share.size, share.bytes_per_second, now, full=full) if share.rate else None
         self.earning = not full
-        self.waiting: dict[tuple[int, _Kind], QueuedPacket] = {}
+        self.waiting: deque[QueuedPacket] = deque()
         self.robots: set[int] = set()
 
     def enters_at(self) -> Fraction | None:
         """When what waits first may enter the queue."""
         if self.bucket is None or not self.waiting:
             return None
-        first = next(iter(self.waiting.values()))
-        return max(Fraction(first.arrived), self.bucket.ready(first.size))
+        return max(Fraction(self.waiting[0].arrived), self.bucket.ready(self.waiting[0].size))
 
     def enter(self, now: Ns) -> Iterator[QueuedPacket]:
         """What enters the queue up to now."""
         while self.bucket is not None and (at := self.enters_at()) is not None and at <= now:
-            first = self.waiting.pop(next(iter(self.waiting)))
+            first = self.waiting.popleft()
             self.bucket.take(first.size, at)
             first.entered, first.queued = at, True
             yield first
@@ -105,7 +165,6 @@ class TransmitQueue:
 
     def __init__(self, rate: Fraction, *, first_number: int = 0) -> None:
         self._ns_per_byte = SECOND / rate
-        self._rate = rate
         self._first_number = first_number
         self._ahead = MAX_PACKET * self._ns_per_byte
         """How much earlier than the line is free the next packet is written: one waits in the kernel."""
@@ -113,7 +172,7 @@ class TransmitQueue:
         self._members: dict[Place, _Member] = {}
         self._queue: deque[QueuedPacket] = deque()
         self._urgent: dict[int, tuple[type[StopPacket] | type[HaltPacket], Ns]] = {}
-        self._schedules: dict[int, RetransmitSchedule] = {}
+        self._robots: dict[int, _Robot] = {}
         self._reserve = Bucket(Fraction(urgent_burst(0)), rate * RESERVE, 0)
         self.replaced = 0
         """Drive and camera packets that a newer command made void before they went out."""
@@ -130,23 +189,27 @@ class TransmitQueue:
 
     def leave(self, place: Place) -> set[int]:
         """A holder is gone, and what waits for it. Returns the robots that it made do something."""
-        member = self._members.pop(place, None)
-        if member is None:
+        if place not in self._members:
             return set()
+        self.dropped += self._remove(lambda waiting: waiting.place == place)
+        member = self._members.pop(place)
         self._fit_reserve()
-        self.dropped += len(member.waiting) + self._remove(lambda waiting: waiting.place == place)
         return member.robots
 
     def places(self) -> list[Place]:
         """Who has joined and not left."""
         return list(self._members)
 
+    def _fit_reserve(self) -> None:
+        self._reserve.size = Fraction(urgent_burst(len(self._members)))
+
     # What is to be sent
 
     def offer(self, place: Place, grant: Grant, order: RadioDrive | RadioCamera, now: Ns) -> Ns:
         """A drive or camera packet of a holder that has joined. Returns in about how many ns it is through.
 
-        Raises Full, and ValueError with a reason in words where the holder's share has no room for it."""
+        Raises QueueFull, and ValueError with a reason in words where the holder's share has no room for it.
+        """
         member = self._members[place]
         waiting = QueuedPacket(place, grant, order, now)
         if member.bucket is None:
@@ -162,42 +225,51 @@ class TransmitQueue:
             for other in self._members.values():
                 other.robots.discard(order.robot)
         member.robots.add(order.robot)
-        for queued in self._queue:
-            if queued.place == place and _same(queued.order, order):
-                queued.order, queued.grant = order, grant
+        for earlier in chain(self._queue, member.waiting):
+            same = earlier.place == place and earlier.order.robot == order.robot
+            if same and type(earlier.order) is type(order):
+                earlier.order, earlier.grant = order, grant
                 self.replaced += 1
-                return self._through_queue(queued, now)
-        key = (order.robot, type(order))
-        earlier = member.waiting.get(key)
-        if earlier is not None:
-            earlier.order, earlier.grant = order, grant
-            self.replaced += 1
-            waiting = earlier
-        elif len(member.waiting) >= MAX_WAITING:
-            raise QueueFull
+                waiting = earlier
+                break
         else:
-            member.waiting[key] = waiting
-        self._release(now)
+            if len(member.waiting) >= MAX_WAITING:
+                raise QueueFull
+            member.waiting.append(waiting)
+            self._release(now)
         if waiting.queued:
-            return self._through_queue(waiting, now)
+            ahead = len(self._urgent) * OVERHEAD
+            for queued in self._queue:
+                ahead += queued.size
+                if queued is waiting:
+                    break
+            return self._carried(ahead, now)
         begins = max(member.bucket.ready(waiting.size), self._free_at, Fraction(now))
         return round(begins - now + waiting.size * self._ns_per_byte)
 
     def send_urgent(self, robot: int, kind: type[StopPacket] | type[HaltPacket], now: Ns) -> Ns:
         """A stop or a halt, ahead of all that waits. Drive packets that wait for this robot are void, with a
         halt camera packets too. Returns in about how many ns it is through."""
-        voided = (RadioDrive, RadioCamera) if kind is HaltPacket else (RadioDrive,)
         self.replaced += self._remove(
-            lambda waiting: waiting.order.robot == robot and isinstance(waiting.order, voided)
+            lambda waiting: (
+                waiting.order.robot == robot and (kind is HaltPacket or isinstance(waiting.order, RadioDrive))
+            )
         )
+        first, since = self._urgent.get(robot, (kind, now))
+        self._urgent[robot] = (HaltPacket if HaltPacket in (first, kind) else StopPacket, since)
+        return self._carried((list(self._urgent).index(robot) + 1) * OVERHEAD, now)
+
+    def _remove(self, gone: Callable[[QueuedPacket], bool]) -> int:
+        """Takes out what is `gone` of all that waits; returns how much that was."""
+        before = self.waiting
+        self._queue = deque(waiting for waiting in self._queue if not gone(waiting))
         for member in self._members.values():
-            for what in voided:
-                self.replaced += member.waiting.pop((robot, what), None) is not None
-        earlier = self._urgent.get(robot)
-        if earlier is None or (kind is HaltPacket and earlier[0] is StopPacket):
-            self._urgent[robot] = (kind, now if earlier is None else earlier[1])
-        place = list(self._urgent).index(robot) + 1
-        return self._carried(place * OVERHEAD, now)
+            member.waiting = deque(waiting for waiting in member.waiting if not gone(waiting))
+        return before - self.waiting
+
+    def _carried(self, size: int, now: Ns) -> Ns:
+        """In how many ns `size` bytes more are through."""
+        return round(max(self._free_at - now, Fraction(0)) + size * self._ns_per_byte)
 
     # Going out
 
@@ -208,28 +280,30 @@ class TransmitQueue:
             return None
         self._release(now)
         if self._urgent:
-            robot = next(iter(self._urgent))
-            kind, arrived = self._urgent.pop(robot)
-            return self._transmit(
-                kind(robot, self._schedule_of(robot).number()), arrived, Fraction(arrived), now
-            )
-        repeat = self._due(now)
-        if repeat is not None:
-            schedule, again = repeat
-            due = again.due
-            return self._transmit(schedule.retransmit(again, now), due, Fraction(due), now, repeat=True)
+            number = next(iter(self._urgent))
+            kind, since = self._urgent.pop(number)
+            robot = self._robot(number)
+            return self._transmit(kind(number, robot.number()), Fraction(since), now)
+        due = [
+            (repeat.due, robot, repeat)
+            for robot, repeat in self._repeats()
+            if self._may_repeat(repeat) <= now
+        ]
+        if due:
+            at, robot, repeat = min(due, key=lambda item: item[0])
+            return self._transmit(robot.repeat(repeat, now), Fraction(at), now, repeat=True)
         while self._queue:
             waiting = self._queue.popleft()
             if not stands(waiting.grant):
                 self.dropped += 1
                 continue
-            order, schedule = waiting.order, self._schedule_of(waiting.order.robot)
+            order, number = waiting.order, self._robot(waiting.order.robot).number()
             packet: Packet
             if isinstance(order, RadioDrive):
-                packet = DrivePacket(order.robot, schedule.number(), order.left, order.right, order.lasts)
+                packet = DrivePacket(order.robot, number, order.left, order.right, order.lasts)
             else:
-                packet = CameraPacket(order.robot, schedule.number(), order.channel)
-            return self._transmit(packet, waiting.arrived, waiting.entered, now)
+                packet = CameraPacket(order.robot, number, order.channel)
+            return self._transmit(packet, waiting.entered, now)
         for member in self._members.values():
             # Nothing waits: whoever joined while something did may have its packet now.
             if member.earning and member.bucket is not None:
@@ -240,14 +314,9 @@ class TransmitQueue:
     def wake(self, now: Ns) -> Ns | None:
         """When to call `next` again; None: not before something else happens."""
         times = [Fraction(now)] if self._urgent or self._queue else []
-        for schedule in self._schedules.values():
-            repeat = schedule.next_due()
-            if repeat is not None:
-                times.append(self._repeat_at(repeat))
+        times += [self._may_repeat(repeat) for _, repeat in self._repeats()]
         times += [at for member in self._members.values() if (at := member.enters_at()) is not None]
-        if not times:
-            return None
-        return math.ceil(max(self._free_at - self._ahead, min(times)))
+        return math.ceil(max(self._free_at - self._ahead, min(times))) if times else None
 
     @property
     def urgent(self) -> int:
@@ -259,62 +328,31 @@ class TransmitQueue:
         """Drive and camera packets that have not gone out."""
         return len(self._queue) + sum(len(member.waiting) for member in self._members.values())
 
-    # Within
-
     def _release(self, now: Ns) -> None:
         """Lets into the queue what the buckets let through up to now, in the order of its times."""
         entering = [waiting for member in self._members.values() for waiting in member.enter(now)]
-        entering.sort(key=lambda waiting: waiting.entered)
-        self._queue.extend(entering)
+        self._queue.extend(sorted(entering, key=lambda waiting: waiting.entered))
 
-    def _due(self, now: Ns) -> tuple[RetransmitSchedule, Retransmission] | None:
-        """What is to be repeated now, where the reserve has room for it."""
-        due = [
-            (schedule, repeat)
-            for schedule in self._schedules.values()
-            if (repeat := schedule.next_due()) is not None and self._repeat_at(repeat) <= now
-        ]
-        return min(due, key=lambda item: item[1].due, default=None)
+    def _repeats(self) -> Iterator[tuple[_Robot, _Repeat]]:
+        """What is to be repeated next of each robot."""
+        for robot in self._robots.values():
+            if robot.repeats:
+                yield robot, min(robot.repeats, key=lambda repeat: repeat.due)
 
-    def _repeat_at(self, repeat: Retransmission) -> Fraction:
-        """When a repeat may go out."""
+    def _may_repeat(self, repeat: _Repeat) -> Fraction:
+        """When a repeat may go out: where it is due, and the reserve has room for it."""
         return max(Fraction(repeat.due), self._reserve.ready(len(encode(repeat.packet))))
 
     def _transmit(
-        self, packet: Packet, arrived: Ns, entered: Fraction, now: Ns, *, repeat: bool = False
+        self, packet: Packet, entered: Fraction, now: Ns, *, repeat: bool = False
     ) -> OutgoingPacket:
         size = len(encode(packet))
         if repeat or isinstance(packet, StopPacket | HaltPacket):
             self._reserve.take(size, now)
         if not repeat:
-            self._schedule_of(packet.robot).sent(packet, now)
+            self._robot(packet.robot).sent(packet, now)
         self._free_at = max(self._free_at, Fraction(now)) + size * self._ns_per_byte
-        return OutgoingPacket(packet, arrived, entered, self._free_at, repeat)
+        return OutgoingPacket(packet, entered, self._free_at, repeat)
 
-    def _schedule_of(self, robot: int) -> RetransmitSchedule:
-        return self._schedules.setdefault(robot, RetransmitSchedule(self._first_number))
-
-    def _through_queue(self, last: QueuedPacket, now: Ns) -> Ns:
-        ahead = len(self._urgent) * OVERHEAD
-        for waiting in self._queue:
-            ahead += waiting.size
-            if waiting is last:
-                break
-        return self._carried(ahead, now)
-
-    def _carried(self, size: int, now: Ns) -> Ns:
-        """In how many ns `size` bytes more are through."""
-        return round(max(self._free_at - now, Fraction(0)) + size * self._ns_per_byte)
-
-    def _remove(self, gone: Callable[[QueuedPacket], bool]) -> int:
-        """Takes out of the queue what is `gone`; returns how much that was."""
-        before = len(self._queue)
-        self._queue = deque(waiting for waiting in self._queue if not gone(waiting))
-        return before - len(self._queue)
-
-    def _fit_reserve(self) -> None:
-        self._reserve.size = Fraction(urgent_burst(len(self._members)))
-
-
-def _same(one: RadioDrive | RadioCamera, other: RadioDrive | RadioCamera) -> bool:
-    return type(one) is type(other) and one.robot == other.robot
+    def _robot(self, robot: int) -> _Robot:
+        return self._robots.setdefault(robot, _Robot(self._first_number))
