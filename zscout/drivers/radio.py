@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
@@ -19,19 +19,15 @@ from typing import Any, Final
 from zscout.drivers.airtime import RESERVE, Share, line_rate, objection, share_of
 from zscout.drivers.commands import RadioHalt, RadioStop, radio_command
 from zscout.drivers.driver import Driver, RcHandle
-from zscout.drivers.packets import (
-    MAX_PACKET,
-    HaltPacket,
-    StopPacket,
-    encode,
-)
+from zscout.drivers.packets import MAX_PACKET, HaltPacket, StopPacket, encode
 from zscout.drivers.serial_line import CLOSE_TIMEOUT, DEPTH, SerialLine
 from zscout.drivers.transmit_queue import QueueFull, TransmitQueue
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
-from zscout.types import SECOND, Grant, Ns
+from zscout.types import SECOND, Grant, Ns, Place
 
+COUNTED: Final = ("packets", "bytes", "repeats", "halts")
 RECENT: Final = 64
 """Packets over which the longest wait is measured."""
 OPENING: Final = 1.0
@@ -53,15 +49,16 @@ class RadioDriver(Driver):
         # Not 0: the last radio of these robots may have begun there.
         self._air = TransmitQueue(self._rate, first_number=random.randrange(256))  # noqa: S311
         self._robots: dict[int, str] = {}
-        """Which robot RC an id belongs to: the first that spoke for it, while it is there."""
+        """Which robot RC an id belongs to: the first that commanded it, while it is there."""
         self._up = False
         self._why = "its line is not open yet"
         self._known = asyncio.Event()
-        """It was found out whether there is a line."""
+        """Whether there is a line was found out."""
         self._quiet = asyncio.Event()
         self._outstanding = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._packets = self._bytes = self._repeats = self._halts = self._losses = 0
+        self._losses = 0
+        self._counts = Counter(dict.fromkeys(COUNTED, 0))
         self._waits: deque[Fraction] = deque(maxlen=RECENT)
 
     async def open(self, rc: RcHandle) -> None:
@@ -113,13 +110,15 @@ class RadioDriver(Driver):
     async def end(self, holder: Holder) -> None:
         """What waits for this holder is dropped, and the robots that it drove are halted: their own RCs do so
         too, unless their hosts are gone."""
-        for robot in self._air.leave(holder.place):
-            self._send_urgent(robot, HaltPacket)
+        self._leave(holder.place)
 
     async def safe(self) -> None:
         for place in self._air.places():
-            for robot in self._air.leave(place):
-                self._send_urgent(robot, HaltPacket)
+            self._leave(place)
+
+    def _leave(self, place: Place) -> None:
+        for robot in self._air.leave(place):
+            self._send_urgent(RadioHalt(robot))
 
     # Commands
 
@@ -128,9 +127,10 @@ class RadioDriver(Driver):
         owner = self._robots.get(order.robot)
         if owner is not None and owner not in holder.rcs and self._is_offered(owner):
             raise Refused("not_yours", f"robot {order.robot} is {owner}, which this ARC does not hold")
-        self._refuse_down()
+        if not self._up:
+            raise Refused("down", self._why)
         if isinstance(order, RadioStop | RadioHalt):
-            return self._send_urgent(order.robot, StopPacket if isinstance(order, RadioStop) else HaltPacket)
+            return self._send_urgent(order)
         try:
             after = self._air.offer(holder.place, holder.grant, order, self._rc.mesh.now())
         except QueueFull:
@@ -153,19 +153,18 @@ class RadioDriver(Driver):
         owner = self._robots.get(order.robot)
         if owner is None or not self._is_offered(owner):
             self._robots[order.robot] = order.rc
-        self._refuse_down()
-        return self._send_urgent(order.robot, StopPacket if isinstance(order, RadioStop) else HaltPacket)
+        if not self._up:
+            raise Refused("down", self._why)
+        return self._send_urgent(order)
 
     def _is_offered(self, rc: str) -> bool:
         return self._rc.directory is not None and bool(self._rc.directory.hosts(rc))
 
-    def _refuse_down(self) -> None:
-        if not self._up:
-            raise Refused("down", self._why)
-
-    def _send_urgent(self, robot: int, kind: type[StopPacket] | type[HaltPacket]) -> dict[str, float]:
-        self._halts += kind is HaltPacket
-        after = self._air.send_urgent(robot, kind, self._rc.mesh.now())
+    def _send_urgent(self, order: RadioStop | RadioHalt) -> dict[str, float]:
+        halts = isinstance(order, RadioHalt)
+        self._counts["halts"] += halts
+        kind = HaltPacket if halts else StopPacket
+        after = self._air.send_urgent(order.robot, kind, self._rc.mesh.now())
         self._pump()
         return {"after": after / SECOND}
 
@@ -186,9 +185,7 @@ class RadioDriver(Driver):
             data = encode(outgoing.packet)
             if self._line.write(data):
                 self._outstanding += 1
-            self._packets += 1
-            self._bytes += len(data)
-            self._repeats += outgoing.repeat
+            self._counts.update(packets=1, bytes=len(data), repeats=outgoing.repeat)
             if not outgoing.repeat:
                 self._waits.append(outgoing.through - outgoing.entered)
         if not self._air.urgent:
@@ -200,10 +197,8 @@ class RadioDriver(Driver):
 
     def _is_in_force(self, grant: Grant) -> bool:
         """Whether the hold of a packet is in force at the moment when it goes out."""
-        held = self._rc.holds.held.get(grant)
-        return (
-            held is not None and self._rc.holds.check(grant, held.holder.client, self._rc.mesh.now()) is None
-        )
+        held, holds = self._rc.holds.held.get(grant), self._rc.holds
+        return held is not None and holds.check(grant, held.holder.client, self._rc.mesh.now()) is None
 
     def line_up(self) -> None:
         self._up, self._why, self._outstanding = True, "", 0
@@ -224,15 +219,8 @@ class RadioDriver(Driver):
         self._pump()
 
     def figures(self) -> Figures:
+        counts = {name: float(self._counts[name]) for name in COUNTED}
+        waits = {name: float(getattr(self._air, name)) for name in ("replaced", "dropped", "waiting")}
         worst = max(self._waits, default=Fraction(0))
-        return {
-            "packets": float(self._packets),
-            "bytes": float(self._bytes),
-            "repeats": float(self._repeats),
-            "halts": float(self._halts),
-            "replaced": float(self._air.replaced),
-            "dropped": float(self._air.dropped),
-            "waiting": float(self._air.waiting),
-            "longest_wait_ms": round(float(worst / SECOND * 1000), 1),
-            "unplugged": float(self._losses),
-        }
+        longest = round(float(worst / SECOND * 1000), 1)
+        return counts | waits | {"longest_wait_ms": longest, "unplugged": float(self._losses)}
