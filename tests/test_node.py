@@ -14,7 +14,7 @@ from zscout import node as node_module
 from zscout.config.node import Node, load_node
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.keyexpr import Role, Sender, Token
-from zscout.mesh.memory import MemoryNetwork
+from zscout.lab.faults.memory import MemoryNetwork
 from zscout.node import NodeFailed, run_services
 from zscout.services.node.component_host import ComponentHost
 

@@ -24,7 +24,7 @@ from zscout.drivers.registry import driver_for
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError, ZenohMesh
-from zscout.mesh.stall import StallWatch
+from zscout.mesh.supervision import StallWatch
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.node.load_reporter import LoadReporter
 from zscout.services.rcm.candidate import Candidate

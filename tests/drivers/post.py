@@ -15,7 +15,7 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.drivers.robot import RobotDriver
 from zscout.keyexpr import Sender
 from zscout.mesh import Mesh, ZenohMesh
-from zscout.mesh.stall import StallWatch
+from zscout.mesh.supervision import StallWatch
 from zscout.messages import Command, Done
 from zscout.types import SECOND, Grant
 

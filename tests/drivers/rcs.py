@@ -11,9 +11,9 @@ from typing import Any, Final
 from zscout.drivers.driver import Driver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token
+from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import IncomingQuery, Mesh
-from zscout.mesh.memory import MemoryNetwork
-from zscout.mesh.stall import StallWatch
+from zscout.mesh.supervision import StallWatch
 from zscout.messages import Command, Done, Grants, Holder, HoldView, RcmState, StateAsk
 from zscout.types import Grant, Place, Term
 

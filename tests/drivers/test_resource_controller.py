@@ -14,8 +14,8 @@ from tests.mesh.kit import run, until
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.resource_controller import EARLY_PER_HOST, CommandQuery, ResourceController, WorkQueue
 from zscout.keyexpr import Role, Sender
+from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import Mesh
-from zscout.mesh.memory import MemoryNetwork
 from zscout.messages import Grants, RcState
 from zscout.types import SECOND, Grant
 

@@ -14,7 +14,7 @@ from zscout.drivers.driver import Driver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.mesh import ZenohMesh
-from zscout.mesh.stall import StallWatch
+from zscout.mesh.supervision import StallWatch
 from zscout.messages import Done, Holder
 from zscout.types import SECOND, Grant
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from zscout.mesh.virtual_time import run
+from zscout.lab.faults.virtual_time import run
 
 __all__ = ["run", "until"]
 

@@ -8,9 +8,9 @@ import threading
 import pytest
 
 from tests.mesh.kit import run, until
-from zscout.mesh import inbox
-from zscout.mesh.exchange import Refused
-from zscout.mesh.inbox import BURST, Backlog, Inbox
+from zscout.mesh import session
+from zscout.mesh.exchange import Backlog, Refused
+from zscout.mesh.session import BURST, Inbox
 
 
 def test_items_of_several_threads_are_handled_in_the_order_of_each() -> None:
@@ -50,7 +50,7 @@ def test_others_have_their_turn_between_two_bursts() -> None:
 
 
 def test_each_declaration_and_the_inbox_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inbox, "INBOX_DEPTH", 5)
+    monkeypatch.setattr(session, "INBOX_DEPTH", 5)
 
     async def story() -> None:
         box = Inbox(asyncio.get_running_loop())

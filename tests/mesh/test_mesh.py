@@ -18,11 +18,10 @@ from tests.mesh.kit import until
 from zscout import messages
 from zscout.config.fleet import MeshConfig
 from zscout.keyexpr import BadName, Role, Sender, Token, new_instance
-from zscout.mesh import IncomingQuery, MeshError, Refused, ZenohMesh, inbox
-from zscout.mesh.memory import MemoryNetwork
-from zscout.mesh.session import SessionMesh
+from zscout.lab.faults.memory import MemoryNetwork
+from zscout.lab.faults.virtual_time import VirtualTimeLoop
+from zscout.mesh import IncomingQuery, Mesh, MeshError, Refused, ZenohMesh, session
 from zscout.mesh.transport import Collector, Quality
-from zscout.mesh.virtual_time import VirtualTimeLoop
 from zscout.messages import MAX_FRAME, FrameHead, Message
 from zscout.types import SECOND
 
@@ -54,9 +53,9 @@ class World:
 
     def __init__(self, stack: AsyncExitStack) -> None:
         self._stack = stack
-        self.meshes: list[SessionMesh] = []
+        self.meshes: list[Mesh] = []
 
-    async def open(self, *names: str) -> list[SessionMesh]:
+    async def open(self, *names: str) -> list[Mesh]:
         for name in names:
             self.meshes.append(await self._stack.enter_async_context(await self._open(Sender(name, "test"))))
         await until(lambda: all(mesh.links() >= len(self.meshes) - 1 for mesh in self.meshes))
@@ -71,7 +70,7 @@ class World:
                 await _sees(other, token)
             fence.close()
 
-    async def _open(self, me: Sender) -> SessionMesh:
+    async def _open(self, me: Sender) -> Mesh:
         raise NotImplementedError
 
     async def occupied(self, condition: Callable[[], object]) -> None:
@@ -82,7 +81,7 @@ class World:
 class Zenoh(World):
     _ports: list[int]
 
-    async def _open(self, me: Sender) -> SessionMesh:
+    async def _open(self, me: Sender) -> Mesh:
         self._ports = getattr(self, "_ports", [])
         endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in self._ports)
         while True:
@@ -103,7 +102,7 @@ class Zenoh(World):
 
 
 class Memory(World):
-    async def _open(self, me: Sender) -> SessionMesh:
+    async def _open(self, me: Sender) -> Mesh:
         self.network: MemoryNetwork = getattr(self, "network", None) or MemoryNetwork()
         return self.network.open("test", me)
 
@@ -136,7 +135,7 @@ def play(request: pytest.FixtureRequest) -> Callable[[Story], None]:
 Play: TypeAlias = Callable[[Story], None]
 
 
-async def _sees(mesh: SessionMesh, token: Token) -> None:
+async def _sees(mesh: Mesh, token: Token) -> None:
     seen = asyncio.Event()
     watch = mesh.watch(mesh.keys.alive(token), lambda _, alive: seen.set() if alive else None)
     await seen.wait()
@@ -155,11 +154,11 @@ class Replies(Collector):
         self.over = True
 
 
-def pong(mesh: SessionMesh) -> Callable[[IncomingQuery[Ping]], None]:
+def pong(mesh: Mesh) -> Callable[[IncomingQuery[Ping]], None]:
     return lambda query: query.answer(Pong(query.message.number, mesh.me.host))
 
 
-async def timed(mesh: SessionMesh, asked: Awaitable[Any]) -> tuple[Any, float]:
+async def timed(mesh: Mesh, asked: Awaitable[Any]) -> tuple[Any, float]:
     before = mesh.now()
     result = await asked
     return result, (mesh.now() - before) / SECOND
@@ -715,7 +714,7 @@ def test_a_token_with_a_bad_name_is_ignored(play: Play) -> None:
 def test_neither_a_death_nor_the_end_of_a_query_is_lost_where_the_inbox_is_full(
     play: Play, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inbox, "INBOX_DEPTH", 3)
+    monkeypatch.setattr(session, "INBOX_DEPTH", 3)
 
     async def story(world: World) -> None:
         a, b = await world.open("a", "b")

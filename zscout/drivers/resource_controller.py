@@ -18,7 +18,7 @@ from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.rc_directory import RcDirectory
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
-from zscout.mesh.stall import StallWatch
+from zscout.mesh.supervision import StallWatch
 from zscout.messages import (
     Ballot,
     Command,

@@ -1,21 +1,27 @@
-"""One query and its replies, as messages."""
+"""What services send and receive: queries with their replies, and what a process has declared on the mesh."""
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import msgspec
 
 from zscout import messages
-from zscout.mesh.transport import TransportQuery
+from zscout.mesh.transport import TransportPublisher, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem
 from zscout.types import Ns, Term
 
-log = logging.getLogger(__name__)
+QUEUE_DEPTH = 1_024
+"""Items of one declaration that may wait for the event loop."""
 
 R = TypeVar("R")
+S = TypeVar("S")
+
+
+class MeshError(Exception):
+    """The mesh can't be joined, or is closed; the message names the remedy."""
 
 
 class Refused(Exception):
@@ -56,21 +62,75 @@ class IncomingQuery(Generic[R]):
     def refuse(self, problem: Problem) -> None:
         query, self._query = self._query, None
         if query is not None:
-            refuse(query, problem)
+            query.reply_error(messages.encode(problem), Problem)
 
 
-def refuse(query: TransportQuery, problem: Problem) -> None:
-    query.reply_error(messages.encode(problem), Problem)
+class Publisher:
+    """Publishes messages of one kind on one key."""
+
+    def __init__(self, publisher: TransportPublisher) -> None:
+        self._publisher = publisher
+        self.close = publisher.undeclare
+
+    def put(self, message: msgspec.Struct) -> None:
+        self._publisher.put(messages.encode(message))
 
 
-def read_reply(key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -> Reply[R] | None:
-    try:
-        if ok:
-            return Reply(key, messages.decode(payload, kind, limit))
-        if payload == b"Timeout":
-            return None
-        problem: Problem = messages.decode(payload, Problem)
-        return Reply("", None, problem)
-    except Malformed as error:
-        log.warning("a reply was malformed: %s", error)
-        return None
+@dataclass(slots=True)
+class Backlog:
+    """Of one declaration: how many of its items wait, and how many were dropped because `depth` did."""
+
+    pending: int = 0
+    missed: int = 0
+    closed: bool = False
+    depth: int = QUEUE_DEPTH
+
+
+class Declaration:
+    """A declaration, to be undeclared once."""
+
+    def __init__(self, undeclare: Undeclare, state: Backlog | None = None) -> None:
+        self._undeclare: Undeclare | None = undeclare
+        self._state = state or Backlog()
+
+    @property
+    def missed(self) -> int:
+        """Publications that were dropped because the queue was full."""
+        return self._state.missed
+
+    def close(self) -> None:
+        undeclare, self._undeclare = self._undeclare, None
+        if undeclare is not None:
+            undeclare()
+
+
+class Overheard(Declaration, Generic[S]):
+    """The latest publications on a key, kept outside the event loop until they are taken."""
+
+    def __init__(
+        self,
+        take: Callable[[], tuple[str, bytes] | None],
+        undeclare: Undeclare,
+        kind: type[S],
+        depth: int,
+    ) -> None:
+        super().__init__(undeclare)
+        self._take, self._kind, self._depth = take, kind, depth
+
+    def take(self) -> list[S]:
+        """What was published since the last call, oldest first; malformed messages are dropped silently."""
+        return [message for _, message in self.each()]
+
+    def each(self) -> Iterator[tuple[str, S]]:
+        """The same one by one, each with its key; what is not consumed is kept for the next call. Ends after
+        as many as there is room for: more may arrive meanwhile."""
+        for _ in range(self._depth):
+            sample = self._take()
+            if sample is None:
+                return
+            key, payload = sample
+            try:
+                message: S = messages.decode(payload, self._kind, messages.MAX_STATE)
+            except Malformed:
+                continue
+            yield key, message

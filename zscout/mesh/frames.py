@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Self
 
 from zscout import messages
-from zscout.mesh.inbox import Inbox
 from zscout.mesh.transport import Transport, TransportPublisher
 from zscout.messages import MAX_FRAME, FrameHead, Malformed
 from zscout.types import Ns
@@ -39,9 +38,9 @@ class Frame:
 class FramePublisher:
     """Publishes frames on one key. `put` may be called from any one thread at a time."""
 
-    def __init__(self, publisher: TransportPublisher, inbox: Inbox) -> None:
-        self._publisher = publisher
-        self._inbox = inbox
+    def __init__(self, publisher: TransportPublisher, deliver: Callable[..., None]) -> None:
+        self._publisher, self._deliver = publisher, deliver
+        self.close = publisher.undeclare
         self._watched = False
 
     @property
@@ -58,7 +57,7 @@ class FramePublisher:
                 changed(watched)
 
         def on_matching(watched: bool) -> None:
-            self._inbox.deliver(update, watched)
+            self._deliver(update, watched)
 
         update(self._publisher.match(on_matching))
 
@@ -69,15 +68,14 @@ class FramePublisher:
             raise ValueError(f"a frame of {len(jpeg)} bytes is too large; at most {MAX_FRAME} are sent")
         self._publisher.put(jpeg, messages.encode(head))
 
-    def close(self) -> None:
-        self._publisher.undeclare()
-
 
 class FrameWatch:
     """The newest frame on a key (or of each publication on a key expression, whichever came last)."""
 
-    def __init__(self, transport: Transport, key: str, inbox: Inbox, now: Callable[[], Ns]) -> None:
-        self._inbox, self._now = inbox, now
+    def __init__(
+        self, transport: Transport, key: str, deliver: Callable[..., None], now: Callable[[], Ns]
+    ) -> None:
+        self._deliver, self._now = deliver, now
         self._lock = threading.Lock()
         self._newest: tuple[str, bytes, bytes | None, Ns] | None = None
         self._arrived = asyncio.Event()
@@ -93,7 +91,7 @@ class FrameWatch:
             if replaced:
                 self.missed += 1
         if not replaced:
-            self._inbox.deliver(self._arrived.set)
+            self._deliver(self._arrived.set)
 
     def take(self) -> Frame | None:
         """The newest frame, if there is one that was not taken yet."""

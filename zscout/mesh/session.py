@@ -1,27 +1,45 @@
-"""A mesh over a transport: JSON messages, bounded queues, and one thread for all handlers."""
+"""A process's place on the mesh: JSON messages over a transport, and one event loop for all handlers.
+
+What arrives on Zenoh's threads goes through one bounded inbox into the event loop, in the order in which it
+came, with one wake-up for a burst. Handlers are plain functions that run there and must not block.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, Self, TypeAlias, TypeVar
 
 import msgspec
 
 from zscout import messages
 from zscout.keyexpr import BadName, Keys, Sender, Token
-from zscout.mesh.declared import Declaration, Overheard, Publisher, Shared
-from zscout.mesh.exchange import IncomingQuery, Refused, Reply, read_reply, refuse
+from zscout.mesh.exchange import (
+    QUEUE_DEPTH,
+    Backlog,
+    Declaration,
+    IncomingQuery,
+    Overheard,
+    Publisher,
+    Refused,
+    Reply,
+)
 from zscout.mesh.frames import FramePublisher, FrameWatch
-from zscout.mesh.inbox import INBOX_DEPTH, QUEUE_DEPTH, Backlog, Inbox
-from zscout.mesh.protocol import OVERHEARD, Mesh
 from zscout.mesh.transport import Collector, Quality, Transport, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem
 from zscout.types import Ns
 
 log = logging.getLogger(__name__)
 
+INBOX_DEPTH = 20_000
+"""Items of all kinds that may wait for the event loop."""
+BURST = 256
+"""Items that are handled in one go at most, those included that arrive meanwhile."""
+OVERHEARD = 32
+"""Publications that `overhear` keeps."""
 FINAL_SLACK = 0.5
 """Seconds after its timeout at which a query is over though the transport has not said so."""
 
@@ -32,15 +50,103 @@ S = TypeVar("S")
 R = TypeVar("R")
 
 
-class SessionMesh(Mesh):
-    """What the mesh does alike on every transport. An async context manager."""
+@dataclass(slots=True)
+class Inbox:
+    """From Zenoh's threads into the event loop, waking it once for whatever has gathered."""
 
-    def __init__(self, transport: Transport, keys: Keys, me: Sender, loop: asyncio.AbstractEventLoop) -> None:
+    loop: asyncio.AbstractEventLoop
+    items: deque[tuple[Backlog | None, Callable[..., None], tuple[Any, ...]]] = field(default_factory=deque)
+    scheduled: bool = False
+    closed: bool = False
+    draining: bool = False
+    after: list[Callable[[], None]] = field(default_factory=list)
+    """What is called once the present burst has been handled."""
+
+    def offer(self, state: Backlog, call: Callable[..., None], *args: Any) -> bool:
+        """Calls `call(*args)` in the event loop, unless too much waits there: whether it will."""
+        if self.closed or len(self.items) >= INBOX_DEPTH or state.pending >= state.depth:
+            return False
+        state.pending += 1
+        return self._put(state, call, args)
+
+    def deliver(self, call: Callable[..., None], *args: Any) -> None:
+        """The same of what must not be lost, such as deaths and ends of queries. Of these there are as many
+        as there are processes and own queries."""
+        if not self.closed:
+            self._put(None, call, args)
+
+    def close(self) -> None:
+        """Nothing is called any more, what waits included."""
+        self.closed = True
+        self.items.clear()
+
+    def _put(self, *item: Any) -> bool:
+        self.items.append(item)
+        if not self.scheduled:
+            self.scheduled = True
+            try:
+                self.loop.call_soon_threadsafe(self.drain)
+            except RuntimeError:  # the loop is closed: the process is on its way out
+                self.closed = True
+                return False
+        return True
+
+    def drain(self) -> None:
+        self.draining = True
+        try:
+            for _ in range(BURST):
+                if not self.items or self.closed:
+                    break
+                state, call, args = self.items.popleft()
+                if state is not None:
+                    state.pending -= 1
+                guarded(call, *args)
+            self.draining = False
+            after, self.after = self.after, []
+            for then in after:
+                guarded(then)
+        finally:
+            self.draining = False
+            # In this order: a thread that offers something now either sees that nobody is coming, or is seen.
+            self.scheduled = False
+            if self.items and not self.closed:
+                self.scheduled = True
+                self.loop.call_soon(self.drain)
+
+
+def guarded(call: Callable[..., None], *args: Any) -> None:
+    """Calls a handler; what it raises is logged, if it was not yet."""
+    try:
+        call(*args)
+    except Refused:  # by a supervised handler: it is logged there
+        pass
+    except BadName as error:
+        log.warning("ignored what came under a bad name: %s", error)
+    except Exception:
+        log.exception("a handler failed")
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """One whose publications are decoded once for all handlers of this process."""
+
+    state: Backlog
+    handlers: list[Callable[[str, Any], None]] = field(default_factory=list)
+    undeclare: Undeclare = lambda: None
+
+
+class Mesh:
+    """One process's place on the mesh, an async context manager: typed queries, publications, liveliness, and
+    a clock.
+
+    Declare once per purpose, never per request: Zenoh keeps memory for every key that was ever declared."""
+
+    def __init__(self, transport: Transport, keys: Keys, me: Sender, now: Callable[[], Ns]) -> None:
+        self.keys, self.me, self.now = keys, me, now
+        """`now()` is in nanoseconds on this host's monotonic clock. Not comparable between hosts."""
         self._transport = transport
-        self._inbox = Inbox(loop)
-        self._shared: dict[tuple[Any, ...], Shared] = {}
-        self.keys = keys
-        self.me = me
+        self._inbox = Inbox(asyncio.get_running_loop())
+        self._shared: dict[tuple[Any, ...], _Subscription] = {}
 
     async def __aenter__(self) -> Self:
         return self
@@ -49,13 +155,16 @@ class SessionMesh(Mesh):
         await self.close()
 
     def links(self) -> int:
+        """How many peers this process is linked to."""
         return self._transport.links()
 
     async def close(self) -> None:
+        """Leaves the mesh: tokens die, and no handler is called any more. Bounded in time."""
         self._inbox.close()
         await self._transport.close()
 
     def after_burst(self, then: Callable[[], None]) -> None:
+        """Calls `then` once all that has arrived together is handled: at once, where nothing arrives."""
         if self._inbox.draining:
             self._inbox.after.append(then)
         else:
@@ -73,10 +182,14 @@ class SessionMesh(Mesh):
         enough: Callable[[Reply[R]], bool] | None = None,
         limit: int = messages.MAX_STATE,
     ) -> list[Reply[R]]:
+        """Queries all who serve `key`, and returns the replies that came within `timeout` seconds.
+
+        Returns as soon as a reply is `enough`. No reply at all means that the outcome is unknown: the query
+        may have been carried out or not. Raises MeshError where the query can't be sent."""
         replies: list[Reply[R]] = []
 
         def on_reply(key: str, payload: bytes, ok: bool) -> bool:
-            reply = read_reply(key, payload, ok, kind, limit)
+            reply = _read_reply(key, payload, ok, kind, limit)
             if reply is None:
                 return False
             replies.append(reply)
@@ -88,6 +201,7 @@ class SessionMesh(Mesh):
     async def ask_one(
         self, key: str, message: msgspec.Struct | None, kind: type[R], *, timeout: float
     ) -> Reply[R] | None:
+        """The first reply, message or problem; None if there was none within `timeout` seconds."""
         replies = await self.ask(key, message, kind, timeout=timeout, enough=lambda _: True)
         return replies[0] if replies else None
 
@@ -100,19 +214,19 @@ class SessionMesh(Mesh):
         *,
         timeout: float,
     ) -> None:
+        """Queries, and calls `then` once with the first reply or None: cheaper than a task that waits."""
         first: Reply[R] | None = None
 
         def on_reply(key: str, payload: bytes, ok: bool) -> bool:
             nonlocal first
-            first = read_reply(key, payload, ok, kind, messages.MAX_STATE)
+            first = _read_reply(key, payload, ok, kind, messages.MAX_STATE)
             return first is not None
 
         self._get(key, message, timeout, _Collector(self._inbox, on_reply, lambda: then(first)))
 
     def _get(self, key: str, message: msgspec.Struct | None, timeout: float, to: Collector) -> None:
         payload = None if message is None else messages.encode(message)
-        kind = None if message is None else type(message)
-        self._transport.get(key, payload, kind, timeout, to)
+        self._transport.get(key, payload, None if message is None else type(message), timeout, to)
 
     async def _all(self, query: Callable[[Collector], None], on_reply: OnReply, timeout: float) -> None:
         """Makes a query, and returns when it is over, or when `on_reply` says that it is enough."""
@@ -139,6 +253,11 @@ class SessionMesh(Mesh):
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_PAYLOAD,
     ) -> Declaration:
+        """Calls `handler` for queries on `key` whose message is of `kind`.
+
+        A payload that is not one is refused before the handler sees it, with code `malformed`; a query whose
+        own key holds a wildcard is answered on `key` itself where that is concrete, and refused otherwise;
+        with `depth` queries waiting for the event loop, further ones are refused as `busy`."""
         state = Backlog(depth=depth)
         wild = "*" in key
 
@@ -146,7 +265,7 @@ class SessionMesh(Mesh):
             if state.closed:
                 query.drop()
             elif not self._inbox.offer(state, handle, query, self.now()):
-                refuse(query, Problem("busy", "too many requests are waiting here; ask again"))
+                _refuse(query, "busy", "too many requests are waiting here; ask again")
 
         def handle(query: TransportQuery, arrived: Ns) -> None:
             if state.closed:
@@ -155,13 +274,13 @@ class SessionMesh(Mesh):
                 return
             asked = query.key
             if wild and "*" in asked:
-                refuse(query, Problem("bad_key", f"name yourself in the key {key}: no wildcards"))
+                _refuse(query, "bad_key", f"name yourself in the key {key}: no wildcards")
                 return
             payload = query.payload
             try:
                 message = messages.decode(b"{}" if payload is None else payload, kind, limit)
             except Malformed as error:
-                refuse(query, Problem("malformed", str(error)))
+                _refuse(query, "malformed", str(error))
                 return
             incoming: IncomingQuery[Any] = IncomingQuery(
                 query, asked, asked if wild else key, message, arrived
@@ -181,10 +300,13 @@ class SessionMesh(Mesh):
     # Publications
 
     def publisher(self, key: str, kind: type, *, data: bool = False) -> Publisher:
+        """A publisher for control messages, which block rather than get lost; with `data` they are dropped
+        rather than wait, and yield to control."""
         quality = Quality.DATA if data else Quality.CONTROL
         return Publisher(self._transport.publisher(key, kind, quality))
 
     def put(self, key: str, message: msgspec.Struct) -> None:
+        """Publishes one control message without a declaration: for keys of which there are many."""
         self._transport.put(key, messages.encode(message), type(message))
 
     def subscribe(
@@ -196,10 +318,14 @@ class SessionMesh(Mesh):
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_STATE,
     ) -> Declaration:
+        """Calls `handler(key, message)` for every publication on `key`; malformed ones are logged, those that
+        find `depth` waiting are dropped, and counted as missed.
+
+        All subscriptions that are alike share one declaration and one decoding of each message."""
         alike = (key, kind, depth, limit)
         shared = self._shared.get(alike)
         if shared is None:
-            shared = self._shared[alike] = Shared(Backlog(depth=depth))
+            shared = self._shared[alike] = _Subscription(Backlog(depth=depth))
             shared.undeclare = self._subscribe(key, kind, shared, limit)
         handlers, state, undeclare = shared.handlers, shared.state, shared.undeclare
         handlers.append(handler)
@@ -213,15 +339,13 @@ class SessionMesh(Mesh):
 
         return Declaration(leave, state)
 
-    def _subscribe(self, key: str, kind: type[S], shared: Shared, limit: int) -> Undeclare:
-        state = shared.state
-
+    def _subscribe(self, key: str, kind: type[S], shared: _Subscription, limit: int) -> Undeclare:
         def on_sample(name: str, payload: bytes, _: bytes | None) -> None:
-            if not self._inbox.offer(state, handle, name, payload):
-                state.missed += 1
+            if not self._inbox.offer(shared.state, handle, name, payload):
+                shared.state.missed += 1
 
         def handle(name: str, payload: bytes) -> None:
-            if state.closed:
+            if shared.state.closed:
                 return
             try:
                 message: S = messages.decode(payload, kind, limit)
@@ -229,34 +353,33 @@ class SessionMesh(Mesh):
                 log.warning("ignored a publication on %.200r: %s", name, error)
                 return
             for handler in tuple(shared.handlers):
-                try:
-                    handler(name, message)
-                except BadName as error:
-                    log.warning("ignored a publication on %.200r: %s", name, error)
-                except Refused:  # by a supervised handler: it is logged there
-                    pass
-                except Exception:
-                    log.exception("a handler failed")
+                guarded(handler, name, message)
 
         return self._transport.subscriber(key, on_sample)
 
     def overhear(self, key: str, kind: type[S], *, depth: int = OVERHEARD) -> Overheard[S]:
+        """Keeps the latest `depth` publications on `key`, without waking the event loop, until they are
+        taken."""
         return Overheard(*self._transport.ring(key, depth), kind, depth)
 
     # Frames
 
     def frame_publisher(self, key: str) -> FramePublisher:
-        return FramePublisher(self._transport.publisher(key, None, Quality.FRAME), self._inbox)
+        """A publisher of JPEG frames, which knows whether there are subscribers."""
+        return FramePublisher(self._transport.publisher(key, None, Quality.FRAME), self._inbox.deliver)
 
     def frames(self, key: str) -> FrameWatch:
-        return FrameWatch(self._transport, key, self._inbox, self.now)
+        """The newest frame on `key`, to be taken as often as the caller can. Close it."""
+        return FrameWatch(self._transport, key, self._inbox.deliver, self.now)
 
     # Liveliness
 
     def alive(self, token: Token) -> Declaration:
+        """Declares a liveliness token, until it is closed or this process is gone."""
         return Declaration(self._transport.token(self.keys.alive(token)))
 
     def watch(self, key: str, handler: Callable[[Token, bool], None]) -> Declaration:
+        """Calls `handler(token, alive)` for tokens on `key`, those that live already included."""
         state = Backlog()
 
         def on_token(text: str, alive: bool) -> None:
@@ -270,6 +393,7 @@ class SessionMesh(Mesh):
         return _closing(state, self._transport.token_subscriber(key, on_token))
 
     async def living(self, key: str, *, timeout: float) -> list[Token]:
+        """The tokens on `key` that live now, sorted."""
         found: set[str] = set()
 
         def on_reply(text: str, *_: object) -> bool:
@@ -313,6 +437,23 @@ class _Collector(Collector):
             self._over()
 
 
+def _read_reply(key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -> Reply[R] | None:
+    try:
+        if ok:
+            return Reply(key, messages.decode(payload, kind, limit))
+        if payload == b"Timeout":
+            return None
+        problem: Problem = messages.decode(payload, Problem)
+        return Reply("", None, problem)
+    except Malformed as error:
+        log.warning("a reply was malformed: %s", error)
+        return None
+
+
+def _refuse(query: TransportQuery, code: str, message: str) -> None:
+    query.reply_error(messages.encode(Problem(code, message)), Problem)
+
+
 def _closing(state: Backlog, undeclare: Undeclare) -> Declaration:
     """A declaration after whose end nothing that still waits is handled."""
 
@@ -320,4 +461,4 @@ def _closing(state: Backlog, undeclare: Undeclare) -> Declaration:
         state.closed = True
         undeclare()
 
-    return Declaration(leave, state)
+    return Declaration(leave)

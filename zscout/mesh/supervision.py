@@ -1,22 +1,31 @@
-"""Supervised work of one service: its tasks, timers and handlers live and fail together."""
+"""How the work of a process goes: tasks, timers and handlers of a service live and fail together; the host's
+clock; and whether the process stood still."""
 
 from __future__ import annotations
 
 import asyncio
 import functools
 import logging
+import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Final, ParamSpec, Self, TypeVar
 from weakref import WeakSet
 
 from zscout.keyexpr import BadName
 from zscout.mesh.exchange import Refused
+from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
 
 CLOSE_TIMEOUT = 5.0
 """Seconds that `close` waits for cancelled tasks."""
+STALL_PERIOD = 0.2
+"""Seconds between two readings of the clock."""
+STALL_THRESHOLD = SECOND // 5
+"""A reading that comes this much too late means a stall."""
+AFTERMATH = SECOND // 4
+"""What comes out of the network this soon after a stall may have waited through it."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -159,3 +168,59 @@ def _current_task() -> asyncio.Task[Any] | None:
         return asyncio.current_task()
     except RuntimeError:  # the loop has stopped
         return None
+
+
+class HostClock:
+    """Monotonic, and it goes on while the machine is suspended. Not comparable between hosts."""
+
+    def now(self) -> Ns:
+        """Nanoseconds since boot."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+clock: Final = HostClock()
+
+
+class StallWatch:
+    """The last stall of this process, stopped, suspended or starved, on the clock `now`: how long it was, and
+    when it ended. One watch per process."""
+
+    def __init__(self, now: Callable[[], Ns] = clock.now) -> None:
+        self.length: Ns = 0
+        self.ended: Ns = 0
+        self._now = now
+        self._last = now()
+        self._timer: asyncio.TimerHandle | None = None
+
+    def start(self) -> Self:
+        self._last = self._now()
+        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD, self._beat)
+        return self
+
+    def stop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def check(self) -> None:
+        """Records a stall that has just ended."""
+        now = self._now()
+        gap = now - self._last - round(STALL_PERIOD * SECOND)
+        if gap > STALL_THRESHOLD:
+            self.length, self.ended = gap, now
+            log.warning("this process stood still for %.2f s", gap / SECOND)
+        self._last = now
+
+    def waited_through(self, arrived: Ns) -> Ns:
+        """How long something may have waited in the network that came out of it at `arrived`."""
+        self.check()
+        return self.length if self.length and arrived <= self.ended + AFTERMATH else 0
+
+    def fresh(self) -> bool:
+        """Whether a stall ended so lately that what came meanwhile may not have been handled yet."""
+        self.check()
+        return bool(self.length) and self._now() - self.ended <= AFTERMATH
+
+    def _beat(self) -> None:
+        self.check()
+        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD, self._beat)

@@ -1,9 +1,10 @@
-"""The mesh over Zenoh."""
+"""The mesh over Zenoh: its settings, with every trap taken into account, and a session as a transport."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
 import threading
 from collections.abc import Callable
@@ -15,10 +16,9 @@ from zenoh.handlers import Callback, RingChannel
 from zscout import messages
 from zscout.config.fleet import MeshConfig
 from zscout.keyexpr import Keys, Sender
-from zscout.mesh import clock
-from zscout.mesh.protocol import MeshError
-from zscout.mesh.session import SessionMesh
-from zscout.mesh.settings import zenoh_config
+from zscout.mesh.exchange import MeshError
+from zscout.mesh.session import Mesh
+from zscout.mesh.supervision import clock
 from zscout.mesh.transport import (
     Collector,
     OnSample,
@@ -28,10 +28,14 @@ from zscout.mesh.transport import (
     TransportQuery,
     Undeclare,
 )
-from zscout.types import Ns
 
 log = logging.getLogger(__name__)
 
+BLOCK_US = 100_000
+"""The longest that a publication waits for a peer that does not read, before that peer is given up."""
+CONTROL_BATCHES = 8
+"""Control messages under way to one peer: with fewer, an answer waits until the message before it is out."""
+SCOUTING_DELAY_MS = 200
 CLOSE_TIMEOUT = 3.0
 """Seconds that closing a session may take."""
 CONTROL: Any = {
@@ -55,7 +59,31 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
 _ENCODINGS: dict[type, zenoh.Encoding] = {}
 
 
-class ZenohMesh(SessionMesh):
+def zenoh_config(config: MeshConfig) -> zenoh.Config:
+    """The Zenoh settings behind a `[mesh]` table."""
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "scouting/multicast/enabled": config.multicast,
+        "scouting/multicast/address": config.multicast_address,
+        "scouting/multicast/interface": config.interface,
+        "scouting/delay": SCOUTING_DELAY_MS,
+        "transport/link/tx/lease": round(config.lease * 1000),
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_US,
+        "transport/link/tx/queue/size": {"interactive_high": CONTROL_BATCHES},
+        "transport/shared_memory/enabled": False,
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
+    }
+    if config.listen:
+        settings["listen/endpoints"] = list(config.listen)
+    if config.connect:
+        settings["connect/endpoints"] = list(config.connect)
+    result = zenoh.Config()
+    for key, value in settings.items():
+        result.insert_json5(key, json.dumps(value))
+    return result
+
+
+class ZenohMesh(Mesh):
     """The mesh over a Zenoh session of this process."""
 
     @classmethod
@@ -69,10 +97,7 @@ class ZenohMesh(SessionMesh):
             raise MeshError(
                 f"the mesh can't be joined: {error}; check listen and connect under [mesh]"
             ) from None
-        return cls(ZenohTransport(session), keys, me, asyncio.get_running_loop())
-
-    def now(self) -> Ns:
-        return clock.now()
+        return cls(ZenohTransport(session), keys, me, clock.now)
 
 
 class ZenohTransport(Transport):

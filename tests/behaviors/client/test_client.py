@@ -16,9 +16,9 @@ from zscout.config.fleet import default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import ZenohMesh
-from zscout.mesh.memory import MemoryMesh, MemoryNetwork
-from zscout.mesh.stall import StallWatch
+from zscout.mesh.supervision import StallWatch
 from zscout.messages import Grants
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import SECOND

@@ -13,7 +13,7 @@ from zscout.behaviors.components.migration import RESTORE_TIMEOUT, NotMoved, Out
 from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Sender
-from zscout.mesh.memory import MemoryNetwork
+from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import ComponentOperation, ComponentSpec, ComponentView
 from zscout.types import SECOND
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.mesh.kit import run, until
 from zscout.keyexpr import Role, Sender, Token
-from zscout.mesh.memory import MemoryNetwork
+from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import LoadReport
 from zscout.services.node import load_reporter
 from zscout.services.node.load_reporter import LoadReporter

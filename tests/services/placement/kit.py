@@ -11,8 +11,8 @@ import msgspec
 from tests.mesh.kit import until
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import Declaration, IncomingQuery, Refused
-from zscout.mesh.memory import MemoryMesh, MemoryNetwork
 from zscout.messages import (
     ComponentList,
     ComponentOperation,

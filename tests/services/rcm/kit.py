@@ -11,8 +11,8 @@ import msgspec
 
 from zscout.config.fleet import Fleet, default_fleet
 from zscout.keyexpr import Role, Sender, Token
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import IncomingQuery, Refused
-from zscout.mesh.memory import MemoryMesh, MemoryNetwork
 from zscout.messages import (
     Ask,
     Ballot,

@@ -13,7 +13,7 @@ from tests.mesh.kit import run, until
 from tests.services.recorder.paper_run import SCOUT33, events, lanes
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
-from zscout.mesh.memory import MemoryMesh, MemoryNetwork
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.messages import Grants, Holder, Notice, RcmState, StateAsk
 from zscout.services.recorder.recorder import Recorder, RecorderFailed
 from zscout.services.recorder.timeline import Timeline

@@ -16,7 +16,7 @@ from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStor
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
-from zscout.mesh.stall import StallWatch
+from zscout.mesh.supervision import StallWatch
 from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd
 from zscout.types import NO_TERM, SECOND, Ns, Term
 

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from tests.mesh.kit import run
-from zscout.mesh.virtual_time import START, Deadlock
+from zscout.lab.faults.virtual_time import START, Deadlock
 
 
 def test_hours_pass_at_once_and_in_order() -> None:

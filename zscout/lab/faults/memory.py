@@ -18,8 +18,7 @@ from typing import Any, Final
 import zenoh
 
 from zscout.keyexpr import Keys, Sender
-from zscout.mesh.protocol import Mesh, MeshError
-from zscout.mesh.session import SessionMesh
+from zscout.mesh import Mesh, MeshError
 from zscout.mesh.transport import (
     Collector,
     OnSample,
@@ -37,13 +36,10 @@ def intersects(one: str, other: str) -> bool:
     return one == other or zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other))
 
 
-class MemoryMesh(SessionMesh):
+class MemoryMesh(Mesh):
     """One process's place on a MemoryNetwork; `network.open(...)` makes it."""
 
     _transport: MemoryTransport
-
-    def now(self) -> Ns:
-        return round(self._inbox.loop.time() * SECOND)
 
 
 def _memory(mesh: Mesh) -> MemoryMesh:
@@ -73,7 +69,7 @@ class MemoryNetwork:
         self.nodes.append(node)
         for other in self.nodes:
             self._connect(node, other)
-        return MemoryMesh(node, Keys(fleet), me, node.loop)
+        return MemoryMesh(node, Keys(fleet), me, node.now)
 
     def link(self, source: Mesh, target: Mesh) -> MemoryLink:
         """What carries messages from `source` to `target`: its delays and losses may be set."""
@@ -235,6 +231,9 @@ class MemoryTransport(Transport):
         self._gets: dict[_Get, None] = {}
         self._alive: dict[MemoryTransport, list[str]] = {}
         """Tokens that are known here, by the process that declared them."""
+
+    def now(self) -> Ns:
+        return round(self.loop.time() * SECOND)
 
     def links(self) -> int:
         return sum(1 for node in self._peers() if node is not self)

@@ -7,8 +7,8 @@ from collections.abc import Awaitable, Callable
 
 from tests.mesh.kit import run, until
 from zscout.keyexpr import Role, Sender, Token
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import IncomingQuery
-from zscout.mesh.memory import MemoryMesh, MemoryNetwork
 from zscout.messages import Message
 from zscout.types import SECOND
 

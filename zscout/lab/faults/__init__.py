@@ -1,0 +1,1 @@
+"""The simulated network and virtual time, on which services run with faults."""
