@@ -17,17 +17,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 
-from zscout.messages import EndedHold, Grants, Holder, RcmState, absurd
-from zscout.types import (
-    NO_TERM,
-    SECOND,
-    Grant,
-    Ns,
-    Term,
-)
+from zscout.messages import EndedHold, Grants, Holder, Problem, RcmState, absurd
+from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 REMEMBERED = 64
 """Grants that ended lately, kept to say why a command under one of them is refused."""
@@ -53,7 +48,7 @@ class HoldChange:
     stayed: bool = False
     """Others hold the RC before and after."""
     outdated: bool = False
-    """The speaker is behind: publish this RC's state, so that it sees the newer term."""
+    """The RCM is behind: publish this RC's state, so that it sees the newer term."""
     reread: bool = False
     """Something was missed: read `rcm/state`."""
     present: bool = False
@@ -80,14 +75,6 @@ class HoldChange:
         return not self.stayed and not self.handed_over
 
 
-@dataclass(frozen=True, slots=True)
-class CommandRefusal:
-    """Why a command is not obeyed. Codes are part of the protocol."""
-
-    code: str
-    message: str
-
-
 class HoldTable:
     """The holds of one RC."""
 
@@ -95,7 +82,7 @@ class HoldTable:
         self.rc = rc
         self.hold_lease = hold_lease
         self.term: Term = NO_TERM
-        """The newest term heard or promised."""
+        """The newest term received or promised."""
         self.seq = 0
         self.last_contact: Ns = 0
         """When an RCM that is obeyed last published, as received here."""
@@ -108,12 +95,11 @@ class HoldTable:
 
     def apply_grants(self, grants: Grants, now: Ns, *, sharable: bool = True) -> HoldChange:
         """Takes a publication. Of several holders of an exclusive RC only the newest grant is obeyed."""
-        if (grants.term, grants.seq) < (self.term, self.seq):
-            return HoldChange(outdated=grants.term < self.term)
-        if absurd(grants.term, self.term):
-            return HoldChange()
-        change = HoldChange(reread=grants.term != self.term or grants.prev > self.seq)
-        self.term, self.seq, self.last_contact = grants.term, grants.seq, now
+        missed = grants.term != self.term or grants.prev > self.seq
+        change = HoldChange()
+        if not self._take(grants, change, now):
+            return change
+        change.reread = missed
         holders = grants.rcs.get(self.rc)
         if holders is not None:
             if len(holders) > 1 and not sharable:
@@ -125,12 +111,9 @@ class HoldTable:
 
     def apply_snapshot(self, state: RcmState, now: Ns, *, sharable: bool) -> HoldChange:
         """Takes a snapshot: what was missed is added, what the snapshot does not know is presented."""
-        if (state.term, state.seq) < (self.term, self.seq):
-            return HoldChange(outdated=state.term < self.term)
-        if absurd(state.term, self.term):
-            return HoldChange()
-        self.term, self.seq, self.last_contact = state.term, state.seq, now
         change = HoldChange()
+        if not self._take(state, change, now):
+            return change
         known = {view.grant for view in state.holds if self.rc in view.needs}
         change.present = any(grant not in known for grant in self.held)
         self._awaited.clear()
@@ -141,22 +124,20 @@ class HoldTable:
                 change.present = True
                 self._awaited.add(view.grant)
                 continue
-            holder = Holder(
-                id=view.id,
-                arc=view.arc,
-                client=view.client,
-                grant=view.grant,
-                place=view.place,
-                rcs=sorted(view.needs),
-                min_runtime=view.min_runtime,
-                remaining=view.remaining,
-                priority=view.priority,
-                keep=view.keep,
-                params=view.needs[self.rc],
-                bound=view.bound,
-            )
-            self._begin(holder, change, now)
+            own: dict[str, Any] = {"rcs": sorted(view.needs), "params": view.needs[self.rc]}
+            shared = {name: getattr(view, name) for name in Holder.__struct_fields__ if name not in own}
+            self._begin(Holder(**shared, **own), change, now)
         return change
+
+    def _take(self, news: Grants | RcmState, change: HoldChange, now: Ns) -> bool:
+        """Whether what an RCM says is obeyed: it is not older than what is known, and no absurd jump."""
+        if (news.term, news.seq) < (self.term, self.seq):
+            change.outdated = news.term < self.term
+            return False
+        if absurd(news.term, self.term):
+            return False
+        self.term, self.seq, self.last_contact = news.term, news.seq, now
+        return True
 
     def promise(self, term: Term) -> bool:
         """Obeys no lower term again. False: a higher one is known, or the jump is absurd."""
@@ -195,26 +176,27 @@ class HoldTable:
 
     # Commands
 
-    def check(self, grant: Grant, client: str, now: Ns) -> CommandRefusal | None:
-        """Whether a command of `client` under `grant` is obeyed at this moment."""
+    def check(self, grant: Grant, client: str, now: Ns) -> Problem | None:
+        """Why a command of `client` under `grant` is not obeyed at this moment; None: it is. Codes are part
+        of the protocol."""
         held = self.held.get(grant)
-        if held is not None:
-            if held.holder.client != client:
-                return CommandRefusal(
-                    "wrong_client", f"{self.rc} is held by {held.holder.client}, not by {client}"
-                )
-            if now >= held.end and not held.holder.keep:
-                return CommandRefusal("ended", f"the hold of {self.rc} is over: its time is up")
-            return None
-        if grant in self._ended:
-            return CommandRefusal("ended", f"the hold of {self.rc} is over: {self._ended[grant]}")
         newer = (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term)
-        if newer or grant in self._awaited:
-            return CommandRefusal("not_yet", f"{self.rc} has not heard of this grant")
-        if not self.held:
-            return CommandRefusal("free", f"{self.rc} is held by nobody; ask the RCM for it")
-        holders = ", ".join(sorted(held.holder.arc for held in self.held.values()))
-        return CommandRefusal("not_holder", f"{self.rc} is held by {holders}")
+        if held is not None and held.holder.client != client:
+            code, why = "wrong_client", f"{self.rc} is held by {held.holder.client}, not by {client}"
+        elif held is not None and now >= held.end and not held.holder.keep:
+            code, why = "ended", f"the hold of {self.rc} is over: its time is up"
+        elif held is not None:
+            return None
+        elif grant in self._ended:
+            code, why = "ended", f"the hold of {self.rc} is over: {self._ended[grant]}"
+        elif newer or grant in self._awaited:
+            code, why = "not_yet", f"{self.rc} has not heard of this grant"
+        elif not self.held:
+            code, why = "free", f"{self.rc} is held by nobody; ask the RCM for it"
+        else:
+            holders = ", ".join(sorted(held.holder.arc for held in self.held.values()))
+            code, why = "not_holder", f"{self.rc} is held by {holders}"
+        return Problem(code, why, self.term)
 
     def holders(self, now: Ns) -> list[Holder]:
         """The holders, with the time that each has left now."""
@@ -233,10 +215,10 @@ class HoldTable:
         for grant in [grant for grant in self.held if grant not in wanted]:
             self._stop(grant, reasons.get(grant, "the RCM gave it to another"), change)
         for grant, holder in wanted.items():
-            if grant not in self.held and grant not in self._ended:
+            if grant in self._ended:
+                change.present = True
+            elif grant not in self.held:
                 self._begin(holder, change, now)
-        if any(grant in self._ended for grant in wanted):
-            change.present = True
 
     def _begin(self, holder: Holder, change: HoldChange, now: Ns) -> None:
         self.held[holder.grant] = HoldEntry(holder, now + round(holder.remaining * SECOND))

@@ -25,6 +25,7 @@ from zscout.messages import (
     Done,
     EndedHold,
     Grants,
+    Problem,
     Proposal,
     RcAsk,
     RcmState,
@@ -278,9 +279,8 @@ class ResourceController:
             raise Refused("stale", f"the command waited {waited}, longer than its ttl {command.ttl:g} s")
         if command.grant is None:
             return await self.driver.command_without_grant(sender, command.do)
-        refused = self._refusal(query)
-        if refused is not None:
-            raise refused
+        if problem := self._refusal(query):
+            raise Refused(problem.code, problem.message, problem.term)
         warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
         if command.do.get("name") == "confirm":
             return Done(warming=warming)
@@ -288,7 +288,7 @@ class ResourceController:
             raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
         return await self.driver.command(self.holds.held[command.grant].holder, command.do)
 
-    def _refusal(self, query: CommandQuery) -> Refused | None:
+    def _refusal(self, query: CommandQuery) -> Problem | None:
         """Why a command is not obeyed under its grant; None: it is, or has none."""
         grant, sender = query.message.grant, self.mesh.keys.sender_of(query.key)
         if grant is None:
@@ -296,8 +296,7 @@ class ResourceController:
         client, held, directory = str(sender), self.holds.held.get(grant), self.directory
         if held and directory and directory.is_node_of_gang(sender, held.holder, self.name):
             client = held.holder.client
-        refusal = self.holds.check(grant, client, self.mesh.now())
-        return None if refusal is None else Refused(refusal.code, refusal.message, self.holds.term)
+        return self.holds.check(grant, client, self.mesh.now())
 
     def _waited(self, query: CommandQuery) -> Ns:
         """How long a command may have waited: in our queue, and before it in the network through a stall."""
@@ -322,8 +321,8 @@ class ResourceController:
     # Commands under a grant that this RC does not know yet
 
     def _is_early(self, query: CommandQuery) -> bool:
-        refused = self._refusal(query)
-        return refused is not None and refused.problem.code == "not_yet" and not self._is_stale(query)
+        problem = self._refusal(query)
+        return problem is not None and problem.code == "not_yet" and not self._is_stale(query)
 
     def _set_aside(self, query: CommandQuery) -> None:
         """Keeps a command until `rcm/state` has been read. Nothing else waits for that."""
@@ -385,8 +384,8 @@ class ResourceController:
                 break
         self.queue.resume(lambda query: not self._is_early(query))
         for query in self.queue.drop_early():
-            if refused := self._refusal(query):
-                query.refuse(refused.problem)
+            if problem := self._refusal(query):
+                query.refuse(problem)
 
     def _is_current(self, reply: Reply[RcmState]) -> bool:
         """Whether no other answer is needed: this one is of an RCM that is obeyed already."""
