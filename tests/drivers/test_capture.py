@@ -99,10 +99,10 @@ def test_each_picture_is_given_once_and_read_ones_are_not_dropped() -> None:
         until(lambda: capture.stalls > 0)
         last = capture.number
         dropped = capture.dropped
-        assert capture.newest(last) is None
+        assert capture.wait(last, 0) is None
         assert capture.wait(last, 0.01) is None
-        assert last == number or capture.newest(number) is not None
-        assert capture.newest(0) is not None
+        assert last == number or capture.wait(number, 0) is not None
+        assert capture.wait(0, 0) is not None
         server.mode = "run"
         picture_of(capture, last)
         assert capture.dropped - dropped <= capture.number - last - 1
@@ -167,7 +167,7 @@ def test_garbled_pictures_do_not_end_the_stream() -> None:
         until(lambda: server.sent > sent + 20)
         server.mode = "run"
         after = server.sent
-        until(lambda: (got := capture.newest(0)) is not None and number_of(got.picture) > after)
+        until(lambda: (got := capture.wait(0, 0)) is not None and number_of(got.picture) > after)
         assert capture.health == "ok"
         assert capture.stalls == 0
         assert server.accepted == capture.opened

@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.drivers.mjpeg import numbered
-from zscout.drivers.frame_pump import RATE_SPAN, FrameMeter, FramePacer, encode, is_grey
-from zscout.drivers.framegrabber import FramegrabberDriver
+from zscout.drivers.framegrabber import RATE_SPAN, FramegrabberDriver, FrameMeter, FramePacer, encode, is_grey
 from zscout.messages import FrameHead
 
 

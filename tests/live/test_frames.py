@@ -19,7 +19,7 @@ from tests.hang import HANG
 from tests.live.bench import Bench, SharedBench, Stand, answer, running, until
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
-from zscout.drivers import frame_pump, framegrabber
+from zscout.drivers import framegrabber
 from zscout.drivers.framegrabber import FramegrabberDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
@@ -210,13 +210,13 @@ def test_frames_are_published_while_somebody_holds_and_somebody_looks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     encoded: list[bytes] = []
-    encode = frame_pump.encode
+    encode = framegrabber.encode
 
     def counted(picture: Any, quality: int) -> bytes:
         encoded.append(encode(picture, quality))
         return encoded[-1]
 
-    monkeypatch.setattr(frame_pump, "encode", counted)
+    monkeypatch.setattr(framegrabber, "encode", counted)
 
     async def story() -> None:
         async with scene(tmp_path) as at:
@@ -290,7 +290,7 @@ def test_frames_are_published_while_somebody_holds_and_somebody_looks(
 
                 # The next holder has it at once, but nothing that was there before its hold.
                 assert at.driver._capture is not None
-                before = at.driver._before.pictures + at.driver._capture.number
+                before = at.driver._before["number"] + at.driver._capture.number
                 third, newest = await running(at.client, "third", GRABBER, "video/ch2")
                 frame = await frame_of(watch)
                 assert frame.head.grant == newest
@@ -300,7 +300,7 @@ def test_frames_are_published_while_somebody_holds_and_somebody_looks(
                 # What is too old or too large is not sent.
                 for limit, value in (("MAX_AGE", -1.0), ("MAX_FRAME", 100)):
                     with monkeypatch.context() as patch:
-                        patch.setattr(frame_pump, limit, value)
+                        patch.setattr(framegrabber, limit, value)
                         await sends(at.two, 3)
                         published = at.driver.figures()["published"]
                         await sends(at.two, 10)

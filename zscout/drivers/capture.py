@@ -1,8 +1,8 @@
 """The newest picture of any source that OpenCV can open: a device, a file, or a URL.
 
-OpenCV hands out pictures in order, however old they are: a reader that is too slow falls behind
-without end. So a thread of its own reads all of them and keeps only the newest. It opens its source again
-whenever that fails, and describes its state in words.
+OpenCV hands out pictures in order, however old they are: a reader that is too slow falls behind without end.
+So a thread of its own reads all of them and keeps only the newest. It opens its source again whenever that
+fails, and describes its state in words.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ from zscout.types import SECOND
 
 log = logging.getLogger(__name__)
 
-RETRY_FIRST: Final = 0.2
-RETRY_MOST: Final = 2.0
-"""Seconds between two attempts to open a source: doubled from the first to the last."""
+PAUSES: Final = (0.2, 2.0)
+"""Seconds between two attempts to open a source: the first, and the longest."""
 STOP_WAIT: Final = 1.0
 MAX_PIXELS: Final = 1 << 24
 """Of one picture; larger ones count as a failure of the source."""
@@ -72,19 +71,19 @@ class Capture:
         self.kind = kind_of(source)
         self.health = "not open yet"
         """`ok` while pictures come; or in words what is wrong, without passwords that stand in a URL."""
+        self.number = 0
+        """Of the newest picture; 0 while there was none."""
         self.opened = 0
         """How often the source was opened."""
         self.dropped = 0
         """Pictures that a newer one replaced before anybody looked at them."""
         self.stalls = 0
         """How often an open source gave nothing for `read_timeout`."""
-        self._open_timeout = open_timeout
-        self._read_timeout = read_timeout
+        self._open_timeout, self._read_timeout = open_timeout, read_timeout
         self._stop = threading.Event()
         self._news = threading.Condition()
         self._newest: CapturedFrame | None = None
         self._taken = True
-        self._number = 0
         self._due = 0.0
         # A daemon: a process that ends need not wait for ever until OpenCV has given up.
         self._thread = threading.Thread(target=self._run, name=f"capture {shown(source)}"[:60], daemon=True)
@@ -103,76 +102,66 @@ class Capture:
             self._thread.join(wait)
 
     @property
-    def number(self) -> int:
-        """Of the newest picture; 0 while there was none."""
-        return self._number
-
-    @property
     def alive(self) -> bool:
         """Whether the thread runs, be it only until OpenCV lets go of it."""
         return self._thread.is_alive()
-
-    def newest(self, after: int) -> CapturedFrame | None:
-        """The newest picture if its number is above `after`."""
-        with self._news:
-            return self._take(after)
 
     def wait(self, after: int, timeout: float) -> CapturedFrame | None:
         """The newest picture with a number above `after`, as soon as there is one; None if none came within
         `timeout` seconds, or when the capture was stopped."""
         with self._news:
-            self._news.wait_for(lambda: self._number > after or self._stop.is_set(), timeout)
-            return None if self._stop.is_set() else self._take(after)
-
-    def _take(self, after: int) -> CapturedFrame | None:
-        if self._newest is None or self._newest.number <= after:
-            return None
-        self._taken = True
-        return self._newest
+            self._news.wait_for(lambda: self.number > after or self._stop.is_set(), timeout)
+            if self._stop.is_set() or self.number <= after:
+                return None
+            self._taken = True
+            return self._newest
 
     # In the thread
 
     def _run(self) -> None:
-        pause = RETRY_FIRST
+        pause = PAUSES[0]
         while not self._stop.is_set():
-            before = self._number
+            before = self.number
             try:
                 self._read_all()
             except cv2.error as error:
                 self._set_health(f"OpenCV failed on {shown(self.source)}: {str(error).strip()[:200]}")
-            if self._number > before:
-                pause = RETRY_FIRST
+            if self.number > before:
+                pause = PAUSES[0]
                 if self.kind == "file":
                     continue
             self._stop.wait(pause)
-            pause = min(RETRY_MOST, 2 * pause)
+            pause = min(2 * pause, PAUSES[1])
 
     def _read_all(self) -> None:
         """Opens the source, and reads it until it fails or ends."""
-        began = _now()
+        began = seconds()
         video = _open(self.source, self.kind, self._open_timeout, self._read_timeout)
         try:
             if not video.isOpened():
-                self._set_health(self._why_closed(_now() - began))
+                self._set_health(self._why_closed(seconds() - began))
                 return
             self.opened += 1
-            if self._number == 0:
+            if self.number == 0:
                 self.health = "open, no picture yet"
             period = _file_period(video) if self.kind == "file" else 0.0
             misses = 0
             while not self._stop.is_set():
-                if period and not misses and self._rest(period):
-                    return
-                asked = _now()
+                if period and not misses:
+                    # After a stall it goes on from there, rather than rush through what it missed.
+                    self._due = max(self._due + period, seconds())
+                    if self._stop.wait(max(0.0, self._due - seconds())):
+                        return
+                asked = seconds()
                 good, picture = video.read()
                 if self._stop.is_set():
                     return
                 if not good:
                     misses += 1
-                    waited = _now() - asked
+                    waited = seconds() - asked
                     if misses < MISSES and waited < STALLED * self._read_timeout:
                         continue
-                    self._ended(waited, before=self._number)
+                    self._ended(waited)
                     return
                 misses = 0
                 if picture.dtype != np.uint8 or picture.shape[0] * picture.shape[1] > MAX_PIXELS:
@@ -182,13 +171,6 @@ class Capture:
         finally:
             video.release()
 
-    def _rest(self, period: float) -> bool:
-        """Waits until the next picture of a file is due; whether the capture was stopped meanwhile."""
-        now = _now()
-        # After a stall it goes on from there, rather than rush through what it missed.
-        self._due = max(self._due + period, now)
-        return self._stop.wait(max(0.0, self._due - now))
-
     def _keep(self, picture: NDArray[np.uint8]) -> None:
         if self.health != "ok":
             log.info("%s gives pictures", shown(self.source))
@@ -196,14 +178,15 @@ class Capture:
             if not self._taken:
                 self.dropped += 1
             self._taken = False
-            self._number += 1
-            self._newest = CapturedFrame(self._number, _now(), picture)
+            self.number += 1
+            self._newest = CapturedFrame(self.number, seconds(), picture)
             self.health = "ok"
             self._news.notify_all()
 
-    def _ended(self, waited: float, before: int) -> None:
+    def _ended(self, waited: float) -> None:
+        """A source that was open gives no more pictures."""
         if self.kind == "file":
-            if before == 0:
+            if self.number == 0:
                 self._set_health(f"there is no picture in {shown(self.source)}")
         elif waited >= STALLED * self._read_timeout:
             self.stalls += 1
@@ -224,11 +207,9 @@ class Capture:
             return f"{name} can't be opened: {error.strerror}"
         if not os.access(path, os.R_OK):
             return f"{name} can't be opened: permission denied"
-        if self.kind == "file" and not stat.S_ISREG(mode):
-            return f"{name} is not a file"
-        return f"{name} can't be opened: " + (
-            "is it a camera, and free?" if self.kind == "device" else "it is not a video"
-        )
+        if self.kind == "device":
+            return f"{name} can't be opened: is it a camera, and free?"
+        return f"{name} can't be opened: it is not a video" if stat.S_ISREG(mode) else f"{name} is not a file"
 
     def _set_health(self, words: str) -> None:
         if words != self.health:
@@ -245,16 +226,14 @@ def _stop_all() -> None:
     captures = list(_LIVING)
     for capture in captures:
         capture.stop(0)
-    end = _now() + EXIT_WAIT
+    end = seconds() + EXIT_WAIT
     for capture in captures:
-        capture.stop(max(0.0, end - _now()))
+        capture.stop(max(0.0, end - seconds()))
 
 
 def kind_of(source: str) -> Literal["device", "file", "url"]:
     """What a source is, by its form alone."""
-    if source.isascii() and source.isdigit():
-        return "device"
-    if source.startswith("/dev/"):
+    if (source.isascii() and source.isdigit()) or source.startswith("/dev/"):
         return "device"
     return "url" if _URL.match(source) else "file"
 
@@ -304,5 +283,6 @@ def _file_period(video: cv2.VideoCapture) -> float:
     return 1 / (rate if least <= rate <= most else FILE_RATE)
 
 
-def _now() -> float:
+def seconds() -> float:
+    """This host's own clock, in seconds."""
     return clock.now() / SECOND

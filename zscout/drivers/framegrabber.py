@@ -2,7 +2,7 @@
 
 It is tuned to the video RC that stands in the gang of its holder. Three things happen side by side: a capture
 reads the source (`capture.py`), a pump encodes and publishes in a thread of its own, and the event loop
-watches over both: a framegrabber that has no picture for LOST_AFTER while it is held reports itself lost,
+supervises both: a framegrabber that has no picture for LOST_AFTER while it is held reports itself lost,
 goes on trying, and is back with the first picture.
 """
 
@@ -11,16 +11,21 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import statistics
+import threading
+from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
-from zscout.drivers.capture import Capture
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zscout.drivers.capture import Capture, CapturedFrame, seconds
 from zscout.drivers.driver import Driver, RcHandle
-from zscout.drivers.frame_pump import FrameMeter, FrameOrigin, FramePump
-from zscout.mesh import Refused, clock
-from zscout.messages import Figures, Holder
-from zscout.types import SECOND
+from zscout.mesh import Refused
+from zscout.messages import MAX_FRAME, Figures, FrameHead, Holder
+from zscout.types import Grant
 
 if TYPE_CHECKING:
     from zscout.mesh.frames import FramePublisher
@@ -33,26 +38,19 @@ TRY_NEXT: Final = 5.0
 """Seconds that a lost framegrabber tries one of several sources."""
 CHECK: Final = 0.2
 """Seconds from one look at the source to the next."""
-
-
-@dataclass(frozen=True, slots=True)
-class CaptureTotals:
-    """What the captures of a framegrabber have counted that it has let go."""
-
-    pictures: int = 0
-    dropped: int = 0
-    opened: int = 0
-    stalls: int = 0
-
-    def and_of(self, capture: Capture | None) -> Self:
-        if capture is None:
-            return self
-        return type(self)(
-            self.pictures + capture.number,
-            self.dropped + capture.dropped,
-            self.opened + capture.opened,
-            self.stalls + capture.stalls,
-        )
+MAX_AGE: Final = 1.0
+"""Seconds; an older picture is not published as if it were new."""
+PATIENCE: Final = 0.25
+"""Seconds from one look at whether it should stop to the next, where no pictures come."""
+EARLY: Final = 0.5
+"""Share of the interval between two frames by which one may come early."""
+GREY: Final = 3
+"""Difference of the colours up to which a picture is grey: what decoding makes of a grey picture that was
+coded in colour."""
+MEASURED: Final = 64
+"""Frames over which the latency is measured."""
+RATE_SPAN: Final = 3.0
+"""Seconds over which the rate is measured."""
 
 
 class FramegrabberDriver(Driver):
@@ -83,12 +81,13 @@ class FramegrabberDriver(Driver):
         self._silent = 0.0
         """Seconds without a picture while it was open and this process awake, since the hold began."""
         self._lost = False
-        self._before = CaptureTotals()
+        self._before: Counter[str] = Counter()
+        """What the captures have counted that were let go."""
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc
         self._publisher = rc.mesh.frame_publisher(rc.mesh.keys.frame(rc.name))
-        self._publisher.follow(self._on_watched)
+        self._publisher.follow(lambda _watched: self._close_unless_needed())
 
     async def close(self) -> None:
         self._lost = False
@@ -104,7 +103,7 @@ class FramegrabberDriver(Driver):
         self._holder = holder
         source, self._untuned = self._of_gang(holder.rcs)
         if source is None:
-            log.warning("%s: held by %s, but %s", self._name, holder.arc, self._untuned)
+            log.warning("%s: held by %s, but %s", self._rc.name, holder.arc, self._untuned)
             self._stop_pump()
             if not self._lost:
                 self._let_go()
@@ -129,20 +128,24 @@ class FramegrabberDriver(Driver):
     def figures(self) -> Figures:
         """Rates are per second, over the last 3 s; latency is from reading a picture to its publication, the
         median of the last 64; `dropped`, `opened` and `stalls` count since the node began."""
-        totals = self._before.and_of(self._capture)
-        meter = self._meter
+        totals, meter = self._totals(), self._meter
         return {
-            "frames_per_second": round(meter.rate(_now()), 1),
+            "frames_per_second": round(meter.rate(seconds()), 1),
             "latency_ms": round(1000 * meter.latency(), 1),
             "published": meter.published,
-            "dropped": totals.dropped,
-            "opened": totals.opened,
-            "stalls": totals.stalls,
+            "dropped": totals["dropped"],
+            "opened": totals["opened"],
+            "stalls": totals["stalls"],
             "too_large": meter.too_large,
             "width": meter.width,
             "height": meter.height,
             "bytes": meter.size,
         }
+
+    def _totals(self) -> Counter[str]:
+        """What all captures have counted."""
+        own = {name: getattr(self._capture, name, 0) for name in ("number", "dropped", "opened", "stalls")}
+        return self._before + Counter(own)
 
     # Tuning
 
@@ -162,9 +165,11 @@ class FramegrabberDriver(Driver):
 
     def _wanted(self, holder: Holder, to: object) -> str:
         if "" in self._sources:
-            raise Refused("bad_command", f"{self._name} has one source only; there is nothing to tune")
+            raise Refused("bad_command", f"{self._rc.name} has one source only; there is nothing to tune")
         if not isinstance(to, str) or to not in self._sources:
-            raise Refused("bad_command", f"{self._name} receives {self._receives()}; set `to` to one of them")
+            raise Refused(
+                "bad_command", f"{self._rc.name} receives {self._receives()}; set `to` to one of them"
+            )
         videos = [rc for rc in holder.rcs if rc.startswith("video/")]
         if videos and to not in videos:
             raise Refused(
@@ -182,11 +187,16 @@ class FramegrabberDriver(Driver):
         capture = self._capture
         if capture is None or source != self._source:
             capture = self._open(source)
-        shot = FrameOrigin(self._before.pictures, holder.grant, source)
         self._pump = FramePump(
-            self._publisher, capture, self._meter, shot, rate=self._rate, quality=self._quality
+            self._publisher,
+            capture,
+            self._meter,
+            first=self._before["number"],
+            grant=holder.grant,
+            source=source,
+            rate=self._rate,
+            quality=self._quality,
         )
-        self._pump.start()
 
     def _open(self, source: str) -> Capture:
         self._let_go()
@@ -202,16 +212,13 @@ class FramegrabberDriver(Driver):
         self._stop_pump()
         if self._capture is not None:
             self._capture.stop(0)
-            self._before = self._before.and_of(self._capture)
+            self._before = self._totals()
         self._capture = self._source = None
 
     def _stop_pump(self) -> None:
         if self._pump is not None:
             self._pump.stop()
             self._pump = None
-
-    def _on_watched(self, _watched: bool) -> None:
-        self._close_unless_needed()
 
     def _close_unless_needed(self) -> None:
         """A source stays open while somebody holds the framegrabber, and afterwards while somebody looks: the
@@ -223,33 +230,27 @@ class FramegrabberDriver(Driver):
 
     async def _watch_over(self) -> None:
         """Reports the RC lost, and back, by the pictures that come."""
-        seen, last = (self._capture, 0), _now()
+        seen, last = (self._capture, 0), seconds()
         while (capture := self._capture) is not None:
-            now, newest = _now(), (capture, capture.number)
+            now, newest = seconds(), (capture, capture.number)
             if newest == seen:
                 # Where this process stood still, its capture did so too: that says nothing of the source.
                 self._silent += min(now - last, 2 * CHECK)
             else:
                 self._silent = 0.0
                 if self._lost and capture.number > 0:
-                    self._found()
+                    self._lost = False
+                    self._rc.recover()
+                    self._close_unless_needed()
             seen, last = newest, now
             if self._lost:
                 if self._silent > TRY_NEXT and self._holder is None:
                     self._try_next()
             elif self._holder is not None and self._silent > LOST_AFTER:
-                self._lose(capture)
+                self._lost = True
+                about = f" of {self._source}" if self._source else ""
+                self._rc.fail(f"no picture{about} for {LOST_AFTER:g} s: {capture.health}")
             await asyncio.sleep(CHECK)
-
-    def _lose(self, capture: Capture) -> None:
-        self._lost = True
-        about = f" of {self._source}" if self._source else ""
-        self._rc.fail(f"no picture{about} for {LOST_AFTER:g} s: {capture.health}")
-
-    def _found(self) -> None:
-        self._lost = False
-        self._rc.recover()
-        self._close_unless_needed()
 
     def _try_next(self) -> None:
         """With several sources, one that is dead must not keep the others from being used."""
@@ -257,27 +258,162 @@ class FramegrabberDriver(Driver):
         if len(names) > 1 and self._source is not None:
             self._open(names[(names.index(self._source) + 1) % len(names)])
 
-    # Status
-
-    @property
-    def _name(self) -> str:
-        return self._rc.name
-
     def _snapshot(self) -> dict[str, Any]:
         capture = self._capture
         if capture is None:
             return {"source": None, "health": self._untuned or "not open", "number": 0}
-        found: dict[str, Any] = {
-            "source": self._source,
-            "health": capture.health,
-            "number": self._before.pictures + capture.number,
-        }
-        newest = capture.newest(0)
+        number = self._before["number"] + capture.number
+        found: dict[str, Any] = {"source": self._source, "health": capture.health, "number": number}
+        newest = capture.wait(0, 0)
         if newest is not None:
             height, width = newest.picture.shape[:2]
-            found |= {"width": width, "height": height, "age": round(_now() - newest.time, 3)}
+            found |= {"width": width, "height": height, "age": round(seconds() - newest.time, 3)}
         return found
 
 
-def _now() -> float:
-    return clock.now() / SECOND
+class FramePacer:
+    """At most `rate` frames a second without holding any back: one that comes too early is passed over.
+
+    The generic cell rate algorithm (ITU-T I.371, annex A) with a tolerance of EARLY intervals, so that a
+    source that is a little faster, or uneven, loses no more than what is too much. Times are seconds.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._period = 1 / rate
+        self._due = float("-inf")
+
+    def admits(self, now: float) -> bool:
+        """Whether a picture that is there `now` is published."""
+        if now < self._due - EARLY * self._period:
+            return False
+        self._due = max(self._due, now) + self._period
+        return True
+
+
+class FrameMeter:
+    """What a framegrabber has published. Written by one pump at a time, read by the event loop."""
+
+    def __init__(self) -> None:
+        self.published = self.too_large = 0
+        """Frames; too large are those of more than MAX_FRAME bytes, which are not sent."""
+        self.width = self.height = self.size = 0
+        """Pixels and bytes of the newest frame."""
+        self._times: deque[float] = deque(maxlen=1_024)
+        self._latencies: deque[float] = deque(maxlen=MEASURED)
+
+    def count(self, head: FrameHead, size: int, now: float) -> None:
+        self.published += 1
+        self.width, self.height, self.size = head.width, head.height, size
+        self._times.append(now)
+        self._latencies.append(now - head.time)
+
+    def rate(self, now: float) -> float:
+        """Frames a second in the last RATE_SPAN; 0 without any."""
+        times = [time for time in list(self._times) if now - time <= RATE_SPAN]
+        return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
+
+    def latency(self) -> float:
+        """Seconds from reading a picture to its publication: the median of the last; 0 without any."""
+        return statistics.median(list(self._latencies) or [0.0])
+
+
+class FramePump:
+    """Publishes the pictures of a capture that are read from now on, until it is stopped; in a thread of its
+    own. Numbers go on from `first`.
+
+    At most `rate` frames a second, with JPEG `quality` 1..100, and only while somebody subscribes: otherwise
+    nothing is even encoded.
+    """
+
+    def __init__(
+        self,
+        publisher: FramePublisher,
+        capture: Capture,
+        meter: FrameMeter,
+        *,
+        first: int,
+        grant: Grant,
+        source: str,
+        rate: float,
+        quality: int,
+    ) -> None:
+        self._publisher, self._capture, self._meter = publisher, capture, meter
+        self._first, self._grant, self._source = first, grant, source
+        self._quality = quality
+        self._pace = FramePacer(rate)
+        self._after = capture.number
+        self._lock = threading.Lock()
+        self._stopped = False
+        self._complained = False
+        self._thread = threading.Thread(target=self._run, name="frame pump", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Nothing is published any more when this returns; the thread ends a little later."""
+        with self._lock:
+            self._stopped = True
+
+    def join(self) -> None:
+        """Waits for the end of the thread, after `stop`: some tenths of a second at most."""
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopped:
+            captured = self._capture.wait(self._after, PATIENCE)
+            if captured is None:
+                if not self._capture.alive:
+                    return
+                continue
+            self._after = captured.number
+            if self._publisher.watched and self._pace.admits(captured.time):
+                self._publish(captured)
+
+    def _publish(self, captured: CapturedFrame) -> None:
+        try:
+            jpeg = encode(captured.picture, self._quality)
+        except cv2.error as error:
+            self._complain(f"a picture can't be encoded: {str(error).strip()[:200]}")
+            return
+        if len(jpeg) > MAX_FRAME:
+            self._meter.too_large += 1
+            self._complain(
+                f"frames of {len(jpeg)} bytes are too large, at most {MAX_FRAME} are sent; lower "
+                "`quality`, or the resolution of the source"
+            )
+            return
+        height, width = captured.picture.shape[:2]
+        head = FrameHead(
+            number=self._first + captured.number,
+            time=captured.time,
+            width=width,
+            height=height,
+            grant=self._grant,
+            source=self._source,
+        )
+        with self._lock:
+            now = seconds()
+            if not self._stopped and now - captured.time <= MAX_AGE:
+                self._publisher.put(head, jpeg)
+                self._meter.count(head, len(jpeg), now)
+
+    def _complain(self, words: str) -> None:
+        if not self._complained:
+            self._complained = True
+            log.warning("%s", words)
+
+
+def encode(picture: NDArray[np.uint8], quality: int) -> bytes:
+    """A picture as JPEG; one without colour as a grey JPEG, whatever its form. Raises cv2.error for one that
+    JPEG can't have."""
+    shown = picture[:, :, 1] if picture.ndim == 3 and is_grey(picture) else picture
+    _, coded = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return coded.tobytes()
+
+
+def is_grey(picture: NDArray[np.uint8]) -> bool:
+    """Whether a BGR picture has no colour. A few of its pixels settle it for most that have."""
+    few = picture[::16, ::16].astype(np.int16)
+    if int(np.ptp(few, axis=2).max(initial=0)) > GREY:
+        return False
+    blue, green, red = cv2.split(picture)
+    return cv2.norm(blue, green, cv2.NORM_INF) <= GREY and cv2.norm(green, red, cv2.NORM_INF) <= GREY
