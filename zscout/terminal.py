@@ -8,8 +8,10 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import zip_longest
 from typing import IO, TYPE_CHECKING, Any, Final, Self
 
 import msgspec
@@ -49,11 +51,6 @@ def console(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
 
 
-def narrow() -> bool:
-    """Whether the terminal has so few columns that tables leave out what matters least."""
-    return console().width < NARROW
-
-
 def clean(text: str) -> str:
     """Words from another host, on one line, unable to draw on the terminal."""
     return "".join(char if char.isprintable() else " " for char in text)
@@ -84,35 +81,60 @@ def many(count: int, what: str) -> str:
 # Tables
 
 
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of texts, made safe to print where they are. `styles` has Rich's style for each row, `spare` the
+    columns that a narrow terminal omits."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    styles: Sequence[str] = ()
+    spare: Collection[str] = ()
+
+    def lines(self) -> list[str]:
+        """Without colours: two spaces between columns."""
+        table = [self.columns, *([clean(cell) for cell in row] for row in self.rows)]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in table
+        ]
+        return [self.title, *lines] if self.title else lines
+
+    def picture(self, most: int | None = None) -> RenderableType:
+        """For a terminal, no more than `most` rows."""
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(
+            title=self.title or None,
+            title_justify="left",
+            title_style="bold cyan",
+            header_style="bold",
+            box=None,
+            padding=(0, 2, 0, 0),
+        )
+        narrow = console().width < NARROW
+        kept = [at for at, name in enumerate(self.columns) if not (narrow and name in self.spare)]
+        for at in kept:
+            # A name or key that is cut short can't be copied.
+            table.add_column(self.columns[at], overflow="fold")
+        for row, style in zip_longest(self.rows[:most], self.styles[:most], fillvalue=""):
+            table.add_row(*(Text(clean(row[at])) for at in kept), style=style)
+        return table
+
+    def print(self) -> None:
+        """Coloured at a terminal, aligned plain lines elsewhere."""
+        if at_terminal():
+            console().print(self.picture())
+        else:
+            for line in self.lines():
+                print_line(line)
+
+
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "") -> None:
-    """A table: coloured at a terminal, aligned plain lines elsewhere. Cells are made safe to print."""
-    cells = [[clean(cell) for cell in row] for row in rows]
-    if not at_terminal():
-        for line in plain_table(columns, cells, title):
-            print_line(line)
-        return
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(
-        title=title or None, title_justify="left", box=None, header_style="bold", padding=(0, 2, 0, 0)
-    )
-    for column in columns:
-        # A name or key that is cut short can't be copied.
-        table.add_column(column, overflow="fold")
-    for row in cells:
-        table.add_row(*(Text(cell) for cell in row))
-    console().print(table)
-
-
-def plain_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> list[str]:
-    """The lines of a table without colours: two spaces between columns."""
-    widths = [max(len(line[at]) for line in (columns, *rows)) for at in range(len(columns))]
-    lines = [title] if title else []
-    for row in (columns, *rows):
-        padded = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        lines += ["  ".join(padded).rstrip()]
-    return lines
+    Table(title, columns, rows).print()
 
 
 # Drawn in place

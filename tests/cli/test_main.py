@@ -18,9 +18,9 @@ from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.cli.main import COMMANDS, main
-from zscout.cli.requests.arguments import gather_needs, parse_duration, parse_need
+from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
 from zscout.config.strict import BadInput
-from zscout.terminal import plain_table, span
+from zscout.terminal import Table, span
 
 HEAVY = ("zenoh", "rich", "rerun", "msgspec", "numpy", "cv2")
 
@@ -216,7 +216,7 @@ def test_spans_of_time_as_people_read_them() -> None:
 
 
 def test_plain_tables_align() -> None:
-    assert plain_table(["RC", "holder"], [["robot/a", "x"], ["b/c", ""]]) == [
+    assert Table("", ["RC", "holder"], [["robot/a", "x"], ["b/c", ""]]).lines() == [
         "RC       holder",
         "robot/a  x",
         "b/c",

@@ -6,10 +6,11 @@ Zenoh and Rich are imported by the functions that need them: most of a short com
 from __future__ import annotations
 
 import asyncio
+import difflib
 import os
 import signal
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
+from contextlib import asynccontextmanager, suppress
 from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -29,6 +30,8 @@ LOOK_FOR_RCM: Final = 2.0
 LOOK_FOR_TAKEOVER: Final = 5.0
 """The same where a candidate is seen: it may be about to take the lead."""
 STATE_TRIES: Final = 3
+MAX_NAMED: Final = 8
+"""Names that are listed of those known."""
 MAX_NAME: Final = 200
 """Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 
@@ -94,21 +97,23 @@ def run(main: Coroutine[Any, Any, T]) -> T:
 # Joining the mesh
 
 
-def fleet_file() -> Path | None:
-    """The fleet file: `--fleet`, else $ZSCOUT_FLEET; None: the default fleet."""
+def _given_file() -> Path | None:
+    """What `--fleet` names."""
     context = click.get_current_context(silent=True)
     given = context.find_root().obj if context is not None else None
-    if isinstance(given, Path):
-        return given
+    return given if isinstance(given, Path) else None
+
+
+def fleet_file() -> Path | None:
+    """The fleet file: `--fleet`, else $ZSCOUT_FLEET; None: the default fleet."""
     named = os.environ.get(FLEET_VARIABLE)
-    return Path(named) if named else None
+    return _given_file() or (Path(named) if named else None)
 
 
 def the_fleet() -> Fleet:
     """The fleet that this call of zscout is about. Raises BadInput."""
-    context = click.get_current_context(silent=True)
-    given = context.find_root().obj if context is not None else None
-    return load_fleet(given) if isinstance(given, Path) else fleet_from_env()
+    given = _given_file()
+    return load_fleet(given) if given is not None else fleet_from_env()
 
 
 @asynccontextmanager
@@ -141,9 +146,9 @@ async def see_rcm(client: Client) -> None:
         mesh.watch(mesh.keys.alive_any(Role.CANDIDATE), on_candidate),
     ]
     try:
-        if await _within(LOOK_FOR_RCM, seen):
+        if await within(LOOK_FOR_RCM, seen):
             return
-        if candidates and await _within(LOOK_FOR_TAKEOVER - LOOK_FOR_RCM, seen):
+        if candidates and await within(LOOK_FOR_TAKEOVER - LOOK_FOR_RCM, seen):
             return
     finally:
         for watch in watches:
@@ -177,16 +182,53 @@ def arc_named(text: str) -> str:
     return text
 
 
-async def _within(seconds: float, event: asyncio.Event) -> bool:
-    try:
+async def within(seconds: float | None, event: asyncio.Event) -> bool:
+    """Waits for an event, at most so long; returns whether it has come."""
+    with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await event.wait()
-    except TimeoutError:
-        return False
-    return True
+    return event.is_set()
+
+
+@asynccontextmanager
+async def beside(work: Coroutine[Any, Any, Any]) -> AsyncIterator[None]:
+    """Runs `work` for as long as the context lasts."""
+    task = asyncio.ensure_future(work)
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
+    """Runs all until one has ended, and cancels the others. Returns which have; raises what one raised."""
+    tasks = [asyncio.ensure_future(work) for work in works]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+        return [task in done for task in tasks]
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 # Options and words
+
+
+def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> Failed:
+    """What to raise where nobody knows a `name`: it lists names like it, or those that are known (the word is
+    `listed`) and how many `more` there are, or it says that there is `nothing`."""
+    names = sorted(set(known))
+    hint = f", {nothing}"
+    if near := difflib.get_close_matches(name, names, n=3):
+        hint = f"; did you mean {' or '.join(near)}?"
+    elif names:
+        rest = len(names) - MAX_NAMED + more
+        hint = f"; {listed}: {', '.join(names[:MAX_NAMED])}" + (f" and {rest} more" if rest > 0 else "")
+    return Failed(f"no {what} {quoted(name)} is known{hint}")
 
 
 def json_option(help: str = "Print JSON.") -> Callable[[F], F]:  # noqa: A002 - click's word

@@ -1,14 +1,23 @@
-"""`zscout completion`: the script that makes a shell complete `zscout`."""
+"""What the shell offers at Tab: components, hosts and RCs of the fleet, kinds that are installed here; and
+`zscout completion`, the script that makes it do so."""
 
 from __future__ import annotations
 
+import asyncio
 import os
+from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import click
 from click.shell_completion import get_completion_class
 
+if TYPE_CHECKING:
+    from zscout.mesh import Mesh
+
+LOOK: Final = 1.0
+"""Seconds that Tab may take, beyond joining the mesh."""
 SHELLS: Final = ("bash", "zsh", "fish")
 
 
@@ -31,3 +40,70 @@ def completion(ctx: click.Context, shell: str | None) -> None:
             f"$SHELL names no shell that is known here; write one of {', '.join(SHELLS)}", ctx
         )
     click.echo(found(ctx.find_root().command, {}, "zscout", "_ZSCOUT_COMPLETE").source())
+
+
+def kinds(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    from zscout.behaviors.components.kinds import installed
+
+    return [name for name in installed() if name.startswith(incomplete)]
+
+
+def components(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    from zscout.messages import ListPlacements, Placements
+
+    async def find(mesh: Mesh) -> Iterable[str]:
+        listed = await mesh.ask_one(mesh.keys.placer, ListPlacements(), Placements, timeout=LOOK)
+        return {one.component for one in listed.message.components} if listed and listed.message else ()
+
+    return _offered(ctx, param, incomplete, find)
+
+
+def hosts(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    from zscout.keyexpr import Role
+
+    async def find(mesh: Mesh) -> Iterable[str]:
+        return {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK)}
+
+    return _offered(ctx, param, incomplete, find)
+
+
+def rcs(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    from zscout.keyexpr import Role
+
+    async def find(mesh: Mesh) -> Iterable[str]:
+        return {token.name for token in await mesh.living(mesh.keys.alive_any(Role.RC), timeout=LOOK)}
+
+    return _offered(ctx, param, incomplete, find)
+
+
+def _offered(
+    ctx: click.Context,
+    param: click.Parameter,
+    incomplete: str,
+    find: Callable[[Mesh], Awaitable[Iterable[str]]],
+) -> list[str]:
+    """What is found and not yet given; nothing where there is no mesh."""
+    from zscout.cli import common
+    from zscout.config.fleet import fleet_from_env, load_fleet
+    from zscout.config.strict import BadInput
+    from zscout.keyexpr import BadName
+    from zscout.mesh import MeshError
+
+    async def look() -> Iterable[str]:
+        # Click has not run anything yet, so the fleet is only an option.
+        file = ctx.find_root().params.get("fleet")
+        fleet = load_fleet(Path(os.fspath(file))) if file is not None else fleet_from_env()
+        async with common.connected("complete", fleet, need_rcm=False) as client:
+            # A mesh that was just joined shows nobody yet.
+            with suppress(common.NobodyThere, TimeoutError):
+                async with asyncio.timeout(LOOK):
+                    await common.see_rcm(client)
+            return await find(client.mesh)
+
+    try:
+        names = asyncio.run(look())
+    except (BadInput, BadName, MeshError):
+        return []
+    given = ctx.params.get(param.name or "")
+    taken = given if isinstance(given, tuple) else ()
+    return sorted(name for name in names if name.startswith(incomplete) and name not in taken)

@@ -44,9 +44,9 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "stop": ("zscout.cli.components.start", "End components for good."),
     "components": ("zscout.cli.components.components", "List components: where each runs, and what it uses."),
     "logs": ("zscout.cli.components.logs", "Print or follow the output of a component."),
-    "migrate": ("zscout.cli.components.migrate", "Move a running component to another host."),
-    "drain": ("zscout.cli.components.drain", "Empty a host of components, and place none there any more."),
-    "uncordon": ("zscout.cli.components.drain", "Use a drained host again."),
+    "migrate": ("zscout.cli.components.moves", "Move a running component to another host."),
+    "drain": ("zscout.cli.components.moves", "Empty a host of components, and place none there any more."),
+    "uncordon": ("zscout.cli.components.moves", "Use a drained host again."),
     "keys": ("zscout.cli.fleet.keys", "List what is alive on the mesh, and the keys it serves."),
     "view": ("zscout.cli.fleet.view", "Watch the fleet live on a timeline, or open a recording."),
     "replay": ("zscout.cli.lab.replay", "Schedule a workload file under virtual time."),
@@ -130,31 +130,33 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
         return INTERRUPTED, ""
     # Only a failing command pays for these imports, and most have made them already.
+    from zscout.behaviors.client.client import CommandRefused, RequestRefused
+    from zscout.behaviors.client.placer_client import PlacerSilent
     from zscout.cli.common import Failed, Interrupted, NobodyThere
     from zscout.config.strict import BadInput
     from zscout.keyexpr import BadName
-
-    if isinstance(error, Interrupted):
-        return error.exit_code, ""
-    if isinstance(error, Failed):
-        return error.exit_code, f"zscout: {_line(str(error))}"
-    if isinstance(error, (BadInput, BadName)):
-        return BAD_INPUT, f"zscout: {_line(str(error))}"
-    from zscout.behaviors.client.client import CommandRefused, RequestRefused
-    from zscout.behaviors.client.placer_client import PlacerSilent
     from zscout.lab import LabError
     from zscout.mesh import MeshError
 
-    if isinstance(error, PlacerSilent):
-        return NobodyThere.exit_code, f"zscout: {_line(str(error))}"
-    if isinstance(error, (RequestRefused, CommandRefused, MeshError, LabError)):
-        return COULD_NOT, f"zscout: {_line(str(error))}"
+    words = f"zscout: {_line(str(error))}"
+    match error:
+        case Interrupted():
+            return error.exit_code, ""
+        case Failed():
+            return error.exit_code, words
+        case BadInput() | BadName():
+            return BAD_INPUT, words
+        case PlacerSilent():
+            return NobodyThere.exit_code, words
+        case RequestRefused() | CommandRefused() | MeshError() | LabError():
+            return COULD_NOT, words
     return None
 
 
 def _line(text: str) -> str:
-    """One line that can't draw on the terminal: parts of it come from other hosts."""
-    return "".join(char if char.isprintable() else " " for char in " ".join(text.split()))
+    from zscout.terminal import clean
+
+    return clean(" ".join(text.split()))
 
 
 def _pipe_closed() -> int:

@@ -14,8 +14,8 @@ from tests.cli.tools import COMMAND, zscout_soon
 from tests.hang import HANG
 from tests.live.bench import Bench, Stand, until
 from tests.live.lab import Lab
-from zscout.cli.fleet.devices import figures_text
-from zscout.cli.fleet.watching import _lasting
+from zscout.cli.fleet.status import figures_text
+from zscout.cli.fleet.watching import lasting
 from zscout.messages import Figures
 
 
@@ -98,7 +98,7 @@ def test_health_and_figures_of_devices(tmp_path: Path) -> None:
 
 def test_figures_alone_make_no_new_block_of_watch() -> None:
     told = {"rcs": [{"rc": "robot/a", "health": "ok", "figures": {"dropped": 3.0}}]}
-    assert _lasting(told) == {"rcs": [{"rc": "robot/a", "health": "ok"}]}
+    assert lasting(told) == {"rcs": [{"rc": "robot/a", "health": "ok"}]}
 
 
 def test_figures_in_words() -> None:

@@ -102,10 +102,10 @@ def test_an_estimate_that_ticks_down_prints_nothing_and_asks_for_nothing(fleet: 
     async def wait_in_a_crowd_of_news() -> list[bool]:
         async with await Noting.connect("noting", fleet=fleet.lab.fleet, host="test") as client:
             client.looks = []
-            with Report("next", str(client.mesh.me), as_json=False, stream=out) as report:
+            with Report("next", client, as_json=False, stream=out) as report:
                 client.watch(report.news)
                 arc = await client.request("next", {"robot/a": {}}, estimate=True)
-                telling = asyncio.ensure_future(report.follow_wait(client))
+                telling = asyncio.ensure_future(report.follow_wait())
                 until = clock.now() + 2 * REFRESH * SECOND
                 while clock.now() < until:
                     report.news(arc)

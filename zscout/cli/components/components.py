@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import AsyncExitStack, ExitStack, suppress
+from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from zscout import terminal
-from zscout.cli import common, completions
+from zscout.cli import common, completion
 from zscout.cli.components.placing import (
     component_named,
     placement_object,
     placer_of,
     tail_of,
-    unknown,
+    unknown_here,
 )
 from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView
-from zscout.cli.fleet.overview import Overview, Table, print_overview
-from zscout.cli.fleet.watching import display_for, pause, show_once
+from zscout.cli.fleet.watching import Overview, display, pause, show_once
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role
-from zscout.mesh import clock
 from zscout.messages import ComponentList, ComponentUse, ListComponents, Placement
+from zscout.terminal import Table
 from zscout.types import SECOND, Ns
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ STYLES: Final = {
 
 
 @click.command()
-@click.argument("name", required=False, shell_complete=completions.components)
+@click.argument("name", required=False, shell_complete=completion.components)
 @click.option("--kinds", is_flag=True, help="List what can be started, and on which hosts.")
 @click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
@@ -66,7 +65,7 @@ def components(name: str | None, kinds: bool, watch: bool, as_json: bool) -> int
         return common.run(_kinds(as_json=as_json))
     if name is not None:
         component_named(name)
-    return common.run(_watch(name, as_json=as_json) if watch else _once(name, as_json=as_json))
+    return common.run(_list(name, watch=watch, as_json=as_json))
 
 
 class Listing:
@@ -83,10 +82,7 @@ class Listing:
         """All of them, with what they use. Raises NobodyThere; Failed for a name that nobody knows."""
         await self.placer.refresh()
         if self.name is not None and self.name not in self.placer.placements:
-            async with AsyncExitStack() as stack:
-                everyone = stack.enter_context(placer_of(self.client))
-                await everyone.refresh()
-            raise unknown(self.name, everyone.placements)
+            raise await unknown_here(self.client, self.name)
         hosts = {one.host for one in self._running()}
 
         def reported() -> bool:
@@ -103,7 +99,7 @@ class Listing:
         if running <= self._began.keys():
             return
         for node in await ask_nodes(self.client, ListComponents(self.name)):
-            now = clock.now()
+            now = self.client.mesh.now()
             for view in node.components:
                 key = (view.component, view.incarnation)
                 if key in running:
@@ -155,7 +151,7 @@ class Listing:
     def _headline(self) -> str:
         running = self._running()
         hosts = len({one.host for one in running})
-        on = f" on {hosts} host{'' if hosts == 1 else 's'}" if running else ""
+        on = f" on {terminal.many(hosts, 'host')}" if running else ""
         cordoned = f"; cordoned: {', '.join(sorted(self.placer.cordoned))}" if self.placer.cordoned else ""
         return f"Fleet {self.client.fleet.name}: {len(running)} of {len(self._all())} run{on}{cordoned}"
 
@@ -174,7 +170,7 @@ class Listing:
 
     def _uptime(self, one: Placement) -> float | None:
         began = self._began.get((one.component, one.incarnation))
-        return None if began is None else (clock.now() - began) / SECOND
+        return None if began is None else (self.client.mesh.now() - began) / SECOND
 
 
 async def ask_nodes(client: Client, asked: ListComponents) -> list[ComponentList]:
@@ -184,33 +180,26 @@ async def ask_nodes(client: Client, asked: ListComponents) -> list[ComponentList
     return sorted(lists, key=lambda one: one.host)
 
 
-async def _once(name: str | None, *, as_json: bool) -> int:
-    async with common.connected("components") as client:
-        listing = Listing(client, name)
-        with listing.placer:
-            await listing.find()
-        show_once(listing, as_json=as_json)
-        if name is not None and not as_json and (tail := tail_of(listing.placer.placements[name])):
-            terminal.print_line("\nThe end of its output:")
-            for line in tail:
-                terminal.print_line(line)
-    return 0
-
-
-async def _watch(name: str | None, *, as_json: bool) -> int:
-    stop = asyncio.Event()
+async def _list(name: str | None, *, watch: bool, as_json: bool) -> int:
     async with AsyncExitStack() as stack:
         client = await stack.enter_async_context(common.connected("components"))
         listing = Listing(client, name)
         placer = stack.enter_context(listing.placer)
-        stack.callback(listing.fleet_view.close)
+        stack.enter_context(listing.fleet_view)
         await listing.find()
+        if not watch:
+            show_once(listing, as_json=as_json)
+            tail = tail_of(placer.placements[name]) if name is not None and not as_json else []
+            for line in ["\nThe end of its output:", *tail] if tail else []:
+                terminal.print_line(line)
+            return 0
+        stop = asyncio.Event()
 
         def end() -> None:
             stop.set()
             placer.changed.set()
 
-        show = display_for(stack, as_json=as_json, end=end)
+        show = stack.enter_context(display(as_json=as_json, end=end))
         while not stop.is_set():
             show(listing)
             await pause(placer.changed, stop)
@@ -224,10 +213,8 @@ async def _kinds(*, as_json: bool) -> int:
     async with common.connected("components", need_rcm=False) as client:
         with suppress(common.NobodyThere):
             await common.see_rcm(client)
-        with ExitStack() as stack:
-            fleet_view = FleetView(client)
-            stack.callback(fleet_view.close)
-            await all_hosts_seen(fleet_view)
+        with FleetView(client) as fleet_view:
+            await fleet_view.all_seen()
         nodes = await ask_nodes(client, ListComponents())
         fleet = client.fleet.name
     if not nodes:
@@ -242,19 +229,6 @@ async def _kinds(*, as_json: bool) -> int:
     rows = [(kind, ", ".join(one.host for one in nodes if kind in one.kinds)) for kind in kinds]
     nothing = [one.host for one in nodes if not one.kinds]
     without = f"; nothing on {', '.join(nothing)}" if nothing else ""
-    print_overview(
-        Overview(
-            f"Fleet {fleet}: {len(kinds)} kinds can be started{without}",
-            [Table("Kinds", ("KIND", "ON"), rows, [""] * len(rows))],
-        )
-    )
+    headline = f"Fleet {fleet}: {len(kinds)} kinds can be started{without}"
+    Overview(headline, [Table("Kinds", ("KIND", "ON"), rows)]).print()
     return 0
-
-
-async def all_hosts_seen(fleet_view: FleetView) -> None:
-    """Returns when no host has come into sight for a while: links are made one after another."""
-    deadline = clock.now() + round(FIND_LOADS * SECOND)
-    while clock.now() < deadline:
-        known = set(fleet_view.hosts)
-        if not await fleet_view.until(lambda known=known: set(fleet_view.hosts) != known, QUIET):  # type: ignore[misc]
-            return

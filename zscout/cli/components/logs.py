@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
-from contextlib import ExitStack, suppress
 from typing import Final
 
 import click
@@ -12,14 +10,13 @@ import click
 from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
-from zscout.cli import common, completions
-from zscout.cli.components.components import all_hosts_seen
+from zscout.cli import common, completion
 from zscout.cli.components.placing import (
     OVER,
     component_named,
     placer_of,
     standing,
-    unknown,
+    unknown_here,
 )
 from zscout.cli.fleet.fleet_view import FleetView
 from zscout.keyexpr import check_name
@@ -33,7 +30,7 @@ UNKNOWN: Final = 3
 
 
 @click.command()
-@click.argument("name", shell_complete=completions.components)
+@click.argument("name", shell_complete=completion.components)
 @click.option("-f", "--follow", is_flag=True, help="Go on until it has ended, wherever it moves.")
 @click.option(
     "--lines", type=click.IntRange(0, 100_000), help="Only the last so many lines of what there is."
@@ -41,7 +38,7 @@ UNKNOWN: Final = 3
 @click.option(
     "--host",
     metavar="HOST",
-    shell_complete=completions.hosts,
+    shell_complete=completion.hosts,
     help="What it wrote there; else where it ran last.",
 )
 def logs(name: str, follow: bool, lines: int | None, host: str | None) -> int:
@@ -194,16 +191,12 @@ class Reader:
             await self._placer.wait_changed()
 
     async def _pause(self) -> None:
-        with suppress(TimeoutError):
-            async with asyncio.timeout(READ_EVERY):
-                await self._placer.changed.wait()
+        await common.within(READ_EVERY, self._placer.changed)
         self._placer.changed.clear()
 
     async def _see_hosts(self) -> None:
-        with ExitStack() as stack:
-            fleet_view = FleetView(self._client)
-            stack.callback(fleet_view.close)
-            await all_hosts_seen(fleet_view)
+        with FleetView(self._client) as fleet_view:
+            await fleet_view.all_seen()
 
     async def _nothing(self) -> common.Failed:
         """What to raise where there is no output."""
@@ -215,9 +208,7 @@ class Reader:
             return common.Failed(
                 terminal.clean(f"no host knows any output of {self._name}: it {standing(self._record)}")
             )
-        with placer_of(self._client) as everyone:
-            await everyone.refresh()
-        return unknown(self._name, everyone.placements)
+        return await unknown_here(self._client, self._name)
 
     def write(self, text: str) -> None:
         """To stdout, as it is; at a terminal without what could draw on it."""

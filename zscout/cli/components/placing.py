@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import difflib
 import sys
 from collections.abc import AsyncIterator, Callable, Collection, Iterable
 from contextlib import asynccontextmanager
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import structs
 
 from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.cli import common
-from zscout.config.strict import BadInput, quoted
+from zscout.config.strict import BadInput
 from zscout.keyexpr import check_name
-from zscout.messages import Placement
+from zscout.messages import ListPlacements, Placement, Placements
 
 if TYPE_CHECKING:
-    from rich.live import Live
-
     from zscout.behaviors.client.client import Client
 
 PATIENCE: Final = 15.0
 """Seconds within which a placer answers, though the lead changes meanwhile."""
-MAX_NAMED: Final = 8
 OVER: Final = frozenset({"ended", "given_up"})
 """States of a component that will not run again by itself."""
 
@@ -35,44 +30,39 @@ def placer_of(client: Client, only: Collection[str] | None = None) -> PlacerClie
     return PlacerClient(client.mesh, only, patience=PATIENCE)
 
 
-class Progress:
+@asynccontextmanager
+async def placing(
+    command: str, only: Collection[str] | None = None, *, as_json: bool
+) -> AsyncIterator[tuple[Progress, PlacerClient]]:
+    """Progress and placer of one command, which knows how all components stand, or those in `only`. Raises
+    NobodyThere, MeshError, RequestRefused."""
+    async with common.connected(command) as client:
+        with Progress(quiet=as_json) as shown, placer_of(client, only) as placer:
+            await placer.refresh()
+            yield shown, placer
+
+
+class Progress(terminal.LiveLine):
     """How something goes, on stdout: one live line at a terminal, a line for each change in a pipe, nothing
-    where it is `quiet`. Use as a context manager: the live line is gone afterwards."""
+    where it is `quiet`."""
 
     def __init__(self, *, quiet: bool) -> None:
+        super().__init__(shown=not quiet)
         self._quiet = quiet
-        self._watched = not quiet and terminal.at_terminal()
-        self._live: Live | None = None
         self._said = ""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.hide()
 
     def update(self, text: str) -> None:
         """How it stands now."""
-        text = terminal.clean(text)
-        if self._watched:
-            self._draw(text)
-        elif text != self._said and not self._quiet:
-            terminal.print_line(text)
+        self.draw(text)
+        if text != self._said and not (self.watched or self._quiet):
+            self.print(text)
         self._said = text
 
     def say(self, text: str) -> None:
         """What has come of it, to stay on the screen."""
         self.hide()
         if not self._quiet:
-            terminal.print_line(terminal.clean(text))
-
-    def hide(self) -> None:
-        """Takes the live line away."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
+            self.print(text)
 
     @asynccontextmanager
     async def within(
@@ -89,16 +79,6 @@ class Progress:
             self.hide()
             terminal.print_line(interrupted, sys.stderr)
             raise
-
-    def _draw(self, text: str) -> None:
-        from rich.live import Live
-        from rich.text import Text
-
-        picture = Text(text, overflow="ellipsis", no_wrap=True)
-        if self._live is None:
-            self._live = Live(picture, console=terminal.console(), transient=True, auto_refresh=False)
-            self._live.start()
-        self._live.update(picture, refresh=True)
 
 
 # Words
@@ -129,14 +109,18 @@ def standing(placement: Placement) -> str:
 
 def unknown(name: str, known: Iterable[str]) -> common.Failed:
     """What to raise where nobody knows a component of this name."""
-    names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=3)
-    if near:
-        return common.Failed(f"no component {quoted(name)} is known; did you mean {' or '.join(near)}?")
-    if not names:
-        return common.Failed(f"no component {quoted(name)} is known, nor any other; start one: zscout start")
-    rest = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return common.Failed(f"no component {quoted(name)} is known; known: {', '.join(names[:MAX_NAMED])}{rest}")
+    return common.unknown("component", name, known, "nor any other; start one: zscout start", "known")
+
+
+async def unknown_here(client: Client, name: str) -> common.Failed:
+    """The same, after all components have been listed. Raises RequestRefused."""
+    everyone = await placer_of(client).request(ListPlacements(), Placements)
+    return unknown(name, (one.component for one in everyone.components))
+
+
+def out_of_work(placement: Placement) -> str:
+    """For how long its last move kept it from working, in words."""
+    return "" if placement.dead is None else f", out of work for {placement.dead * 1000:.0f} ms"
 
 
 def tail_of(placement: Placement) -> list[str]:

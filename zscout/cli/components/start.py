@@ -16,18 +16,18 @@ import msgspec
 from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
-from zscout.cli import common, completions
+from zscout.cli import common, completion
 from zscout.cli.components.placing import (
     OVER,
     Progress,
     component_named,
     placement_object,
-    placer_of,
+    placing,
     standing,
     tail_of,
     unknown,
 )
-from zscout.cli.requests.arguments import Duration
+from zscout.cli.requests.options import timeout_option
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import check_name
 from zscout.messages import (
@@ -46,6 +46,7 @@ from zscout.types import METRICS, POLICIES
 
 MAX_BYTES: Final = 1 << 60
 MAX_CORES: Final = 1_000_000
+BAD_JSON: Final = (msgspec.MsgspecError, ValueError, RecursionError)
 RESTARTS: Final = ("never", "on-failure", "always")
 
 _SIZE: Final = re.compile(r"([0-9]{1,19}(?:\.[0-9]{1,6})?)([KMGT]?)i?B?", re.IGNORECASE)
@@ -93,7 +94,7 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
     if given is not None:
         try:
             params = msgspec.json.decode(given, type=dict[str, Any])
-        except (msgspec.MsgspecError, ValueError, RecursionError):
+        except BAD_JSON:
             raise BadInput(
                 f'--params: {quoted(given)} is not a JSON object; write one, as in {{"a": 1}}'
             ) from None
@@ -105,25 +106,21 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
         if key in seen:
             raise BadInput(f"--set: {quoted(key)} is given twice; give it once")
         seen.add(key)
-        params[key] = _value(value)
+        try:
+            params[key] = msgspec.json.decode(value)
+        except BAD_JSON:
+            params[key] = value
     try:
         size = len(msgspec.json.encode(params))
-    except (msgspec.MsgspecError, ValueError, RecursionError):
+    except BAD_JSON:
         raise BadInput("the parameters can't be written as JSON; mend --set or --params") from None
     if size > MAX_PARAMS_SIZE:
         raise BadInput(f"the parameters have {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are taken")
     return params
 
 
-def _value(text: str) -> Any:
-    try:
-        return msgspec.json.decode(text)
-    except (msgspec.MsgspecError, ValueError, RecursionError):
-        return text
-
-
 @click.command()
-@click.argument("kind", shell_complete=completions.kinds)
+@click.argument("kind", shell_complete=completion.kinds)
 @click.option("--name", metavar="NAME", help="What the component is called. Default: its kind.")
 @click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON."
@@ -134,7 +131,7 @@ def _value(text: str) -> Any:
     "hosts",
     multiple=True,
     metavar="HOST",
-    shell_complete=completions.hosts,
+    shell_complete=completion.hosts,
     help="Run nowhere but there; given several times, on one of them.",
 )
 @click.option("--label", "labels", multiple=True, metavar="LABEL", help="What its host must have.")
@@ -151,10 +148,10 @@ def _value(text: str) -> Any:
 @click.option("--memory-limit", type=Size(), default=0, help="What it may use at most, as in 500M.")
 @click.option("--cpu-limit", type=Cores(), help="Cores that it may use at most, as in 0.5.")
 @click.option("--no-wait", is_flag=True, help="Don't wait until it runs.")
-@click.option("--timeout", type=Duration(), help="Wait at most so long until it runs, then exit with 1.")
+@timeout_option("Wait at most so long until it runs, then exit with 1.")
 @common.json_option("Print one JSON object.")
 def start(
-    kind: str, name: str | None, no_wait: bool, timeout: Decimal | None, as_json: bool, **wanted: Any
+    kind: str, name: str | None, no_wait: bool, timeout: float | None, as_json: bool, **wanted: Any
 ) -> int:
     """Have a component run on the best host of the fleet, and keep it running.
 
@@ -176,8 +173,7 @@ def start(
     """
     called = gather_name(kind, name)
     spec = gather_spec(kind, **wanted)
-    seconds = None if timeout is None else float(timeout)
-    return common.run(_start(called, spec, wait=not no_wait, timeout=seconds, as_json=as_json))
+    return common.run(_start(called, spec, wait=not no_wait, timeout=timeout, as_json=as_json))
 
 
 def gather_name(kind: str, name: str | None) -> str:
@@ -226,20 +222,18 @@ def gather_spec(
 
 async def _start(name: str, spec: ComponentSpec, *, wait: bool, timeout: float | None, as_json: bool) -> int:
     stays = f"{name} stays placed; to end it: zscout stop {name}"
-    async with common.connected("start") as client:
-        with Progress(quiet=as_json) as shown, placer_of(client, {name}) as placer:
+    async with placing("start", {name}, as_json=as_json) as (shown, placer):
 
-            def late() -> str:
-                record = placer.placements.get(name)
-                now = f" {standing(record)};" if record is not None else ""
-                return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
+        def late() -> str:
+            record = placer.placements.get(name)
+            now = f" {standing(record)};" if record is not None else ""
+            return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
 
-            await placer.refresh()
-            before = placer.placements.get(name)
-            placement = await _place(placer, name, spec, before)
-            if wait:
-                async with shown.within(timeout, late, stays):
-                    placement = await _until_settled(placer, shown, name, spec)
+        before = placer.placements.get(name)
+        placement = await _place(placer, name, spec, before)
+        if wait:
+            async with shown.within(timeout, late, stays):
+                placement = await _until_settled(placer, shown, name, spec)
     if as_json:
         terminal.print_json(placement_object(placement))
     if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
@@ -247,10 +241,7 @@ async def _start(name: str, spec: ComponentSpec, *, wait: bool, timeout: float |
             terminal.print_line(line, sys.stderr)
         raise common.Failed(f"{name} {standing(placement)}")
     ran = before is not None and before.state == placement.state == "running"
-    if placement.state == "running" or not wait:
-        shown.say(f"{name} {'already ' if ran else ''}{standing(placement)}")
-    else:
-        shown.say(f"{name} {standing(placement)}")
+    shown.say(f"{name} {'already ' if ran else ''}{standing(placement)}")
     return 0
 
 
@@ -286,10 +277,10 @@ async def _until_settled(placer: PlacerClient, shown: Progress, name: str, spec:
 
 
 @click.command()
-@click.argument("names", nargs=-1, required=True, metavar="NAME...", shell_complete=completions.components)
-@click.option("--timeout", type=Duration(), help="Wait at most so long for the end, then exit with 1.")
+@click.argument("names", nargs=-1, required=True, metavar="NAME...", shell_complete=completion.components)
+@timeout_option("Wait at most so long for the end, then exit with 1.")
 @common.json_option("Print one JSON object.")
-def stop(names: Sequence[str], timeout: Decimal | None, as_json: bool) -> int:
+def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> int:
     """End components for good: they are asked to end, and killed if they don't.
 
     Returns when they have ended. What they held is given back. One that has ended before is no error.
@@ -300,31 +291,29 @@ def stop(names: Sequence[str], timeout: Decimal | None, as_json: bool) -> int:
       zscout stop blue green --timeout 10
     """
     wanted = sorted({component_named(name) for name in names})
-    return common.run(_stop(wanted, None if timeout is None else float(timeout), as_json=as_json))
+    return common.run(_stop(wanted, timeout, as_json=as_json))
 
 
 async def _stop(names: list[str], timeout: float | None, *, as_json: bool) -> int:
     stays = f"{', '.join(names)} will be stopped all the same; zscout components tells how that goes"
-    async with common.connected("stop") as client:
-        with Progress(quiet=as_json) as shown, placer_of(client, names) as placer:
-            await placer.refresh()
+    async with placing("stop", names, as_json=as_json) as (shown, placer):
 
-            def lasting() -> list[str]:
-                records = (placer.placements.get(name) for name in names)
-                return [
-                    f"{one.component} {standing(one)}" for one in records if one and one.state not in OVER
-                ]
+        def lasting() -> str:
+            records = (placer.placements.get(name) for name in names)
+            return "; ".join(
+                f"{one.component} {standing(one)}" for one in records if one and one.state not in OVER
+            )
 
-            def late() -> str:
-                return f"after {terminal.span(timeout or 0)} {'; '.join(lasting())}; {stays}"
+        def late() -> str:
+            return f"after {terminal.span(timeout or 0)} {lasting()}; {stays}"
 
-            async with shown.within(timeout, late, stays):
-                ends = await asyncio.gather(*(_end(placer, name) for name in names), return_exceptions=True)
-                while lasting():
-                    shown.update("; ".join(lasting()))
-                    await placer.wait_changed()
-            last = {end.component: end for end in ends if isinstance(end, Placement)}
-            last |= {name: record for name, record in placer.placements.items() if name in last}
+        async with shown.within(timeout, late, stays):
+            ends = await asyncio.gather(*(_end(placer, name) for name in names), return_exceptions=True)
+            while words := lasting():
+                shown.update(words)
+                await placer.wait_changed()
+        last = {end.component: end for end in ends if isinstance(end, Placement)}
+        last |= {name: record for name, record in placer.placements.items() if name in last}
     if as_json:
         terminal.print_json({"components": [placement_object(one) for one in last.values()]})
     for one in last.values():

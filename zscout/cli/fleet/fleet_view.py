@@ -1,31 +1,31 @@
-"""What a subcommand sees of its fleet: who is alive, how loaded the hosts are, what the RCM knows."""
+"""What a subcommand sees of its fleet: who is alive, loads of hosts, what the RCM and the RCs report."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
+from zscout.behaviors.client.placer_client import PlacerClient
+from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
-from zscout.keyexpr import Role, Sender, Token
-from zscout.mesh import clock
-from zscout.messages import ListPlacements, LoadReport, Placements, RcmState, absurd
-from zscout.types import (
-    NO_TERM,
-    SECOND,
-    Ns,
-    Term,
-)
+from zscout.keyexpr import BadName, Role, Sender, Token
+from zscout.messages import LoadReport, RcAsk, RcmState, RcState
+from zscout.types import SECOND, Ns
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
-    from zscout.mesh import Declaration
+    from zscout.mesh import Reply
 
 ASK_PLACER: Final = 1.0
+ASK_RCS: Final = 0.5
+"""Seconds that the RCs have for their answers."""
 FIND_LOADS: Final = 1.2
 """Seconds to wait for load reports: they come once a second."""
+QUIET: Final = 0.3
+"""Seconds without a new host after which all have been seen."""
 STALE: Final = 3 * SECOND
 """Age in ns past which a load report says little."""
 GONE: Final = 60 * SECOND
@@ -52,57 +52,52 @@ class Host:
 
 
 class FleetView:
-    """What a client sees of its fleet from now on: who is alive, loads, and the RCM's state when asked."""
+    """What a client sees of its fleet from now on: who is alive, loads, and the RCM's state when asked. A
+    context manager."""
 
     def __init__(self, client: Client) -> None:
-        self.client = client
+        self.client, self.mesh = client, client.mesh
         self.hosts: dict[str, Host] = {}
-        self.cordoned: frozenset[str] = frozenset()
-        """Hosts on which nothing is placed, as of the last `ask_cordons` or what was published since."""
         self.changed = asyncio.Event()
+        # No component has this name: it only follows which hosts are cordoned, and its answers are short.
+        self._placer = PlacerClient(client.mesh, {"*"})
         self._settled = False
-        self._placer: Term = NO_TERM
-        keys, mesh = client.mesh.keys, client.mesh
-        self._declared: list[Declaration] = [
-            mesh.watch(keys.alive_any(), self._on_token),
-            mesh.subscribe(keys.load_any, LoadReport, self._on_load),
-            mesh.subscribe(keys.placements, Placements, self._on_placements),
-        ]
+        self._stack = ExitStack()
 
-    def close(self) -> None:
-        for declared in self._declared:
-            declared.close()
+    def __enter__(self) -> Self:
+        keys = self.mesh.keys
+        self._stack.enter_context(self._placer)
+        for declared in (
+            self.mesh.watch(keys.alive_any(), self._on_token),
+            self.mesh.subscribe(keys.load_any, LoadReport, self._on_load),
+        ):
+            self._stack.callback(declared.close)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stack.close()
 
     def _on_token(self, token: Token, alive: bool) -> None:
-        if Sender(token.host, token.name) == self.client.mesh.me:
+        if Sender(token.host, token.name) == self.mesh.me:
             return
         host = self.hosts.setdefault(token.host, Host())
         (host.tokens.add if alive else host.tokens.discard)(token)
-        host.gone = None if host.tokens else clock.now()
+        host.gone = None if host.tokens else self.mesh.now()
         self.changed.set()
 
     def _on_load(self, key: str, load: LoadReport) -> None:
-        host = self.hosts.get(self.client.mesh.keys.host_of(key))
+        host = self.hosts.get(self.mesh.keys.host_of(key))
         if host is not None:
-            host.load, host.reported = load, clock.now()
+            host.load, host.reported = load, self.mesh.now()
             self.changed.set()
 
-    def _on_placements(self, _key: str, placements: Placements) -> None:
-        if placements.term >= self._placer and not absurd(placements.term, self._placer):
-            self._placer, self.cordoned = placements.term, frozenset(placements.cordoned)
-
-    async def ask_cordons(self) -> None:
-        """Asks the placer; without an answer all stays as it was."""
-        # No component has this name: the answer is short.
-        asked = ListPlacements(component="*")
-        reply = await self.client.mesh.ask_one(
-            self.client.mesh.keys.placer, asked, Placements, timeout=ASK_PLACER
-        )
-        if reply is not None and reply.message is not None:
-            self._on_placements("", reply.message)
+    @property
+    def cordoned(self) -> frozenset[str]:
+        """Hosts on which nothing is placed, as the placer published or answered last."""
+        return self._placer.cordoned
 
     def forget_gone(self) -> None:
-        now = clock.now()
+        now = self.mesh.now()
         self.hosts = {
             name: host for name, host in self.hosts.items() if host.gone is None or now - host.gone < GONE
         }
@@ -119,7 +114,7 @@ class FleetView:
         """Whether a host that should report its load has not done so lately."""
         if not host.has(Role.LOAD) or (host.load is None and not self._settled):
             return False
-        return host.load is None or clock.now() - host.reported > STALE
+        return host.load is None or self.mesh.now() - host.reported > STALE
 
     async def until(self, true: Callable[[], bool], seconds: float) -> bool:
         """Waits until `true()`, at most so long; returns which."""
@@ -129,6 +124,14 @@ class FleetView:
                     self.changed.clear()
                     await self.changed.wait()
         return true()
+
+    async def all_seen(self) -> None:
+        """Returns when no host has come into sight for a while: links are made one after another."""
+        deadline = self.mesh.now() + round(FIND_LOADS * SECOND)
+        known = -1
+        while known < len(self.hosts) and self.mesh.now() < deadline:
+            known = len(self.hosts)
+            await self.until(lambda known=known: len(self.hosts) > known, QUIET)  # type: ignore[misc]
 
     async def settled(self, *, loads: bool = True) -> RcmState:
         """The RCM's state, once its RCs are seen, and the hosts with their `loads`. Raises NobodyThere."""
@@ -148,6 +151,63 @@ class FleetView:
 
         await self.until(complete, FIND_LOADS)
         self._settled = loads
-        if loads:
-            await self.ask_cordons()
-        return (await self.client.state(forecast=True) if loads else None) or state
+        if not loads:
+            return state
+        # Without an answer the cordons stay as they were.
+        with suppress(TimeoutError, RequestRefused):
+            async with asyncio.timeout(ASK_PLACER):
+                await self._placer.try_refresh()
+        return await self.client.state(forecast=True) or state
+
+
+class Devices:
+    """The newest state of each RC that lives: asked for once, then received as it is published."""
+
+    def __init__(self, fleet_view: FleetView) -> None:
+        self._fleet_view = fleet_view
+        self._mesh = fleet_view.mesh
+        self._states: dict[str, RcState] = {}
+        # Closed with the mesh: it is wanted for as long as that.
+        self._mesh.subscribe(self._mesh.keys.rc_state_any, RcState, self._on_state)
+
+    async def ask(self) -> None:
+        """Asks the RCs of which no state is known yet; waits ASK_RCS for their answers at most."""
+        living = self.living()
+        self._states = {rc: state for rc, state in self._states.items() if rc in living}
+
+        def all_known(reply: Reply[RcState] | None = None) -> bool:
+            if reply is not None and reply.message is not None:
+                self._on_state(reply.key, reply.message)
+            return all(self.of(rc) is not None for rc in self.living())
+
+        if not all_known():
+            key = self._mesh.keys.rc_state_any
+            await self._mesh.ask(key, RcAsk(), RcState, timeout=ASK_RCS, enough=all_known)
+
+    def living(self) -> dict[str, set[str]]:
+        """Instances by RC."""
+        living: dict[str, set[str]] = {}
+        for token in self._fleet_view.tokens(Role.RC):
+            living.setdefault(token.name, set()).add(token.instance)
+        return living
+
+    def known(self) -> list[RcState]:
+        """All states, by RC."""
+        return [state for rc in sorted(self._states) if (state := self.of(rc)) is not None]
+
+    def of(self, rc: str) -> RcState | None:
+        """What this RC reported last, unless it is gone, or another has come in its place."""
+        state = self._states.get(rc)
+        return state if state is not None and state.instance in self.living().get(rc, ()) else None
+
+    def as_object(self, rc: str) -> dict[str, Any]:
+        """What `--json` prints of an RC; `health` is null where it did not answer."""
+        state = self.of(rc)
+        if state is None:
+            return {"health": None, "figures": {}, "capacity": {}}
+        return {"health": state.health, "figures": dict(state.figures), "capacity": dict(state.capacity)}
+
+    def _on_state(self, key: str, state: RcState) -> None:
+        with suppress(BadName):
+            if key == self._mesh.keys.rc_state(state.rc) and state.rc in self.living():
+                self._states[state.rc] = state

@@ -30,15 +30,14 @@ def keys(as_json: bool) -> None:
 
 async def _list(as_json: bool) -> None:
     async with common.connected("keys", need_rcm=False) as client:
-        fleet_view = FleetView(client)
         sharable: set[str] | None = None
-        try:
-            state = await fleet_view.settled(loads=False)
-            sharable = {view.rc for view in state.rcs if view.sharable}
-        except common.NobodyThere:
-            if not fleet_view.hosts:
-                raise
-        fleet_view.close()
+        with FleetView(client) as fleet_view:
+            try:
+                state = await fleet_view.settled(loads=False)
+                sharable = {view.rc for view in state.rcs if view.sharable}
+            except common.NobodyThere:
+                if not fleet_view.hosts:
+                    raise
         tokens = sorted(token for host in fleet_view.hosts.values() for token in host.tokens)
         own, links = client.mesh.keys, client.mesh.links()
         if as_json:
@@ -108,7 +107,4 @@ def _print(own: Keys, tokens: list[Token], links: int, sharable: set[str] | None
             who = token[:3] if number == 0 or not terminal.at_terminal() else ("", "", "")
             rows.append((*who, key["how"], key["key"].removeprefix(f"{own.base}/"), key["what"]))
     terminal.print_line("")
-    columns: tuple[str, ...] = ("HOST", "ROLE", "NAME", "HOW", "KEY", "WHAT")
-    if terminal.at_terminal() and terminal.narrow():
-        columns, rows = columns[:-1], [row[:-1] for row in rows]
-    terminal.print_table(columns, rows)
+    terminal.Table("", ("HOST", "ROLE", "NAME", "HOW", "KEY", "WHAT"), rows, spare={"WHAT"}).print()

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Final
 
 import click
 from msgspec import structs
 
 from zscout.cli import common
-from zscout.cli.fleet.devices import Devices
-from zscout.cli.fleet.fleet_view import FleetView, Host
-from zscout.cli.fleet.overview import Overview, fleet_overview
-from zscout.cli.fleet.watching import display_for, pause, show_once
-from zscout.keyexpr import Role
-from zscout.mesh import clock
-from zscout.messages import Notice, RcmState
+from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
+from zscout.cli.fleet.watching import Overview, display, pause, show_once
+from zscout.keyexpr import Role, Token
+from zscout.messages import HoldView, Notice, RcmState
+from zscout.terminal import Table, many, span
 from zscout.types import SECOND, Ns
+
+MAX_NAMED: Final = 8
+"""Components in the row of a host."""
+MAX_FIGURES_SHOWN: Final = 12
 
 
 @click.command()
@@ -42,29 +45,10 @@ def status(watch: bool, every: bool, as_json: bool) -> None:
       zscout status --json | jq -r '.queue[] | .arc + ": " + .reason'
       zscout status --devices --watch
     """
-    common.run(_watch(every, as_json) if watch else _once(every, as_json))
+    common.run(_status(every, watch=watch, as_json=as_json))
 
 
-async def _once(every: bool, as_json: bool) -> None:
-    async with common.connected("status", need_rcm=False) as client:
-        fleet_view = FleetView(client)
-        devices = Devices(fleet_view)
-        state, nobody = await _first(fleet_view)
-        await devices.ask()
-        show_once(Standing(fleet_view, state, devices, every), as_json=as_json)
-        if nobody is not None:
-            raise nobody
-
-
-async def _first(fleet_view: FleetView) -> tuple[RcmState | None, common.NobodyThere | None]:
-    """The state, or the error where there is none: hosts and RCs are shown all the same."""
-    try:
-        return await fleet_view.settled(), None
-    except common.NobodyThere as nobody:
-        return None, nobody
-
-
-async def _watch(every: bool, as_json: bool) -> None:
+async def _status(every: bool, *, watch: bool, as_json: bool) -> None:
     news, stop = asyncio.Event(), asyncio.Event()
 
     def end() -> None:
@@ -73,27 +57,31 @@ async def _watch(every: bool, as_json: bool) -> None:
 
     async with AsyncExitStack() as stack:
         client = await stack.enter_async_context(common.connected("status", need_rcm=False))
-        fleet_view = FleetView(client)
-        stack.callback(fleet_view.close)
-        devices = Devices(fleet_view)
-        stack.callback(devices.close)
+        fleet_view = stack.enter_context(FleetView(client))
+        standing = Standing(fleet_view, None, Devices(fleet_view), every)
+        nobody: common.NobodyThere | None = None
+        try:
+            standing.state = await fleet_view.settled()
+        except common.NobodyThere as error:  # hosts and RCs are shown all the same
+            nobody = error
+        await standing.devices.ask()
+        if not watch:
+            show_once(standing, as_json=as_json)
+            if nobody is not None:
+                raise nobody
+            return
         # Whatever becomes of an ARC is published to its client.
-        notices = client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
-        stack.callback(notices.close)
-        show = display_for(stack, as_json=as_json, end=end)
-        state, _ = await _first(fleet_view)
+        client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
+        show = stack.enter_context(display(as_json=as_json, end=end))
         while not stop.is_set():
-            fleet_view.forget_gone()
-            await devices.ask()
-            show(Standing(fleet_view, state, devices, every))
+            show(standing)
             await pause(news, stop)
-            state = await client.state(forecast=True)
+            standing.state = await client.state(forecast=True)
+            fleet_view.forget_gone()
+            await standing.devices.ask()
 
 
-# What is shown
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Standing:
     """How the fleet stands; `state` is None where there is no RCM. `every`: with figures of all devices."""
 
@@ -102,57 +90,187 @@ class Standing:
     devices: Devices
     every: bool
 
+    # For people
+
     def overview(self) -> Overview:
-        lost = frozenset(rc for rc in self.devices.living() if self.devices.ill(rc))
-        overview = fleet_overview(self.fleet_view, self.state, lost)
-        return replace(overview, tables=[*overview.tables, self.devices.table(every=self.every)])
+        fleet, links = self.fleet_view.client.fleet.name, many(self.fleet_view.mesh.links(), "link")
+        headline = f"Fleet {fleet}: nobody leads; nothing is granted until a node does ({links})"
+        if self.state is not None:
+            leader, term = self.state.host, self.state.term.counter
+            headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
+        return Overview(headline, list(self._tables()), alarm=self.state is None)
+
+    def _tables(self) -> Iterator[Table]:
+        if self.state is not None:
+            yield self._rcs(self.state)
+            yield self._running(self.state)
+            yield _waiting(self.state)
+        yield self._hosts()
+        yield self._devices()
+
+    def _homes(self) -> dict[str, str]:
+        return {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
+
+    def _rcs(self, state: RcmState) -> Table:
+        homes = self._homes()
+        lost = {device.rc for device in self.devices.known() if device.health != "ok"}
+        rows, styles = [], []
+        for view in state.rcs:
+            holders = [hold for hold in state.holds if view.rc in hold.needs]
+            there = "held" if holders else "free"
+            words = there if view.present else "lost" if view.rc in lost else "absent"
+            kind = "shared" if view.sharable else "exclusive"
+            names = ", ".join(_with_params(hold, view.rc) for hold in holders)
+            rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
+            styles.append({"absent": "red", "lost": "red", "held": "yellow", "free": "green"}[words])
+        return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles)
+
+    def _running(self, state: RcmState) -> Table:
+        rows, styles = [], []
+        for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
+            left = span(hold.remaining) if hold.remaining > 0 else "over"
+            left = f"{left}, keeps" if hold.keep else left
+            rcs = " ".join(sorted(hold.needs))
+            rows.append((hold.arc, str(hold.priority), span(hold.held), left, hold.client, rcs))
+            operator = hold.priority >= self.fleet_view.client.fleet.operator_priority
+            styles.append("bold red" if operator else "")
+        columns = ("ARC", "PRIORITY", "SINCE", "LEFT", "CLIENT", "RCS")
+        return Table("Running", columns, rows, styles, {"CLIENT"})
+
+    def _hosts(self) -> Table:
+        rows, styles = [], []
+        for name, host in self.fleet_view.all_hosts().items():
+            words, style = self._condition(name, host)
+            load, cpu, memory = "-", "-", "-"
+            if (report := host.load) is not None:
+                load = f"{report.load_average[0]:.2f} of {report.cores}"
+                cpu = f"{report.cpu:.0f} %"
+                memory = f"{report.memory_available / 2**30:.1f} of {report.memory_total / 2**30:.1f} GiB"
+            rows.append((name, words, load, cpu, memory, _doing(host)))
+            styles.append(style)
+        return Table("Hosts", ("HOST", "STATE", "LOAD", "CPU", "MEMORY FREE", "RUNS"), rows, styles)
+
+    def _condition(self, name: str, host: Host) -> tuple[str, str]:
+        if host.gone is not None:
+            return f"gone for {span((self.fleet_view.mesh.now() - host.gone) / SECOND)}", "red"
+        if not host.tokens:
+            return "not there", "red"
+        if self.fleet_view.stale(host):
+            return "no load report", "yellow"
+        words, style = ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
+        return (f"{words}, cordoned", "yellow") if name in self.fleet_view.cordoned else (words, style)
+
+    def _devices(self) -> Table:
+        """Those that are not well; with `every` also those that report figures."""
+        known = self.devices.known()
+        shown = [one for one in known if one.health != "ok" or (self.every and one.figures)]
+        rows = [(one.rc, one.health, figures_text(one.figures)) for one in shown]
+        styles = ["" if one.health == "ok" else "red" for one in shown]
+        return Table("Devices", ("RC", "HEALTH", "FIGURES"), rows, styles)
+
+    # For programs
 
     def as_object(self) -> dict[str, Any]:
-        return as_object(self.fleet_view, self.state, self.devices)
-
-
-def as_object(fleet_view: FleetView, state: RcmState | None, devices: Devices) -> dict[str, Any]:
-    """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
-    now = clock.now()
-    homes = {token.name: token.host for token in fleet_view.tokens(Role.RC)}
-    rcs: list[dict[str, Any]] = []
-    for view in state.rcs if state is not None else []:
-        holders = [hold for hold in state.holds if view.rc in hold.needs] if state is not None else []
-        rcs.append(
+        """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
+        state, homes, now = self.state, self._homes(), self.fleet_view.mesh.now()
+        holds, views = (state.holds, state.rcs) if state is not None else ([], [])
+        rcs = [
             {
                 "rc": view.rc,
                 "present": view.present,
                 "sharable": view.sharable,
                 "host": homes.get(view.rc),
-                "holders": [{"arc": hold.arc, "id": hold.id, "client": hold.client} for hold in holders],
+                "holders": [
+                    {"arc": hold.arc, "id": hold.id, "client": hold.client}
+                    for hold in holds
+                    if view.rc in hold.needs
+                ],
+                **self.devices.as_object(view.rc),
             }
-            | devices.as_object(view.rc)
+            for view in views
+        ]
+        return {
+            "fleet": self.fleet_view.client.fleet.name,
+            "links": self.fleet_view.mesh.links(),
+            "rcm": None if state is None else {"host": state.host, "term": state.term, "seq": state.seq},
+            "rcs": rcs,
+            "holds": [structs.asdict(hold) for hold in holds],
+            "queue": [structs.asdict(wait) for wait in state.queue] if state is not None else [],
+            "more": state.more if state is not None else 0,
+            "hosts": [
+                self._host_object(name, host, now) for name, host in self.fleet_view.all_hosts().items()
+            ],
+        }
+
+    def _host_object(self, name: str, host: Host, now: Ns) -> dict[str, Any]:
+        return {
+            "host": name,
+            "leads": host.has(Role.RCM),
+            "node": host.has(Role.NODE),
+            "candidate": host.has(Role.CANDIDATE),
+            "rcs": sorted(token.name for token in host.tokens if token.role == Role.RC),
+            "clients": sorted({token.name for token in host.tokens if token.role == Role.CLIENT}),
+            "components": host.components,
+            "cordoned": name in self.fleet_view.cordoned,
+            "alive": bool(host.tokens),
+            "gone": None if host.gone is None else (now - host.gone) / SECOND,
+            "stale": self.fleet_view.stale(host),
+            "load": None if host.load is None else structs.asdict(host.load),
+            "age": None if host.load is None else (now - host.reported) / SECOND,
+        }
+
+
+def _waiting(state: RcmState) -> Table:
+    rows = [
+        (
+            str(number),
+            wait.arc,
+            str(wait.priority),
+            span(wait.waited),
+            span(float(wait.min_runtime)),
+            "?" if wait.starts_in is None else f"in {span(wait.starts_in)}",
+            str(wait.preemptions),
+            wait.client,
+            wait.reason,
         )
-    return {
-        "fleet": fleet_view.client.fleet.name,
-        "links": fleet_view.client.mesh.links(),
-        "rcm": None if state is None else {"host": state.host, "term": state.term, "seq": state.seq},
-        "rcs": rcs,
-        "holds": [structs.asdict(hold) for hold in state.holds] if state is not None else [],
-        "queue": [structs.asdict(wait) for wait in state.queue] if state is not None else [],
-        "more": state.more if state is not None else 0,
-        "hosts": [_host_object(fleet_view, name, host, now) for name, host in fleet_view.all_hosts().items()],
-    }
+        for number, wait in enumerate(state.queue, 1)
+    ]
+    title = f"Waiting, and {state.more} more" if state.more else "Waiting"
+    columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "CLIENT", "WHY")
+    return Table(title, columns, rows, spare={"RUNTIME", "PREEMPTED", "CLIENT"})
 
 
-def _host_object(fleet_view: FleetView, name: str, host: Host, now: Ns) -> dict[str, Any]:
-    return {
-        "host": name,
-        "leads": host.has(Role.RCM),
-        "node": host.has(Role.NODE),
-        "candidate": host.has(Role.CANDIDATE),
-        "rcs": sorted(token.name for token in host.tokens if token.role == Role.RC),
-        "clients": sorted({token.name for token in host.tokens if token.role == Role.CLIENT}),
-        "components": host.components,
-        "cordoned": name in fleet_view.cordoned,
-        "alive": bool(host.tokens),
-        "gone": None if host.gone is None else (now - host.gone) / SECOND,
-        "stale": fleet_view.stale(host),
-        "load": None if host.load is None else structs.asdict(host.load),
-        "age": None if host.load is None else (now - host.reported) / SECOND,
-    }
+def _with_params(hold: HoldView, rc: str) -> str:
+    amounts = common.amount_text(hold.needs[rc])
+    return f"{hold.arc} ({amounts})" if amounts else hold.arc
+
+
+def _doing(host: Host) -> str:
+    counts = {role: sum(1 for token in host.tokens if token.role == role) for role in (Role.RC, Role.CLIENT)}
+    parts = ["node"] if host.has(Role.NODE) else []
+    parts += ["recorder"] if host.has(Role.RECORDER) else []
+    parts += [many(counts[Role.RC], "RC")] if counts[Role.RC] else []
+    components = host.components
+    # Each component is a client too, and is named below.
+    clients = counts[Role.CLIENT] - sum(1 for token in host.tokens if _of_component(token, components))
+    parts += [many(clients, "client")] if clients > 0 else []
+    parts += components[:MAX_NAMED]
+    parts += [f"{len(components) - MAX_NAMED} more components"] if len(components) > MAX_NAMED else []
+    return ", ".join(parts)
+
+
+def _of_component(token: Token, components: Sequence[str]) -> bool:
+    """Whether this is the client of one of these: `<component>.<incarnation>`."""
+    name, _, number = token.name.rpartition(".")
+    return token.role == Role.CLIENT and number.isdigit() and name in components
+
+
+def figures_text(figures: Mapping[str, float]) -> str:
+    """Figures as people read them, without those that are 0: `frames_per_second=9.8, opened=1`."""
+    parts = []
+    for name, value in figures.items():
+        if value:
+            whole = value == round(value) and abs(value) < 1e15
+            parts.append(f"{name}={round(value) if whole else format(value, '.4g')}")
+    rest = len(parts) - MAX_FIGURES_SHOWN
+    return ", ".join(parts[:MAX_FIGURES_SHOWN]) + (f", {rest} more" if rest > 0 else "")

@@ -1,27 +1,68 @@
-"""`--watch`: the same shown again and again: in place at a terminal, a block for each change in a pipe, or
-JSON lines."""
+"""A line and tables as they stand now, shown once; or with `--watch` again and again: in place at a terminal,
+a block for each change in a pipe, or JSON lines."""
 
 from __future__ import annotations
 
 import asyncio
-import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
-from typing import Any, Final, Protocol, TypeAlias
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
 from zscout import terminal
-from zscout.cli.fleet.overview import Overview, print_overview, rich_overview
+from zscout.cli import common
+from zscout.terminal import Table
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.text import Text
 
 EVERY: Final = 1.0
 """Seconds between two refreshes."""
 HASTE: Final = 0.1
 """The same where something has changed."""
+MAX_ROWS: Final = 500
+"""Of one table at a terminal."""
 PASSING: Final = frozenset(
     {"held", "remaining", "waited", "starts_in", "seq", "links", "load", "age", "gone"}
     | {"uptime", "cpu", "memory", "figures"}
 )
 """Fields that change without anything having happened."""
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """A line, and tables below it. `alarm`: the line is about something that is wrong."""
+
+    headline: str
+    tables: Sequence[Table]
+    alarm: bool = False
+
+    def print(self) -> None:
+        if terminal.at_terminal():
+            terminal.console().print(self.picture())
+            return
+        terminal.print_line(terminal.clean(self.headline))
+        for table in self.tables:
+            if table.rows:
+                terminal.print_line("")
+                table.print()
+
+    def picture(self, *after: Text) -> Group:
+        """For a terminal."""
+        from rich.console import Group
+        from rich.text import Text
+
+        headline = terminal.clean(self.headline)
+        parts: list[Any] = [Text(headline, style="bold red" if self.alarm else "bold")]
+        for table in self.tables:
+            if table.rows:
+                parts += [Text(""), table.picture(MAX_ROWS)]
+            if len(table.rows) > MAX_ROWS:
+                more = f"... {len(table.rows) - MAX_ROWS} more rows: --json has all"
+                parts.append(Text(more, style="dim"))
+        return Group(*parts, *after)
 
 
 class Displayed(Protocol):
@@ -41,88 +82,52 @@ def show_once(shown: Displayed, *, as_json: bool) -> None:
     if as_json:
         terminal.print_json(shown.as_object())
     else:
-        print_overview(shown.overview())
+        shown.overview().print()
 
 
-def display_for(stack: AsyncExitStack, *, as_json: bool, end: Callable[[], None]) -> Show:
-    """What shows it each time; calls `end` when somebody presses q. `stack` clears the terminal up."""
+@contextmanager
+def display(*, as_json: bool, end: Callable[[], None]) -> Iterator[Show]:
+    """Gives what shows it each time; calls `end` when somebody presses q."""
     if as_json:
-        return lambda shown: terminal.print_json(shown.as_object())
-    if terminal.at_terminal():
-        stack.enter_context(_q_ends(end))
-        return _in_place(stack)
-    return _blocks()
+        yield lambda shown: terminal.print_json(shown.as_object())
+    elif not terminal.at_terminal():
+        yield _blocks()
+    else:
+        from rich.text import Text
+
+        hint = Text("q or Ctrl-C ends", style="dim")
+        with ExitStack() as stack:
+            if sys.stdin.isatty():
+                ends = (b"q", b"Q")
+                stack.enter_context(terminal.typed_keys(lambda key: end() if key in ends else None, end))
+            live = stack.enter_context(terminal.LiveLine(stays=True))
+            yield lambda shown: live.draw(shown.overview().picture(hint))
 
 
 async def pause(news: asyncio.Event, stop: asyncio.Event) -> None:
     """Until the next refresh is due."""
-    await _within(EVERY, news)
-    await _within(HASTE, stop)
+    await common.within(EVERY, news)
+    await common.within(HASTE, stop)
     news.clear()
-
-
-async def _within(seconds: float, event: asyncio.Event) -> None:
-    with suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            await event.wait()
 
 
 def _blocks() -> Show:
     """Prints a block where something has changed that is not a load or a span of time."""
-    last: list[Any] = [None]
+    last: Any = None
 
     def show(shown: Displayed) -> None:
-        lasting = _lasting(shown.as_object())
-        if lasting != last[0]:
-            if last[0] is not None:
-                terminal.print_line("")
-            last[0] = lasting
-            print_overview(shown.overview())
+        nonlocal last
+        before, last = last, lasting(shown.as_object())
+        if before is not None and last != before:
+            terminal.print_line("")
+        if last != before:
+            shown.overview().print()
 
     return show
 
 
-def _lasting(value: Any) -> Any:
+def lasting(value: Any) -> Any:
     """A JSON value without what changes all the time."""
     if isinstance(value, dict):
-        return {key: _lasting(item) for key, item in value.items() if key not in PASSING}
-    return [_lasting(item) for item in value] if isinstance(value, list) else value
-
-
-def _in_place(stack: AsyncExitStack) -> Show:
-    from rich.live import Live
-    from rich.text import Text
-
-    live = stack.enter_context(Live(console=terminal.console(), auto_refresh=False))
-
-    def show(shown: Displayed) -> None:
-        hint = Text("q or Ctrl-C ends", style="dim")
-        live.update(rich_overview(shown.overview(), hint), refresh=True)
-
-    return show
-
-
-@contextmanager
-def _q_ends(end: Callable[[], None]) -> Iterator[None]:
-    """Calls `end` when q is pressed, for as long as the context lasts."""
-    if not sys.stdin.isatty():
-        yield
-        return
-    import termios
-    import tty
-
-    loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
-
-    def pressed() -> None:
-        typed = os.read(terminal, 1024)
-        if not typed or b"q" in typed.lower():
-            end()
-
-    tty.setcbreak(terminal)
-    loop.add_reader(terminal, pressed)
-    try:
-        yield
-    finally:
-        loop.remove_reader(terminal)
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+        return {key: lasting(item) for key, item in value.items() if key not in PASSING}
+    return [lasting(item) for item in value] if isinstance(value, list) else value

@@ -15,7 +15,7 @@ import click
 
 from zscout import terminal
 from zscout.cli import common
-from zscout.cli.requests.arguments import RcName
+from zscout.cli.requests.options import RcName
 from zscout.config.strict import BadInput, quoted
 from zscout.mesh import clock
 from zscout.types import SECOND

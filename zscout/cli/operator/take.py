@@ -12,9 +12,8 @@ import click
 
 from zscout.behaviors.client.client import Client
 from zscout.cli.common import Failed, connected, run, state_of, the_fleet
-from zscout.cli.requests.arguments import Need
 from zscout.cli.requests.contention import contention_of, hold_json, hold_text
-from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
+from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, Need, gather, hold_options
 from zscout.cli.requests.request import carry_out
 from zscout.messages import HoldView, RcmState
 from zscout.terminal import clean, print_json, print_line

@@ -1,22 +1,187 @@
-"""The options of all commands that hold something, and what they come to."""
+"""What people write on the command line, read strictly: durations, needs, options of what holds something."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
+from zscout import types
 from zscout.cli.common import json_option
-from zscout.cli.requests.arguments import Duration, Needs, gather_needs
 from zscout.cli.requests.run_command import check_command
-from zscout.config.strict import BadInput
-from zscout.keyexpr import check_name, valid_name
+from zscout.config.strict import BadInput, quoted
+from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
+from zscout.messages import MAX_NEEDS, MAX_PARAMS
+from zscout.scheduling.model import check_patterns
 
+Needs = dict[str, dict[str, Decimal]]
 F = TypeVar("F", bound=Callable[..., Any])
+
+_NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
+_UNITS: Final = {
+    "": Decimal(1),
+    "s": Decimal(1),
+    "ms": Decimal("0.001"),
+    "m": Decimal(60),
+    "h": Decimal(3600),
+}
+
+
+class Duration(click.ParamType[Decimal]):
+    """A duration in seconds from `5`, `1.5`, `300ms`, `2m` or `1h`."""
+
+    name = "duration"
+
+    def __init__(self, *, zero: bool = False) -> None:
+        self._zero = zero
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Decimal:
+        if isinstance(value, Decimal):
+            return value
+        what = param.opts[0] if param is not None else "duration"
+        return parse_duration(str(value), what, zero=self._zero)
+
+
+def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
+    """`--timeout`, in seconds."""
+    return click.option(
+        "--timeout",
+        type=Duration(),
+        callback=lambda _context, _option, value: None if value is None else float(value),
+        help=help,
+    )
+
+
+class Need(click.ParamType[tuple[str, dict[str, Decimal]]]):
+    """An RC or a pattern, and how it will be used."""
+
+    name = "need"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, dict[str, Decimal]]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            return parse_need(str(value))
+        except BadInput as error:
+            if "/" not in str(value) and ctx is not None and not ctx.meta.get("command"):
+                raise BadInput(f"{error}; a command goes after --") from None
+            raise
+
+
+class RcName(click.ParamType[str]):
+    """An RC of one kind: `robot/scout33`, or `scout33` alone; with `pattern` also `robot/*`. Tab offers those
+    on the mesh."""
+
+    name = "rc"
+
+    def __init__(self, kind: str, *, pattern: bool = False) -> None:
+        self._kind, self._pattern = kind, pattern
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        text = str(value)
+        rc = text if "/" in text else f"{self._kind}/{text}"
+        if rc.partition("/")[0] != self._kind or (is_pattern(rc) and not self._pattern):
+            raise BadInput(f"{quoted(text)} is no {self._kind}; name one, as in {self._kind}/NAME")
+        try:
+            check_need(rc)
+        except BadName as error:
+            raise BadInput(str(error)) from None
+        return rc
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        from zscout.cli.completion import rcs
+
+        found = rcs(ctx, param, incomplete)
+        return [CompletionItem(rc) for rc in found if rc.startswith(f"{self._kind}/")]
+
+
+def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
+    """Seconds from `5`, `1.5`, `300ms`, `2m` or `1h`. Raises BadInput."""
+    remedy = "write a number of seconds, or with a unit: 1.5, 300ms, 2m, 1h"
+    number = text.rstrip("hms")
+    unit = text[len(number) :]
+    if _NUMBER.fullmatch(number) is None or unit not in _UNITS:
+        raise BadInput(f"{what}: {quoted(text)} is not a duration; {remedy}")
+    seconds = Decimal(number) * _UNITS[unit]
+    if zero and seconds == 0:
+        return seconds
+    try:
+        types.duration(seconds, what)
+    except ValueError as error:
+        raise BadInput(f"{error}; {remedy}") from None
+    return seconds
+
+
+def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
+    """`robot/scout33`, a pattern such as `framegrabber/*`, or with bandwidth parameters
+    `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
+    rc, colon, rest = text.partition(":")
+    try:
+        check_need(rc)
+    except BadName as error:
+        raise BadInput(f"need {quoted(text)}: {error}") from None
+    params: dict[str, Decimal] = {}
+    for part in rest.split(",") if colon else []:
+        name, equals, number = part.partition("=")
+        remedy = f"write parameter=number, as in {rc}:command_rate=5"
+        try:
+            check_name(name, "parameter")
+        except BadName as error:
+            raise BadInput(f"need {quoted(text)}: {error}; {remedy}") from None
+        if name in params:
+            raise BadInput(f"need {quoted(text)}: {name} is given twice; give it once")
+        if _NUMBER.fullmatch(number) is None:
+            found = f"is {quoted(number)}" if equals else "has no number"
+            raise BadInput(f"need {quoted(text)}: {name} {found}; {remedy}")
+        params[name] = Decimal(number)
+    if len(params) > MAX_PARAMS:
+        raise BadInput(f"need {quoted(text)}: {len(params)} parameters; at most {MAX_PARAMS} are allowed")
+    try:
+        types.exact_amounts(params)
+    except ValueError as error:
+        raise BadInput(f"need {quoted(text)}: {error}") from None
+    return rc, params
+
+
+def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
+    """The needs of one ARC; a pattern that comes again is numbered: `framegrabber/*#2` is the second.
+
+    Raises BadInput where there are too many, one RC is named twice, or patterns contradict each other."""
+    if len(pairs) > MAX_NEEDS:
+        raise BadInput(f"{len(pairs)} RCs; at most {MAX_NEEDS} are allowed in one request")
+    needs: Needs = {}
+    # Numbers that are written out are not given to others.
+    written = {need for need, _ in pairs}
+    for need, params in pairs:
+        name = need
+        if need in needs:
+            if not is_pattern(need):
+                raise BadInput(
+                    f"{need} is named twice; name each RC once, all its parameters after one colon"
+                )
+            if "#" in need:
+                raise BadInput(f"{need} is named twice; leave the numbers out, and they are given")
+            numbered = (f"{need}#{number}" for number in range(2, MAX_NEEDS + 2))
+            name = next(one for one in numbered if one not in needs and one not in written)
+        needs[name] = params
+    try:
+        check_patterns({need: types.exact_amounts(params) for need, params in needs.items()})
+    except ValueError as error:
+        raise BadInput(str(error)) from None
+    return needs
+
+
+# Commands that hold something
 
 
 class CommandAfterDashes(click.Command):
@@ -45,7 +210,7 @@ class HoldOptions:
     priority: int
     min_runtime: Decimal
     keep: bool
-    timeout: Decimal | None
+    timeout: float | None
     grace: Decimal
     command: tuple[str, ...]
     again: bool
@@ -54,11 +219,17 @@ class HoldOptions:
 
 def hold_options(command: F) -> F:
     """The options of all commands that hold something."""
-    options: list[Callable[[F], F]] = [
+    for option in (
+        json_option("Print JSON lines, one for each event."),
+        click.option("--again", is_flag=True, help="Wait and run the command again after a preemption."),
         click.option(
-            "--name",
-            help="What the ARC is called. Default: the command's name, else request (take: operator).",
+            "--grace",
+            type=Duration(zero=True),
+            default="5",
+            show_default=True,
+            help="Between SIGTERM and SIGKILL to the command.",
         ),
+        timeout_option("Wait at most so long for a grant, then exit with 1."),
         click.option(
             "--min-runtime",
             type=Duration(),
@@ -67,19 +238,10 @@ def hold_options(command: F) -> F:
             help="For how long, from the grant: 5, 1.5, 300ms, 2m, 1h.",
         ),
         click.option(
-            "--timeout", type=Duration(), help="Wait at most so long for a grant, then exit with 1."
+            "--name",
+            help="What the ARC is called. Default: the command's name, else request (take: operator).",
         ),
-        click.option(
-            "--grace",
-            type=Duration(zero=True),
-            default="5",
-            show_default=True,
-            help="Between SIGTERM and SIGKILL to the command.",
-        ),
-        click.option("--again", is_flag=True, help="Wait and run the command again after a preemption."),
-        json_option("Print JSON lines, one for each event."),
-    ]
-    for option in reversed(options):
+    ):
         command = option(command)
     return command
 

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from collections.abc import Iterator
 from typing import Any, Final
 
 import click
 
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import Client, CommandRefused
-from zscout.behaviors.client.request import OpenArc
-from zscout.cli.common import Failed, connected, fleet_file, run
-from zscout.cli.requests.arguments import (
-    Need,
-)
+from zscout.behaviors.client.request import HoldEnd, OpenArc
+from zscout.cli import common
+from zscout.cli.common import Failed
 from zscout.cli.requests.contention import held_text
-from zscout.cli.requests.dry_run import foresee
-from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
+from zscout.cli.requests.options import (
+    CommandAfterDashes,
+    HoldOptions,
+    Need,
+    gather,
+    hold_options,
+)
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.waiting import Report
-from zscout.mesh import clock
-from zscout.terminal import clean, span
+from zscout.messages import Foresight
+from zscout.terminal import clean, print_json, print_line, span
 
 TAKEN_AWAY: Final = 75
 """EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""
@@ -92,11 +96,11 @@ def request(
       zscout request robot/scout33 --priority 5 --dry-run
     """
     wanted = gather(ctx, needs, name, priority=priority, keep=keep, **rest)
-    return run(foresee(wanted) if dry_run else _request(wanted))
+    return common.run(_foresee(wanted) if dry_run else _request(wanted))
 
 
 async def _request(wanted: HoldOptions) -> int:
-    async with connected("request") as client:
+    async with common.connected("request") as client:
         return await carry_out(client, wanted)
 
 
@@ -104,7 +108,8 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
     """Waits, holds, runs the command; everything is given back at the end. Returns the exit code.
 
     Raises Failed, RequestRefused."""
-    with report_for(client, wanted) as report:
+    stream = sys.stderr if wanted.command else sys.stdout
+    with Report(wanted.name, client, as_json=wanted.as_json, stream=stream) as report:
         client.watch(report.news)
         arc: OpenArc | None = None
         while True:
@@ -114,7 +119,8 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
             except CommandRefused as refused:
                 # A device did not know of the grant: the client has given it back.
                 if not wanted.again:
-                    raise Failed(f"{wanted.name}: {refused}; try again", _lost_code(wanted)) from None
+                    lost = TAKEN_AWAY if wanted.command else 1
+                    raise Failed(f"{wanted.name}: {refused}; try again", lost) from None
                 report.event("lost", f"{wanted.name}: {refused}; asking again", {"reason": str(refused)})
                 arc = None
                 continue
@@ -122,16 +128,10 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
                 return code
 
 
-def report_for(client: Client, wanted: HoldOptions) -> Report:
-    stream = sys.stderr if wanted.command else sys.stdout
-    return Report(wanted.name, str(client.mesh.me), as_json=wanted.as_json, stream=stream)
-
-
 async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc | None) -> OpenArc:
     """Until it is granted. Raises Failed where it is not."""
-    telling = asyncio.ensure_future(report.follow_wait(client))
     try:
-        async with asyncio.timeout(float(wanted.timeout) if wanted.timeout is not None else None):
+        async with common.beside(report.follow_wait()), asyncio.timeout(wanted.timeout):
             if arc is None:
                 arc = await client.request(
                     wanted.name,
@@ -146,7 +146,7 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
         why = arc.reason if arc is not None else ""
         if arc is not None:
             await client.end(arc)
-        line = f"{wanted.name} was not granted within {span(float(wanted.timeout or 0))}, and is cancelled"
+        line = f"{wanted.name} was not granted within {span(wanted.timeout or 0)}, and is cancelled"
         report.event("ended", "", {"outcome": "timeout", "reason": why})
         raise Failed(clean(f"{line}: {why}" if why else line)) from None
     except asyncio.CancelledError:
@@ -155,8 +155,6 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
         report.event("ended", f"{wanted.name} is cancelled", {"outcome": "cancelled"})
         raise
     finally:
-        telling.cancel()
-        await asyncio.gather(telling, return_exceptions=True)
         report.hide()
     if grant is None:
         report.event("ended", "", {"outcome": arc.outcome, "reason": arc.reason})
@@ -195,8 +193,8 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     if held.active:
         # By our clock its time is over; the RCM's own word is on its way.
         await report.within(LAST_WORD, lambda: not held.active)
-    if held.active or report.ending.outcome == "completed":
-        arc.finish("completed", "its time is over", clock.now())
+    if held.active or _ending(arc).outcome == "completed":
+        arc.finish("completed", "its time is over", client.mesh.now())
         report.event("ended", f"the time of {arc.name} is over", {"outcome": "completed"})
         return TIME_OVER if wanted.command else 0
     return await _taken(client, wanted, report, arc)
@@ -204,12 +202,10 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
 
 async def _hold(report: Report, held: Held) -> None:
     """Until the hold is over."""
-    telling = asyncio.ensure_future(report.follow_hold(held.arc))
     try:
-        await held.over()
+        async with common.beside(report.follow_hold(held.arc)):
+            await held.over()
     finally:
-        telling.cancel()
-        await asyncio.gather(telling, return_exceptions=True)
         report.hide()
 
 
@@ -224,30 +220,24 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
         client=client.mesh.me,
         remaining=held.remaining,
         fleet_name=client.fleet.name,
-        fleet_file=fleet_file(),
+        fleet_file=common.fleet_file(),
     )
     async with RunningCommand(wanted.command, env, grace=float(wanted.grace)) as command:
-        over = asyncio.ensure_future(held.over())
-        ended = asyncio.ensure_future(command.wait())
-        try:
-            await asyncio.wait({over, ended}, return_when=asyncio.FIRST_COMPLETED)
-            if ended.done():
-                if held.active:
-                    # At once: what it left running is ended afterwards, and may take its time.
-                    await client.end(held.arc)
-                return ended.result()
-            why = "its time is over" if held.active else report.ending.reason or "the grant is gone"
-            report.event("stopping", f"{wanted.command[0]} is stopped: {why}", {"reason": why})
-            await command.end()
-        finally:
-            over.cancel()
-            ended.cancel()
+        _, ended = await common.first_of(held.over(), command.wait())
+        if ended:
+            if held.active:
+                # At once: what it left running is ended afterwards, and may take its time.
+                await client.end(held.arc)
+            return await command.wait()
+        why = "its time is over" if held.active else _ending(held.arc).reason or "the grant is gone"
+        report.event("stopping", f"{wanted.command[0]} is stopped: {why}", {"reason": why})
+        await command.end()
     return None
 
 
 async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
     """The grant was taken away. Raises Failed where there is no command and no second try."""
-    ending, again = report.ending, wanted.again and arc.open
+    ending, again = _ending(arc), wanted.again and arc.open
     line = f"{arc.name} lost its grant: {ending.reason or ending.outcome}"
     details = {"outcome": ending.outcome, "reason": ending.reason, "by": ending.by, "again": again}
     if again:
@@ -261,5 +251,50 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
     raise Failed(clean(f"{line}; ask again, or with a higher priority"))
 
 
-def _lost_code(wanted: HoldOptions) -> int:
-    return TAKEN_AWAY if wanted.command else 1
+def _ending(arc: OpenArc) -> HoldEnd:
+    """How its last hold came to its end."""
+    return arc.ending or HoldEnd("lost", "")
+
+
+# What would come of it
+
+
+async def _foresee(wanted: HoldOptions) -> int:
+    """Prints when it would start and whom it would preempt at once. Exit code 1: it would not start.
+
+    Raises RequestRefused, NobodyThere."""
+    async with common.connected("request") as client:
+        foretold = await client.foresee(
+            wanted.name,
+            wanted.needs,
+            priority=wanted.priority,
+            min_runtime=wanted.min_runtime,
+            keep=wanted.keep,
+        )
+        if foretold is None:
+            raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
+    if wanted.as_json:
+        print_json(
+            {
+                "arc": wanted.name,
+                "starts_in": foretold.starts_in,
+                "preempts": foretold.preempts,
+                "reason": foretold.reason,
+            }
+        )
+    else:
+        for line in _words(foretold):
+            print_line(clean(line))
+    return 0 if foretold.starts_in is not None else 1
+
+
+def _words(foretold: Foresight) -> Iterator[str]:
+    if foretold.starts_in is None:
+        yield f"{foretold.arc} would wait, and no start can be foretold: {foretold.reason}"
+    elif foretold.reason:
+        yield f"{foretold.arc} would start in {span(foretold.starts_in)}, if nothing else comes"
+        yield f"until then: {foretold.reason}"
+    else:
+        yield f"{foretold.arc} would start at once"
+    if foretold.preempts:
+        yield f"it would preempt {', '.join(foretold.preempts)}"

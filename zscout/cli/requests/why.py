@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,7 +11,6 @@ from msgspec import structs
 from zscout import terminal
 from zscout.cli import common
 from zscout.cli.requests.contention import NeedContention, contention_of, hold_json
-from zscout.config.strict import quoted
 from zscout.messages import HoldView, RcAsk, RcmState, RcState, StoryLine, WaitView
 
 if TYPE_CHECKING:
@@ -20,7 +18,6 @@ if TYPE_CHECKING:
 
 MAX_TWINS: Final = 20
 """Open ARCs of one name that are described."""
-MAX_NAMED: Final = 8
 ASK_RC: Final = 0.5
 """Seconds that an RC has to say what ails it."""
 
@@ -60,7 +57,8 @@ async def _look(asked: str) -> dict[str, Any]:
         views: list[View] = [*state.holds, *state.queue]
         same = [view for view in views if asked in (view.arc, view.id, _full(view))]
         if not same and not state.story:
-            raise common.Failed(_unknown(asked, views, state.more))
+            names = [view.arc for view in views]
+            raise common.unknown("ARC", asked, names, "and none is open", "open", state.more)
         arcs = [await _described(client, view, state) for view in same[:MAX_TWINS]]
         if not same:
             arcs = [{"arc": asked, "state": "ended", "story": _story(state.story)}]
@@ -118,19 +116,6 @@ def _story(lines: list[StoryLine]) -> list[dict[str, Any]]:
 
 def _full(view: View) -> str:
     return f"{view.client}/{view.id}"
-
-
-def _unknown(asked: str, views: list[View], more: int) -> str:
-    names = sorted({view.arc for view in views})
-    near = difflib.get_close_matches(asked, names, n=3)
-    if near:
-        return f"no ARC {quoted(asked)} is known; did you mean {' or '.join(near)}?"
-    if not names:
-        return f"no ARC {quoted(asked)} is known, and none is open"
-    rest = len(names) - MAX_NAMED + more
-    return f"no ARC {quoted(asked)} is known; open: {', '.join(names[:MAX_NAMED])}" + (
-        f" and {rest} more" if rest > 0 else ""
-    )
 
 
 # Words

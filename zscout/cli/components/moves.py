@@ -1,0 +1,192 @@
+"""`zscout migrate`, `drain` and `uncordon`: have components go on elsewhere, empty a host, use it again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import click
+
+from zscout import terminal
+from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
+from zscout.behaviors.client.request import RequestRefused
+from zscout.cli import common, completion
+from zscout.cli.components.placing import (
+    OVER,
+    Progress,
+    component_named,
+    out_of_work,
+    placement_object,
+    placer_of,
+    placing,
+    standing,
+    unknown,
+)
+from zscout.cli.requests.options import timeout_option
+from zscout.keyexpr import check_name
+from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
+
+
+@click.command()
+@click.argument("name", shell_complete=completion.components)
+@click.option(
+    "--to", metavar="HOST", shell_complete=completion.hosts, help="Where to. Default: the best other host."
+)
+@common.json_option("Print one JSON object.")
+def migrate(name: str, to: str | None, as_json: bool) -> int:
+    """Move a running component to another host, with its state and all that it holds.
+
+    Only what can give and take a checkpoint can be moved. Says where it went, and for how long it was out of
+    work. If it fails, the component goes on where it was.
+
+    \b
+    Examples:
+      zscout migrate counter
+      zscout migrate counter --to bellows --json | jq .dead
+    """
+    component_named(name)
+    if to is not None:
+        check_name(to, "--to")
+    return common.run(_migrate(name, to, as_json=as_json))
+
+
+async def _migrate(name: str, to: str | None, *, as_json: bool) -> int:
+    async with placing("migrate", as_json=as_json) as (shown, placer):
+        before = placer.placements.get(name)
+        if before is None:
+            raise unknown(name, placer.placements)
+        interrupted = f"{name} is moved all the same; zscout components tells how that goes"
+        async with shown.within(None, str, interrupted):
+            after = await _moved(placer, shown, before, to)
+    moved = after.moves > before.moves
+    if as_json:
+        dead = after.dead if moved else None
+        terminal.print_json(placement_object(after) | {"from": before.host, "dead": dead})
+    if after.host == before.host:
+        shown.say(f"{name} is on {after.host} already")
+    else:
+        shown.say(f"{name} went from {before.host} to {after.host}{out_of_work(after) if moved else ''}")
+    return 0
+
+
+async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: str | None) -> Placement:
+    """Moves it, and shows how it goes. Raises Failed where it did not come to that."""
+    name = before.component
+
+    def begun(record: Placement) -> bool:
+        return record.state == "moving" or record.host != before.host
+
+    try:
+        record = await placer.request_once(MigrateComponent(name, to, wait=0.0), begun)
+    except PlacerSilent:
+        raise
+    except RequestRefused as refused:
+        raise common.Failed(f"{name} was not moved: {refused}") from None
+    if not begun(record):
+        if to == record.host:
+            return record
+        raise common.Failed(terminal.clean(f"{name} was not moved: it {standing(record)}"))
+    while True:
+        if record.state == "running":
+            if record.host != before.host:
+                return record
+            raise common.Failed(
+                terminal.clean(f"{name} was not moved, it goes on on {record.host}: {record.reason}")
+            )
+        if record.state in OVER:
+            raise common.Failed(terminal.clean(f"{name} was not moved: it {standing(record)}"))
+        shown.update(f"{name} {standing(record)}")
+        await placer.wait_changed()
+        record = placer.placements.get(name, record)
+
+
+@click.command()
+@click.argument("host", shell_complete=completion.hosts)
+@timeout_option("Wait at most so long until it is empty, then exit with 1.")
+@common.json_option("Print one JSON object.")
+def drain(host: str, timeout: float | None, as_json: bool) -> int:
+    """Place nothing on a host any more, and move away what can be moved.
+
+    Ends when no movable component is left; exit code 1 names what stays, and why. The host stays cordoned,
+    also after Ctrl-C or --timeout, until zscout uncordon.
+
+    \b
+    Examples:
+      zscout drain anvil && ssh anvil sudo reboot
+      zscout drain anvil --timeout 2m
+    """
+    check_name(host, "host")
+    return common.run(_drain(host, timeout, as_json=as_json))
+
+
+@click.command()
+@click.argument("host", shell_complete=completion.hosts)
+@common.json_option("Print one JSON object.")
+def uncordon(host: str, as_json: bool) -> int:
+    """Use a host again that was drained. Nothing moves back by itself.
+
+    \b
+    Example:
+      zscout uncordon anvil
+    """
+    check_name(host, "host")
+    return common.run(_uncordon(host, as_json=as_json))
+
+
+async def _drain(host: str, timeout: float | None, *, as_json: bool) -> int:
+    cordoned = f"{host} stays cordoned; to use it again: zscout uncordon {host}"
+    async with placing("drain", as_json=as_json) as (shown, placer):
+        at_first = {one.component for one in _there(placer, host)}
+
+        def late() -> str:
+            left = terminal.span(timeout or 0)
+            return f"{host} is not empty after {left}: {_words(_there(placer, host))}; {cordoned}"
+
+        async with shown.within(timeout, late, cordoned):
+            placer.take(*(await placer.request(DrainHost(host), Placements)).components)
+            while leaving := [one for one in _there(placer, host) if _leaves(one)]:
+                shown.update(f"{host}: {_words(leaving)}")
+                await placer.wait_changed()
+        stay = _there(placer, host)
+        records = [one for name in sorted(at_first) if (one := placer.placements.get(name)) is not None]
+        moved = [one for one in records if one.host not in (host, None) and one.state == "running"]
+    if as_json:
+        went, stays = ([placement_object(one) for one in some] for some in (moved, stay))
+        terminal.print_json({"host": host, "moved": went, "stay": stays})
+    for one in moved:
+        shown.say(f"{one.component} went to {one.host}{out_of_work(one)}")
+    if stay:
+        raise common.Failed(
+            terminal.clean(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
+        )
+    shown.say(f"{host} is empty; {cordoned}")
+    return 0
+
+
+async def _uncordon(host: str, *, as_json: bool) -> int:
+    async with common.connected("uncordon") as client:
+        uncordoned = await placer_of(client).request(UncordonHost(host), Placements)
+    if as_json:
+        terminal.print_json({"host": host, "components": list(map(placement_object, uncordoned.components))})
+    else:
+        terminal.print_line(f"{host} is used again")
+    return 0
+
+
+def _there(placer: PlacerClient, host: str) -> list[Placement]:
+    """What is on a host, or coming to it."""
+    found = (one for _, one in sorted(placer.placements.items()))
+    return [one for one in found if host in (one.host, one.to) and one.state not in OVER]
+
+
+def _leaves(one: Placement) -> bool:
+    """Whether it is to be waited for: what is not running yet is moved when it does."""
+    return one.movable or one.state != "running"
+
+
+def _words(some: Sequence[Placement]) -> str:
+    words = []
+    for one in some:
+        why = one.reason or ("" if one.movable else "it can't be moved")
+        stays = "stays" + (f" ({why})" if why else "")
+        words.append(f"{one.component} {stays if one.state == 'running' else standing(one)}")
+    return ", ".join(words)
