@@ -23,39 +23,30 @@ from click.shell_completion import CompletionItem
 from zscout import __version__
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "request": (
-        "zscout.cli.requests.request",
-        "Wait for devices; hold them, or run a command that needs them.",
-    ),
-    "take": (
-        "zscout.cli.operator.take",
-        "Take devices at an operator's priority, preempting who holds them.",
-    ),
-    "drive": (
-        "zscout.cli.operator.drive",
-        "Take a robot and drive it from the keyboard, seeing what it sees.",
-    ),
-    "watch": ("zscout.cli.operator.watch", "Tell when something moves in the pictures of a camera or video."),
-    "release": ("zscout.cli.requests.cancel", "End the hold of a running ARC."),
-    "cancel": ("zscout.cli.requests.cancel", "End an ARC, running or waiting."),
-    "status": ("zscout.cli.fleet.status", "Show devices, holders, the queue and the hosts."),
-    "why": ("zscout.cli.requests.why", "Tell the story of an ARC: what it waits for, and who is in its way."),
-    "start": ("zscout.cli.components.start", "Have a component run on the best host, and keep it running."),
-    "stop": ("zscout.cli.components.start", "End components for good."),
-    "components": ("zscout.cli.components.components", "List components: where each runs, and what it uses."),
-    "logs": ("zscout.cli.components.logs", "Print or follow the output of a component."),
-    "migrate": ("zscout.cli.components.moves", "Move a running component to another host."),
-    "drain": ("zscout.cli.components.moves", "Empty a host of components, and place none there any more."),
-    "uncordon": ("zscout.cli.components.moves", "Use a drained host again."),
-    "keys": ("zscout.cli.fleet.keys", "List what is alive on the mesh, and the keys it serves."),
-    "view": ("zscout.cli.fleet.view", "Watch the fleet live on a timeline, or open a recording."),
-    "replay": ("zscout.cli.lab.replay", "Schedule a workload file under virtual time."),
-    "study": ("zscout.cli.lab.study", "Compare scheduling strategies on random workloads."),
-    "simulate": ("zscout.cli.lab.simulate", "Serve a simulated building with robots, radio and cameras."),
-    "demo": ("zscout.cli.lab.demo", "Show what zscout does, on a live mesh on this machine."),
-    "completion": ("zscout.cli.completion", "Print the completion script for bash, zsh or fish."),
+    "request": ("requests.request", "Wait for devices; hold them, or run a command that needs them."),
+    "take": ("operator.take", "Take devices at an operator's priority, preempting who holds them."),
+    "drive": ("operator.drive", "Take a robot and drive it from the keyboard, seeing what it sees."),
+    "watch": ("operator.watch", "Tell when something moves in the pictures of a camera or video."),
+    "release": ("requests.cancel", "End the hold of a running ARC."),
+    "cancel": ("requests.cancel", "End an ARC, running or waiting."),
+    "status": ("fleet.status", "Show devices, holders, the queue and the hosts."),
+    "why": ("requests.why", "Tell the story of an ARC: what it waits for, and who is in its way."),
+    "start": ("components.start", "Have a component run on the best host, and keep it running."),
+    "stop": ("components.start", "End components for good."),
+    "components": ("components.components", "List components: where each runs, and what it uses."),
+    "logs": ("components.logs", "Print or follow the output of a component."),
+    "migrate": ("components.moves", "Move a running component to another host."),
+    "drain": ("components.moves", "Empty a host of components, and place none there any more."),
+    "uncordon": ("components.moves", "Use a drained host again."),
+    "keys": ("fleet.keys", "List what is alive on the mesh, and the keys it serves."),
+    "view": ("fleet.view", "Watch the fleet live on a timeline, or open a recording."),
+    "replay": ("lab.replay", "Schedule a workload file under virtual time."),
+    "study": ("lab.study", "Compare scheduling strategies on random workloads."),
+    "simulate": ("lab.simulate", "Serve a simulated building with robots, radio and cameras."),
+    "demo": ("lab.demo", "Show what zscout does, on a live mesh on this machine."),
+    "completion": ("completion", "Print the completion script for bash, zsh or fish."),
 }
-"""Name: where the click command of that name lives, and its line in the help."""
+"""Name: the module below zscout.cli that has the click command of that name, and its line in the help."""
 
 OK, COULD_NOT, BAD_INPUT, NOBODY, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -69,7 +60,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command: click.Command = getattr(import_module(COMMANDS[cmd_name][0]), cmd_name)
+        command: click.Command = getattr(import_module(f"zscout.cli.{COMMANDS[cmd_name][0]}"), cmd_name)
         return command
 
     def resolve_command(
@@ -167,7 +158,7 @@ def _pipe_closed() -> int:
 
 @click.group(
     cls=LazyGroup,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True},
 )
 @click.option(
     "--fleet",

@@ -20,20 +20,19 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.piloting import Pilot
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.teleop import Teleop
-from zscout.cli.operator.drive import Hands, _Console
-from zscout.cli.operator.drive_keys import (
+from zscout.cli.operator.drive import _Console
+from zscout.cli.operator.hands import (
     AXIS,
     BUTTON,
     FULL,
     INITIAL,
-    MAX_TYPED,
     PAD_EVENT,
+    Hands,
     game_pad,
-    keys_in,
-    typed_keys,
 )
 from zscout.config.strict import BadInput
 from zscout.mesh import clock
+from zscout.terminal import MAX_TYPED, keys_in, typed_keys
 from zscout.types import SECOND
 
 ZSCOUT = str(Path(sys.executable).with_name("zscout"))

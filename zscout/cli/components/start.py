@@ -119,7 +119,7 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
     return params
 
 
-@click.command()
+@click.command(context_settings={"show_default": False})
 @click.argument("kind", shell_complete=completion.kinds)
 @click.option("--name", metavar="NAME", help="What the component is called. Default: its kind.")
 @click.option(

@@ -41,7 +41,6 @@ HOSTING: Final = "Hosting a web-viewer at"
     "--bind",
     metavar="IP",
     default="127.0.0.1",
-    show_default=True,
     help="Where web page and live stream are served; anything but loopback shows them to other hosts.",
 )
 @click.option(
@@ -53,7 +52,6 @@ HOSTING: Final = "Hosting a web-viewer at"
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("runs"),
-    show_default=True,
     help="Without FILE: the folder in which the live recording is kept.",
 )
 @common.json_option("Print one JSON object as soon as it is served or recorded: url, live, file.")

@@ -47,17 +47,13 @@ def recording_option(command: F) -> F:
     type=Building(),
     metavar="BUILDING",
     default="living_room",
-    show_default=True,
     help="As in zscout simulate: a name, a TOML file, or random:SEED.",
 )
-@click.option(
-    "--seed", type=click.IntRange(0), default=1, show_default=True, help="Of noise, slip and people."
-)
+@click.option("--seed", type=click.IntRange(0), default=1, help="Of noise, slip and people.")
 @click.option(
     "--speed",
     type=click.FloatRange(0.2, 4.0),
     default=1.5,
-    show_default=True,
     help="How many of the building's seconds pass in one of ours.",
 )
 @recording_option

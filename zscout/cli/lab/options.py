@@ -31,7 +31,7 @@ class DefaultGroup(click.Group):
 
 def seeds_option(default: str, help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
     """`--seeds N|A-B`; `parse_seeds` reads it."""
-    return click.option("--seeds", metavar="N|A-B", default=default, show_default=True, help=help)
+    return click.option("--seeds", metavar="N|A-B", default=default, help=help)
 
 
 def rrd_option(*names: str, what: str = " with plots") -> Callable[[F], F]:

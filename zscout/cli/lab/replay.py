@@ -15,11 +15,7 @@ from zscout.scheduling.strategies import STRATEGIES
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
-    "--strategy",
-    type=click.Choice(list(STRATEGIES)),
-    default="priority",
-    show_default=True,
-    help="How RCs are shared out.",
+    "--strategy", type=click.Choice(list(STRATEGIES)), default="priority", help="How RCs are shared out."
 )
 @common.json_option("Print one JSON object instead of the table.")
 @rrd_option(what="")

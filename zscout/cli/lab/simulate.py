@@ -48,14 +48,12 @@ class Building(click.ParamType[str]):
     "--seed",
     type=click.IntRange(0, MAX_SEED),
     default=0,
-    show_default=True,
     help="Of all that is random in it: the same seed, the same building and noise.",
 )
 @click.option(
     "--speed",
     type=click.FloatRange(0, 100, min_open=True),
     default=1.0,
-    show_default=True,
     help="The building's seconds in one of ours.",
 )
 @click.option(
@@ -63,31 +61,25 @@ class Building(click.ParamType[str]):
     "frame_rate",
     type=click.FloatRange(0.1, 60),
     default=10.0,
-    show_default=True,
     help="Pictures of each channel in a second of the building.",
 )
 @click.option(
     "--http",
     metavar="HOST:PORT",
     default="127.0.0.1:0",
-    show_default=True,
     help="Where cameras are served; port 0 is any free one.",
 )
-@click.option(
-    "--channels", type=click.IntRange(1, 15), default=4, show_default=True, help="Video channels served."
-)
+@click.option("--channels", type=click.IntRange(1, 15), default=4, help="Video channels served.")
 @click.option(
     "--baud",
     type=click.IntRange(300, 1_000_000),
     default=9600,
-    show_default=True,
     help="Rate of the radio's line; the line is as much faster as the building is.",
 )
 @click.option(
     "--loss",
     type=click.FloatRange(0, 1),
     default=0.0,
-    show_default=True,
     help="Share of the radio's packets that no robot hears.",
 )
 @click.option(
@@ -107,7 +99,6 @@ class Building(click.ParamType[str]):
     "--framegrabbers",
     type=click.IntRange(1, MAX_FRAMEGRABBERS),
     default=2,
-    show_default=True,
     help="How many the node file has.",
 )
 @click.option("--mesh", is_flag=True, help="Show recorders and operators on the mesh who is where.")

@@ -175,11 +175,7 @@ def placement(seeds: str, as_json: bool, rrd: Path | None) -> None:
     "Default: all shipped, and drawn.",
 )
 @click.option(
-    "--seconds",
-    type=click.FloatRange(1, 3_600),
-    default=180.0,
-    show_default=True,
-    help="Of the building, that each run takes.",
+    "--seconds", type=click.FloatRange(1, 3_600), default=180.0, help="Of the building, that each run takes."
 )
 @click.option(
     "--starts",

@@ -6,8 +6,7 @@ import asyncio
 import importlib
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,12 +16,10 @@ from zscout import terminal
 from zscout.cli import common
 from zscout.cli.requests.options import RcName
 from zscout.config.strict import BadInput, quoted
-from zscout.mesh import clock
 from zscout.types import SECOND
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
-    from zscout.behaviors.piloting import Pilot
     from zscout.behaviors.teleop import Teleop
     from zscout.services.recorder.picture_stream import PictureStream
 
@@ -34,25 +31,16 @@ HELP: Final = "arrows or wasd drive · space stops · + - speed · g gives back 
 
 @click.command()
 @click.argument("robot", type=RcName("robot"))
-@click.option("--radio", default="radio/*", show_default=True, type=RcName("radio", pattern=True))
-@click.option("--video", default="video/*", show_default=True, type=RcName("video", pattern=True))
-@click.option(
-    "--framegrabber", default="framegrabber/*", show_default=True, type=RcName("framegrabber", pattern=True)
-)
+@click.option("--radio", default="radio/*", type=RcName("radio", pattern=True))
+@click.option("--video", default="video/*", type=RcName("video", pattern=True))
+@click.option("--framegrabber", default="framegrabber/*", type=RcName("framegrabber", pattern=True))
 @click.option(
     "--rate",
     type=click.FloatRange(0.5, MAX_RATE),
     default=5.0,
-    show_default=True,
     help="Commands a second: the share of the radio that is asked for.",
 )
-@click.option(
-    "--speed",
-    type=click.FloatRange(0.1, 1.0),
-    default=0.6,
-    show_default=True,
-    help="Of the robot's top speed.",
-)
+@click.option("--speed", type=click.FloatRange(0.1, 1.0), default=0.6, help="Of the robot's top speed.")
 @click.option("--stand-by", is_flag=True, help="Take the robot at the first key that drives, not at once.")
 @click.option(
     "--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="A game pad's left stick as well."
@@ -108,6 +96,7 @@ async def _drive(
     from zscout.behaviors.piloting import Pilot
     from zscout.behaviors.sensor_net.held_robot import RobotNeeds
     from zscout.behaviors.teleop import Teleop
+    from zscout.cli.operator.hands import Hands, game_pad
 
     fleet = common.the_fleet()
     async with AsyncExitStack() as stack:
@@ -125,9 +114,9 @@ async def _drive(
             client, needs, pilot, priority=fleet.operator_priority, changed=lambda: console.update(teleop)
         )
         hands = Hands(teleop, end)
-        stack.enter_context(hands.at_the_terminal())
+        stack.enter_context(terminal.typed_keys(hands.key, end.set))
         if pad is not None:
-            stack.enter_context(hands.at_the_pad(pad))
+            stack.enter_context(game_pad(pad, hands.moved, hands.button))
         if not stand_by:
             teleop.take()
 
@@ -135,18 +124,8 @@ async def _drive(
             stream = await _stream(stack, robot, record, console, view=not no_view)
             await show_pictures(client, teleop, stream, console)
 
-        tasks = [asyncio.create_task(teleop.run()), asyncio.create_task(console.keep_drawing(teleop))]
-        if not no_picture:
-            tasks.append(asyncio.create_task(look()))
-        ending = asyncio.create_task(end.wait())
-        try:
-            done, _ = await asyncio.wait([ending, *tasks], return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
-        finally:
-            for task in [ending, *tasks]:
-                task.cancel()
-            await asyncio.gather(ending, *tasks, return_exceptions=True)
+        works = [end.wait(), teleop.run(), console.keep_drawing(teleop)]
+        await common.first_of(*works, *([] if no_picture else [look()]))
     console.event("ended", "given back")
     return 0
 
@@ -176,16 +155,17 @@ async def _stream(
 
 async def show_pictures(client: Client, teleop: Teleop, stream: PictureStream, console: _Console) -> None:
     """Passes the newest picture of the held framegrabber on, without end."""
-    zero = clock.now()
+    mesh = client.mesh
+    zero = mesh.now()
     while True:
         robot, held = teleop.robot, teleop.held
         if robot is None or held is None:
             await asyncio.sleep(REFRESH)
             continue
         stream.event(
-            (clock.now() - zero) / SECOND, f"{robot.robot} is yours, seen through {robot.framegrabber}"
+            (mesh.now() - zero) / SECOND, f"{robot.robot} is yours, seen through {robot.framegrabber}"
         )
-        with client.mesh.frames(client.mesh.keys.frame(robot.framegrabber)) as frames:
+        with mesh.frames(mesh.keys.frame(robot.framegrabber)) as frames:
             while teleop.robot is robot:
                 frame = await frames.next(REFRESH)
                 if frame is not None and frame.head.grant == held.grant:
@@ -193,97 +173,20 @@ async def show_pictures(client: Client, teleop: Teleop, stream: PictureStream, c
                     console.seen(frame.arrived)
 
 
-class Hands:
-    """What keys and pad do."""
-
-    def __init__(self, teleop: Teleop, end: asyncio.Event) -> None:
-        self.teleop, self._end = teleop, end
-
-    @property
-    def pilot(self) -> Pilot:
-        return self.teleop.pilot
-
-    def key(self, key: bytes) -> None:
-        """A key was typed."""
-        from zscout.cli.operator.drive_keys import KEYS
-
-        if key in KEYS:
-            self.pilot.press(clock.now() / SECOND, KEYS[key])
-            self.teleop.take()
-        elif key in (b" ", b"x"):
-            self.pilot.stop()
-        elif key in (b"+", b"="):
-            self.pilot.faster(1)
-        elif key in (b"-", b"_"):
-            self.pilot.faster(-1)
-        elif key == b"g":
-            self.teleop.give_back()
-        elif key in (b"q", b"\x04"):
-            self._end.set()
-        self.teleop.wake()
-
-    def moved(self, forward: float, right: float) -> None:
-        """The pad's stick was moved."""
-        self.pilot.stick(clock.now() / SECOND, forward, right)
-        if not self.pilot.wheels(clock.now() / SECOND).still:
-            self.teleop.take()
-        self.teleop.wake()
-
-    def button(self, number: int) -> None:
-        """A button of the pad was pressed."""
-        if number == 0:
-            self.pilot.stop()
-            self.teleop.wake()
-        elif number == 1:
-            self.teleop.give_back()
-
-    @contextmanager
-    def at_the_terminal(self) -> Iterator[None]:
-        from zscout.cli.operator.drive_keys import typed_keys
-
-        with typed_keys(self.key, self._end.set):
-            yield
-
-    @contextmanager
-    def at_the_pad(self, device: Path) -> Iterator[None]:
-        from zscout.cli.operator.drive_keys import game_pad
-
-        with game_pad(device, self.moved, self.button):
-            yield
-
-
-class _Console:
+class _Console(terminal.LiveLine):
     """What the operator sees: a live line, or JSON lines. A context manager."""
 
     def __init__(self, robot: str, *, as_json: bool) -> None:
+        super().__init__(shown=not as_json)
         self._robot, self._as_json = robot, as_json
         self._pictures: list[int] = []
-        self._live: Any = None
         self._told: object = None
-
-    def __enter__(self) -> _Console:
-        if not self._as_json and terminal.at_terminal():
-            from rich.live import Live
-
-            self._live = Live(console=terminal.console(), auto_refresh=False, transient=True)
-            self._live.start()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        if self._live is not None:
-            # A terminal that is gone need not be tidied.
-            with suppress(OSError):
-                self._live.stop()
-            self._live = None
 
     def event(self, event: str, words: str, **more: Any) -> None:
         if self._as_json:
             terminal.print_json({"event": event, "robot": self._robot, **more})
-        elif self._live is not None:
-            with suppress(OSError):
-                self._live.console.print(terminal.clean(words), soft_wrap=True)
         else:
-            terminal.print_line(terminal.clean(words))
+            self.print(words)
 
     def update(self, teleop: Teleop) -> None:
         """The state has changed, or the first command was obeyed."""
@@ -312,15 +215,14 @@ class _Console:
 
     async def keep_drawing(self, teleop: Teleop) -> None:
         while True:
-            self._draw(teleop)
+            if self.watched:
+                self._picture(teleop)
             await asyncio.sleep(REFRESH)
 
-    def _draw(self, teleop: Teleop) -> None:
-        if self._live is None:
-            return
+    def _picture(self, teleop: Teleop) -> None:
         from rich.text import Text
 
-        now = clock.now()
+        now = teleop.client.mesh.now()
         pictures = sum(now - at < SECOND for at in self._pictures)
         wheels = teleop.pilot.wheels(now / SECOND)
         line = Text()
@@ -333,7 +235,4 @@ class _Console:
             line.append(f"  {pictures} pictures/s  {teleop.robot.sent} commands")
             if teleop.robot.refused:
                 line.append(f", {teleop.robot.refused} refused", style="red")
-        line.append(f"\n{HELP}", style="dim")
-        # Where the terminal is gone, its keys' end says so and ends all.
-        with suppress(OSError):
-            self._live.update(line, refresh=True)
+        self.draw(line.append(f"\n{HELP}", style="dim"))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
@@ -17,11 +16,10 @@ from zscout import terminal
 from zscout.cli import common
 from zscout.config.strict import BadInput
 from zscout.mesh import clock
+from zscout.terminal import LiveLine, many, span
 from zscout.types import SECOND
 
 if TYPE_CHECKING:
-    from rich.live import Live
-
     from zscout.behaviors.perception.motion import Event
     from zscout.cli.operator.watch_source import Source
     from zscout.services.recorder.watch_recording import WatchRecording
@@ -87,8 +85,7 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
     """
     with ExitStack() as stack:
         ending = stack.enter_context(_Ending())
-        screen = stack.enter_context(_screen())
-        report = _WatchReport(screen, as_json=as_json)
+        report = stack.enter_context(_WatchReport(as_json=as_json))
         from zscout.cli.operator.watch_source import open_source
 
         opened = open_source(source, report.say)
@@ -121,7 +118,7 @@ def _watch(source: Source, report: _WatchReport, ending: _Ending, limit: float |
                 report.recording.picture(time, picture, seen.boxes, moving=seen.moving)
         if ended is not None:
             report.event(ended)
-        report.draw(source, tracker.current)
+        report.show(source, tracker.current)
     last = tracker.close()
     if last is not None:
         report.event(last)
@@ -154,15 +151,15 @@ class _Ending:
         self.signal = number
 
 
-class _WatchReport:
-    """What people and programs read of it."""
+class _WatchReport(LiveLine):
+    """What people and programs read of it: a live line where people look, at stdout or else at stderr."""
 
-    def __init__(self, live: Live | None, *, as_json: bool) -> None:
+    def __init__(self, *, as_json: bool) -> None:
+        super().__init__(sys.stdout if terminal.at_terminal() else sys.stderr)
         self.recording: WatchRecording | None = None
         self.at = 0.0
         """Seconds of the source."""
         self.pictures = 0
-        self._live = live
         self._json = as_json
         self._events = 0
         self._moving = 0.0
@@ -173,68 +170,43 @@ class _WatchReport:
         self._moving += event.end - event.start
         if self.recording is not None:
             self.recording.event(event.start, _words(event))
-        if self._json:
-            self._line(_as_json(event))
+        text = _as_json(event) if self._json else _words(event)
+        if terminal.at_terminal():
+            self.print(text, "" if self._json else "yellow")
         else:
-            self._line(_words(event), "yellow")
+            terminal.print_line(text)
 
     def say(self, text: str) -> None:
         """A word about the source, on stderr."""
         text = terminal.clean(text)
         if self.recording is not None:
             self.recording.event(self.at, text)
-        if self._live is not None and terminal.at_terminal(sys.stderr):
-            self._live.console.print(text, style="red", soft_wrap=True)
+        if terminal.at_terminal(sys.stderr):
+            self.print(text, "red")
         else:
             terminal.print_line(text, sys.stderr)
 
-    def draw(self, source: Source, event: Event | None) -> None:
+    def show(self, source: Source, event: Event | None) -> None:
         """The live line, now and then."""
         now = clock.now()
-        if self._live is None or now - self._drawn < DRAWN * SECOND:
+        if not self.watched or now - self._drawn < DRAWN * SECOND:
             return
         self._drawn = now
         from rich.text import Text
 
-        of = "" if source.duration is None else f" of {terminal.span(source.duration)}"
-        line = Text(f"{terminal.span(self.at)}{of}  {_many(self._events, 'event')}  ", no_wrap=True)
+        of = "" if source.duration is None else f" of {span(source.duration)}"
+        line = Text(f"{span(self.at)}{of}  {many(self._events, 'event')}  ", no_wrap=True)
         if event is None:
             line.append("still", style="green")
         else:
-            line.append(f"moving for {terminal.span(self.at - event.start)}", style="bold yellow")
-        line.append("  Ctrl-C ends", style="dim")
-        self._live.update(line, refresh=True)
+            line.append(f"moving for {span(self.at - event.start)}", style="bold yellow")
+        self.draw(line.append("  Ctrl-C ends", style="dim"))
 
     def summary(self) -> None:
         share = f" ({100 * self._moving / self.at:.0f} %)" if self.at > 0 else ""
-        line = f"{terminal.span(self.at)} watched, {_many(self.pictures, 'picture')}; "
-        line += f"{_many(self._events, 'event')}, motion for {terminal.span(self._moving)}{share}"
+        line = f"{span(self.at)} watched, {many(self.pictures, 'picture')}; "
+        line += f"{many(self._events, 'event')}, motion for {span(self._moving)}{share}"
         terminal.print_line(line, sys.stderr if self._json else sys.stdout)
-
-    def _line(self, text: str, style: str = "") -> None:
-        if self._live is not None and not self._live.console.stderr:
-            self._live.console.print(text, style=style, soft_wrap=True)
-        else:
-            terminal.print_line(text)
-
-
-@contextmanager
-def _screen() -> Iterator[Live | None]:
-    """The live line, where people look: at stdout, or else at stderr."""
-    here = terminal.at_terminal(sys.stdout)
-    if not here and not terminal.at_terminal(sys.stderr):
-        yield None
-        return
-    from rich.live import Live
-
-    with Live(
-        console=terminal.console(stderr=not here),
-        auto_refresh=False,
-        transient=True,
-        redirect_stdout=False,
-        redirect_stderr=False,
-    ) as live:
-        yield live
 
 
 def _recording(stack: ExitStack, source: Source, file: Path) -> WatchRecording:
@@ -266,12 +238,8 @@ def _as_json(event: Event) -> str:
 def _words(event: Event) -> str:
     largest = event.boxes[0]
     things = "one thing" if len(event.boxes) == 1 else f"{len(event.boxes)} things"
-    end = "and goes on" if event.going_on else f"for {terminal.span(event.end - event.start)}"
+    end = "and goes on" if event.going_on else f"for {span(event.end - event.start)}"
     return (
         f"{event.start:9.2f} to {event.end:.2f} s: motion {end}, {things} at the peak, the largest "
         f"{largest.width}x{largest.height} at {largest.x},{largest.y}"
     )
-
-
-def _many(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -226,7 +226,6 @@ def hold_options(command: F) -> F:
             "--grace",
             type=Duration(zero=True),
             default="5",
-            show_default=True,
             help="Between SIGTERM and SIGKILL to the command.",
         ),
         timeout_option("Wait at most so long for a grant, then exit with 1."),
@@ -234,7 +233,6 @@ def hold_options(command: F) -> F:
             "--min-runtime",
             type=Duration(),
             default="60",
-            show_default=True,
             help="For how long, from the grant: 5, 1.5, 300ms, 2m, 1h.",
         ),
         click.option(

@@ -42,7 +42,6 @@ LAST_WORD: Final = 0.5
     "--priority",
     type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
     default=0,
-    show_default=True,
     help="Higher ones preempt lower ones.",
 )
 @click.option("--keep", is_flag=True, help="Go on past the minimum runtime, until something else needs it.")

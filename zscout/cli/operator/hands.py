@@ -1,18 +1,19 @@
-"""Hands at a terminal and at a game pad, as calls in the event loop."""
+"""Hands at a terminal and at a game pad, and what they do with a robot."""
 
 from __future__ import annotations
 
 import asyncio
 import os
 import struct
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 from zscout.behaviors.piloting import Way
+from zscout.behaviors.teleop import Teleop
 from zscout.config.strict import BadInput, quoted
+from zscout.types import SECOND
 
 KEYS: Final[dict[bytes, Way]] = {
     b"\x1b[A": "forward",
@@ -29,7 +30,6 @@ KEYS: Final[dict[bytes, Way]] = {
     b"a": "left",
 }
 """Arrows, in both forms that terminals send, and w a s d."""
-MAX_TYPED: Final = 1_024
 
 PAD_EVENT: Final = struct.Struct("<IhBB")
 """An event of Linux's joystick interface: time in ms, value, type, number (Documentation/input/joydev)."""
@@ -41,45 +41,46 @@ ACROSS, ALONG = 0, 1
 FULL: Final = 32_767
 
 
-def keys_in(typed: bytes) -> Iterator[bytes]:
-    """The single keys of what was typed; an escape sequence is one key."""
-    at = 0
-    while at < len(typed):
-        length = 3 if typed[at : at + 2] in (b"\x1b[", b"\x1bO") and len(typed) - at >= 3 else 1
-        yield typed[at : at + length]
-        at += length
+class Hands:
+    """What keys and pad do."""
 
+    def __init__(self, teleop: Teleop, end: asyncio.Event) -> None:
+        self.teleop, self.pilot, self._end = teleop, teleop.pilot, end
 
-@contextmanager
-def typed_keys(pressed: Callable[[bytes], None], ended: Callable[[], None]) -> Iterator[None]:
-    """Calls `pressed` with each key typed at the terminal, and `ended` when that is gone. Keys come one by
-    one and are not echoed; the terminal is as before afterwards."""
-    import termios
-    import tty
+    def _now(self) -> float:
+        return self.teleop.client.mesh.now() / SECOND
 
-    loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
+    def key(self, key: bytes) -> None:
+        """A key was typed."""
+        if key in KEYS:
+            self.pilot.press(self._now(), KEYS[key])
+            self.teleop.take()
+        elif key in (b" ", b"x"):
+            self.pilot.stop()
+        elif key in (b"+", b"="):
+            self.pilot.faster(1)
+        elif key in (b"-", b"_"):
+            self.pilot.faster(-1)
+        elif key == b"g":
+            self.teleop.give_back()
+        elif key in (b"q", b"\x04"):
+            self._end.set()
+        self.teleop.wake()
 
-    def readable() -> None:
-        try:
-            typed = os.read(terminal, MAX_TYPED)
-        except OSError:
-            typed = b""
-        if not typed:
-            loop.remove_reader(terminal)
-            ended()
-        for key in keys_in(typed):
-            pressed(key)
+    def moved(self, forward: float, right: float) -> None:
+        """The pad's stick was moved."""
+        self.pilot.stick(self._now(), forward, right)
+        if not self.pilot.wheels(self._now()).still:
+            self.teleop.take()
+        self.teleop.wake()
 
-    tty.setcbreak(terminal)
-    loop.add_reader(terminal, readable)
-    try:
-        yield
-    finally:
-        loop.remove_reader(terminal)
-        # A terminal that is gone has no modes to be set back.
-        with suppress(termios.error):
-            termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+    def button(self, number: int) -> None:
+        """A button of the pad was pressed."""
+        if number == 0:
+            self.pilot.stop()
+            self.teleop.wake()
+        elif number == 1:
+            self.teleop.give_back()
 
 
 @contextmanager
