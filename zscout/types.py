@@ -1,14 +1,12 @@
 """Units, amounts and identities that all rooms share.
 
 Times are whole nanoseconds (`Ns`) on one clock of the caller's choice. Bandwidth parameters are `Fraction`,
-so that sums are exact (0.1 + 0.2 is 0.3); numbers from outside are bounded and made exact here before
-anything is computed with them.
+so that sums are exact (0.1 + 0.2 is 0.3).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from decimal import Decimal
 from fractions import Fraction
 from typing import Final, Literal, NamedTuple, TypeAlias
 
@@ -71,39 +69,3 @@ class Place(NamedTuple):
 
     term: Term
     arrival: int
-
-
-MAX_DIGITS = 25
-MAX_EXPONENT = 18
-MAX_SECONDS = Decimal(10 * 366 * 86_400)
-
-
-def exact(value: Decimal, what: str) -> Fraction:
-    """A number that is not negative, exactly. Raises ValueError for NaN, infinity, and implausible sizes."""
-    shown = str(value)[:40]
-    if not value.is_finite():
-        raise ValueError(f"{what} must be a number, not {shown}")
-    if value < 0:
-        raise ValueError(f"{what} must not be negative, and is {shown}")
-    # A Fraction of 1e999999 would take all memory: look at the exponent before converting.
-    if value and not -MAX_EXPONENT <= value.adjusted() <= MAX_EXPONENT:
-        raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {shown}")
-    if len(value.as_tuple().digits) > MAX_DIGITS:
-        raise ValueError(f"{what} has more than {MAX_DIGITS} digits")
-    return Fraction(value)
-
-
-def exact_amounts(params: Mapping[str, Decimal]) -> dict[str, Fraction]:
-    """Bandwidth parameters, exactly. Raises ValueError."""
-    return {name: exact(value, name) for name, value in params.items()}
-
-
-def duration(value: Decimal, what: str) -> Ns:
-    """A positive duration in seconds as whole ns, half to even. Raises ValueError."""
-    exact(value, what)
-    if value > MAX_SECONDS:
-        raise ValueError(f"{what} must be at most {MAX_SECONDS} s (ten years), and is {value}")
-    nanoseconds = round(value * SECOND)
-    if nanoseconds <= 0:
-        raise ValueError(f"{what} must be positive, and is {value}")
-    return nanoseconds

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 
-from zscout.config.scheduling_policy import owner_of
 from zscout.keyexpr import matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcState
@@ -53,7 +52,7 @@ def _check_state(state: SchedulerState) -> None:
             assert len(rc.holders) <= 1, f"{rc.name} has two holders: {sorted(rc.holders)}"
             busy |= rc.bit if rc.holders else 0
     assert busy == state.busy, "the mask of busy RCs is wrong"
-    counted = Counter(owner_of(arc.request.client) for arc in state.running.values())
+    counted = Counter(arc.owner for arc in state.running.values())
     assert counted == state.running_by_owner, "the owners' ARCs are miscounted"
     demand = Counter(name for arc in state.queued.values() for name in arc.request.needs if name in state.rcs)
     for rc in state.rcs.values():
@@ -69,7 +68,7 @@ def _check_index(state: SchedulerState, index: QueueIndex) -> None:
     assert index.ranks == sorted(arc.rank for arc in queued), "the ranks are not those of the queue"
     patient = sorted((arc.since, arc.id) for arc in queued if not index.is_starving(arc))
     assert index._patient == patient, "the patient are not those of the queue"
-    band = state.policy.band
+    band = state.band
     starving = sorted((-band(arc.priority), arc.since, arc.id) for arc in queued if index.is_starving(arc))
     assert index.starving == starving, "the starving are not those of the queue"
     for arc in queued:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
-from zscout.types import SECOND, ClientId, Ns
+from zscout.types import SECOND, Ns
 
 PATIENCE: Final[Ns] = 142 * SECOND
 """Default, in ns. Measured: docs/study.md."""
@@ -32,22 +32,5 @@ class SchedulingPolicy:
     max_running_per_host: int | None = None
     """ARCs that the clients of one host may have running at one time; None: any number."""
 
-    def operator(self, priority: int) -> bool:
-        return priority >= self.operator_priority
-
-    def band(self, priority: int) -> int:
-        """Priorities of one band wait for each other's due."""
-        return priority if self.promise == "equals" or self.operator(priority) else self.operator_priority - 1
-
-    def protected_below(self, *, starving: bool) -> int | None:
-        """Below which priority nobody takes a hold before its minimum runtime is over; None: no such rule."""
-        preemption_protected = self.preempt == "after_min_runtime" or (starving and self.promise == "all")
-        return self.operator_priority if preemption_protected else None
-
 
 DEFAULT: Final = SchedulingPolicy()
-
-
-def owner_of(client: ClientId) -> str:
-    """Whose quota a client counts against: its host's."""
-    return client.partition("/")[0]

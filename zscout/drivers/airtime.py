@@ -32,7 +32,8 @@ from fractions import Fraction
 from typing import Final
 
 from zscout.drivers.packets import MAX_PACKET, OVERHEAD
-from zscout.types import SECOND, Ns, exact_amounts
+from zscout.messages import exact_amounts
+from zscout.types import SECOND, Ns
 
 BITS_PER_BYTE: Final = 10
 """On the line: a start bit, eight of data, a stop bit."""

@@ -8,9 +8,8 @@ from fractions import Fraction
 from typing import Any
 
 from zscout.drivers.driver import Driver
-from zscout.messages import Amounts, Holder, ProposedHolder
+from zscout.messages import Amounts, Holder, ProposedHolder, exact_amounts
 from zscout.scheduling.workload import excess
-from zscout.types import exact_amounts
 
 
 class ExclusiveDriver(Driver):

@@ -14,7 +14,8 @@ from zscout.config.devices import (
 from zscout.drivers.driver import Driver
 from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
 from zscout.drivers.video import VideoDriver
-from zscout.types import SECOND, exact_amounts
+from zscout.messages import exact_amounts
+from zscout.types import SECOND
 
 
 def driver_for(rc: RcConfig) -> Driver:

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from decimal import Decimal
 
 from zscout.drivers.driver import Driver, RcHandle
-from zscout.messages import Amounts, Figures, Holder, ProposedHolder
-from zscout.types import exact
+from zscout.messages import Amounts, Figures, Holder, ProposedHolder, exact
 
 
 class VideoDriver(Driver):

@@ -22,8 +22,13 @@ from zscout.messages.base import Problem as Problem
 from zscout.messages.base import Seconds as Seconds
 from zscout.messages.base import State as State
 from zscout.messages.base import absurd as absurd
+from zscout.messages.base import decimal_seconds as decimal_seconds
+from zscout.messages.base import decimals as decimals
 from zscout.messages.base import decode as decode
+from zscout.messages.base import duration as duration
 from zscout.messages.base import encode as encode
+from zscout.messages.base import exact as exact
+from zscout.messages.base import exact_amounts as exact_amounts
 from zscout.messages.base import names_once as names_once
 from zscout.messages.base import schema as schema
 from zscout.messages.behaviors import MAX_BOXES as MAX_BOXES

@@ -1,15 +1,19 @@
-"""What all messages have in common: their base, bounds, and the way to JSON and back."""
+"""What all messages have in common: their base, bounds, and the way to JSON and back.
+
+Numbers from outside are bounded and made exact here before anything is computed with them."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from decimal import Decimal
+from fractions import Fraction
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import msgspec
 
-from zscout.types import NO_TERM, Term
+from zscout.types import NO_TERM, SECOND, Ns, Params, Term
 
 MAX_PAYLOAD = 65_536
 """Bytes of one message that is not a state answer."""
@@ -109,3 +113,48 @@ def schema(kind: type) -> str:
 
 def _name(kind: Any) -> str:
     return getattr(kind, "__name__", "operation")
+
+
+MAX_DIGITS = 25
+MAX_EXPONENT = 18
+MAX_SECONDS = Decimal(10 * 366 * 86_400)
+
+
+def exact(value: Decimal, what: str) -> Fraction:
+    """A number that is not negative, exactly. Raises ValueError for NaN, infinity, and implausible sizes."""
+    shown = str(value)[:40]
+    if not value.is_finite():
+        raise ValueError(f"{what} must be a number, not {shown}")
+    if value < 0:
+        raise ValueError(f"{what} must not be negative, and is {shown}")
+    # A Fraction of 1e999999 would take all memory: look at the exponent before converting.
+    if value and not -MAX_EXPONENT <= value.adjusted() <= MAX_EXPONENT:
+        raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {shown}")
+    if len(value.as_tuple().digits) > MAX_DIGITS:
+        raise ValueError(f"{what} has more than {MAX_DIGITS} digits")
+    return Fraction(value)
+
+
+def exact_amounts(params: Mapping[str, Decimal]) -> dict[str, Fraction]:
+    """Bandwidth parameters, exactly. Raises ValueError."""
+    return {name: exact(value, name) for name, value in params.items()}
+
+
+def duration(value: Decimal, what: str) -> Ns:
+    """A positive duration in seconds as whole ns, half to even. Raises ValueError."""
+    exact(value, what)
+    if value > MAX_SECONDS:
+        raise ValueError(f"{what} must be at most {MAX_SECONDS} s (ten years), and is {value}")
+    nanoseconds = round(value * SECOND)
+    if nanoseconds <= 0:
+        raise ValueError(f"{what} must be positive, and is {value}")
+    return nanoseconds
+
+
+def decimals(params: Params) -> Amounts:
+    """Bandwidth parameters as they are sent."""
+    return {name: Decimal(value.numerator) / Decimal(value.denominator) for name, value in params.items()}
+
+
+def decimal_seconds(time: Ns) -> Decimal:
+    return Decimal(time).scaleb(-9)

@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
 
-from zscout.config.scheduling_policy import owner_of
 from zscout.scheduling.model import Arc, Rank, Rc
 from zscout.scheduling.packing import PackingItem, PackingProblem
 from zscout.scheduling.patterns import bind_all
@@ -104,7 +103,7 @@ class _Search:
         """Whether an RC has vetoed the ARC beside those who stay in any case, or is silent about that."""
         stay = (holder.id for holder in rc.holders.values() if self._stays(holder, arc))
         answer = self.votes.known(rc.name, frozenset((*stay, arc.id)))
-        return self.votes.silent(rc.name) if answer is None else not answer.accept
+        return rc.name in self.votes.silent if answer is None else not answer.accept
 
     def _reserved_for_other(self, arc: Arc) -> bool:
         """Whether what it would take is kept for another."""
@@ -121,7 +120,7 @@ class _Search:
     def _within_quota(self, arc: Arc) -> bool:
         quota_left = self.state.quota_left(arc)
         if quota_left is not None:
-            owner = owner_of(arc.request.client)
+            owner = arc.owner
             self._started[owner] += 1
             return self._started[owner] <= quota_left
         return True
@@ -257,7 +256,7 @@ class ConflictGroup:
             if holders <= rc.holders.keys():
                 continue
             answer = self.votes.known(rc.name, holders)
-            if answer is None and not self.votes.silent(rc.name):
+            if answer is None and rc.name not in self.votes.silent:
                 questions.append((rc, self._probe(rc, holders) if rc.name in self._short else holders))
             elif answer is None or not answer.accept:
                 # Who was not asked in time is taken to refuse, from the first that it was not asked about.

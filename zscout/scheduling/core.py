@@ -298,7 +298,7 @@ class Core:
             arc = self._new_arc(held.request, held.place)
             if arc.patterns:
                 self._state.bind(arc, held.bound)
-            hold = Hold(held.grant, held.start, held.end, self.policy.protected_below(starving=False))
+            hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc))
             absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
             taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
             over = held.end <= self._now
@@ -326,8 +326,7 @@ class Core:
 
     def start(self, arc: Arc) -> None:
         grant = self._next_grant()
-        protected_below = self.policy.protected_below(starving=self._state.index.is_starving(arc))
-        hold = Hold(grant, self._now, self._now + arc.request.min_runtime, protected_below)
+        hold = Hold(grant, self._now, self._now + arc.request.min_runtime, self._state.protected_below(arc))
         self._start_hold(arc, hold)
         self._effects.append(self._granted(arc, hold))
 

@@ -141,6 +141,8 @@ class Arc:
     bound: Mapping[Need, RcName] = field(default_factory=dict)
     """The RC that each pattern is bound to (`patterns.py`): while it runs, and for the time of a check. Empty
     if there are none to be bound to."""
+    owner: str = field(init=False)
+    """Whose quota it counts against: its client's host."""
     id: ArcId = field(init=False)
     priority: int = field(init=False)
     rank: Rank = field(init=False)
@@ -154,6 +156,7 @@ class Arc:
 
     def __post_init__(self) -> None:
         self.id, self.priority = self.request.arc, self.request.priority
+        self.owner = self.request.client.partition("/")[0]
         self.rank = (-self.priority, self.request.min_runtime, self.place, self.id)
         self.party = Party(self.id, self.request.name, self.priority)
         self.needs = self.request.needs

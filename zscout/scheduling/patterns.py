@@ -75,7 +75,7 @@ class Binder:
         firm = [holder for holder in rc.holders.values() if not holder.preemptible_by(arc, self._state.now)]
         if rc.sharable:
             answer = self._votes.known(rc.name, frozenset((*(holder.id for holder in firm), arc.id)))
-            if answer is None and self._votes.silent(rc.name):
+            if answer is None and rc.name in self._votes.silent:
                 return Fitness.RESERVED, demand
             if answer is not None and not answer.accept:
                 return Fitness.HELD, demand

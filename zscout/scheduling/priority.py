@@ -50,7 +50,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Final, Literal, TypeAlias
 
-from zscout.config.scheduling_policy import StrategyName, owner_of
+from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.model import Arc, ArcState, Rank, Rc
 from zscout.scheduling.patterns import Binder, no_match
 from zscout.scheduling.reason import SHOWN, Reason, ReasonCode, of_rcs
@@ -172,7 +172,7 @@ class AdmissionCheck:
             answer = self._answer(rc)
             if answer is not None and not answer.accept:
                 return _vetoed(rc, answer).reason
-            if answer is None and not silent and self.votes.silent(rc.name):
+            if answer is None and not silent and rc.name in self.votes.silent:
                 silent = of_rcs(ReasonCode.SILENT, [rc.name])
         return silent
 
@@ -344,7 +344,7 @@ class Pass:
                     if any(holder.mask & self.off_limits for holder in rc.holders.values()):
                         bits |= rc.bit
             case VotesNeeded(questions):
-                bits = sum(rc.bit for rc, _ in questions if self.votes.silent(rc.name))
+                bits = sum(rc.bit for rc, _ in questions if rc.name in self.votes.silent)
             case _:
                 bits = 0
         return bits & arc.mask & ~arc.named_mask
@@ -381,12 +381,12 @@ class Pass:
             case "over quota":
                 # Whoever of its owner's ends may let it go: no RC shows that.
                 self.index.make_ready(arc)
-                owner, quota = owner_of(arc.request.client), self.state.policy.max_running_per_host
+                owner, quota = arc.owner, self.state.policy.max_running_per_host
                 self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=owner, number=quota or 0))
             case "off limits":
                 self._defer(arc, check, ArcState.DEFERRED)
                 self.actions.wait(arc, VOTING, settled=False)
-            case VotesNeeded(asked) if silent := [one for one in asked if self.votes.silent(one[0].name)]:
+            case VotesNeeded(asked) if silent := [one for one in asked if one[0].name in self.votes.silent]:
                 if arc.patterns:
                     self.index.make_ready(arc)
                 else:
@@ -436,7 +436,8 @@ class Pass:
         index, votes, rc = self.index, self.votes, self.state.rc
         for name in votes.invalidated:
             index.freed |= rc(name).bit
-        for name in (*votes.answered, *votes.due(self.state.now)):
+        due = votes.due(self.state.now) if votes.silent else ()
+        for name in (*votes.answered, *due):
             index.touched |= rc(name).bit
         votes.invalidated.clear()
         votes.answered.clear()

@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-from zscout.config.scheduling_policy import owner_of
 from zscout.scheduling.model import Arc, Rc
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.state import SchedulerState
@@ -106,8 +105,8 @@ class Reservations:
         """When its owner has room for `arc`."""
         if self._state.quota_left(arc) != 0:
             return self._state.now
-        owner = owner_of(arc.request.client)
-        own = (one for one in self._state.running.values() if owner_of(one.request.client) == owner)
+        owner = arc.owner
+        own = (one for one in self._state.running.values() if one.owner == owner)
         return min(math.inf if one.hold is None or one.request.keep else one.hold.end for one in own)
 
     def _free_from(self, rc: Rc, arc: Arc) -> float:
@@ -118,7 +117,7 @@ class Reservations:
             if self._accepts(rc, frozenset((*(holder.id for holder in firm), *sharing, arc.id))):
                 return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
-            if self._votes.silent(rc.name) or (alone is not None and not alone.accept):
+            if rc.name in self._votes.silent or (alone is not None and not alone.accept):
                 return math.inf
         start: float = self._free.get(rc.bit, self._state.now)
         for holder in firm:
@@ -157,7 +156,7 @@ class Reservations:
             together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
             if not self._accepts(rc, together):
                 known = self._votes.known(rc.name, together)
-                asked = known is None and not self._votes.silent(rc.name)
+                asked = known is None and rc.name not in self._votes.silent
                 return ReservationConflict(rc, reason, together if asked else None)
         return None
 
@@ -168,7 +167,7 @@ class Reservations:
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
-        band = self._state.policy.band
+        band = self._state.band
         return (
             band(arc.priority) <= band(reservation.arc.priority)
             and self._state.now + arc.request.min_runtime > reservation.start

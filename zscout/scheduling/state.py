@@ -13,7 +13,7 @@ from dataclasses import replace
 from operator import itemgetter
 from typing import Protocol
 
-from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName, owner_of
+from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc
 from zscout.scheduling.reason import Party, Reason
@@ -35,7 +35,6 @@ class QueueIndex:
 
     def __init__(self, band: Callable[[int], int]) -> None:
         self._band = band
-        """Which priorities wait for each other (`SchedulingPolicy.band`)."""
         self.ready: dict[ArcId, Arc] = {}
         """Those that are READY, VOTING or DEFERRED."""
         self.parked: dict[ArcId, Arc] = {}
@@ -188,7 +187,7 @@ class SchedulerState:
         """Bits of the RCs that vote and take several holders."""
         self.busy = 0
         """Bits of the exclusive RCs that somebody holds."""
-        self.index = QueueIndex(policy.band)
+        self.index = QueueIndex(self.band)
         self.by_pattern: dict[ArcId, Arc] = {}
         """Those of the queued that need an RC by pattern."""
         self._matching: dict[Need, list[Rc]] = {}
@@ -340,6 +339,7 @@ class SchedulerState:
     def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
         self._forget_client(arc)
         arc.request, arc.id = replace(arc.request, arc=name, client=client), name
+        arc.owner = client.partition("/")[0]
         arc.rank = (*arc.rank[:3], name)
         arc.party = Party(name, arc.request.name, arc.priority)
 
@@ -370,17 +370,32 @@ class SchedulerState:
         self.index.freed |= arc.mask
         self.version += 1
 
+    def operator(self, priority: int) -> bool:
+        """Whether it is an operator's, whom no knob of the policy keeps waiting."""
+        return priority >= self.policy.operator_priority
+
+    def band(self, priority: int) -> int:
+        """Priorities of one band wait for each other's due."""
+        alone = self.policy.promise == "equals" or self.operator(priority)
+        return priority if alone else self.policy.operator_priority - 1
+
+    def protected_below(self, arc: Arc) -> int | None:
+        """Below which priority nobody takes a hold that `arc` is granted now, before its minimum runtime is
+        over; None: no such rule."""
+        promised = self.policy.promise == "all" and self.index.is_starving(arc)
+        return self.policy.operator_priority if promised or self.policy.preempt != "always" else None
+
     def quota_left(self, arc: Arc) -> int | None:
         """How many more ARCs of its owner may run, if `arc` is bound by a quota."""
         quota = self.policy.max_running_per_host
-        if quota is None or self.policy.operator(arc.priority):
+        if quota is None or self.operator(arc.priority):
             return None
-        return max(0, quota - self.running_by_owner[owner_of(arc.request.client)])
+        return max(0, quota - self.running_by_owner[arc.owner])
 
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
         self.version += 1
-        self.running_by_owner[owner_of(arc.request.client)] += 1
+        self.running_by_owner[arc.owner] += 1
         for rc in arc.rcs:
             rc.holders[arc.id] = arc
 
@@ -389,7 +404,7 @@ class SchedulerState:
             rc.demand += by
 
     def _uncount_owner(self, arc: Arc) -> None:
-        owner = owner_of(arc.request.client)
+        owner = arc.owner
         self.running_by_owner[owner] -= 1
         if not self.running_by_owner[owner]:
             del self.running_by_owner[owner]

@@ -132,7 +132,8 @@ class Votes:
         self._ballots: dict[RcName, RcVotes] = {}
         self._out: dict[int, tuple[RcName, HolderSet]] = {}
         self._next = 1
-        self._silent: set[RcName] = set()
+        self.silent: set[RcName] = set()
+        """RCs whose last vote is overdue: nobody waits for them until they answer."""
         self.version = 0
         """Grows with all that changes what is known."""
         self.answered: set[RcName] = set()
@@ -148,12 +149,9 @@ class Votes:
         """The sets that an RC has vetoed; each rules out every larger one as well."""
         return list(self._ballot(rc).vetoed)
 
-    def silent(self, rc: RcName) -> bool:
-        return rc in self._silent
-
     def due(self, now: Ns) -> list[RcName]:
         """The silent RCs that may be asked again by now."""
-        return [rc for rc in self._silent if self._ballots[rc].ask_again <= now]
+        return [rc for rc in self.silent if self._ballots[rc].ask_again <= now]
 
     def open_question(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
         """The number of a new proposal to send, or None where one is out already or the RC is not due.
@@ -184,7 +182,7 @@ class Votes:
         ballot = self._ballots[rc]
         self._close(ballot, holders)
         ballot.silent = False
-        self._silent.discard(rc)
+        self.silent.discard(rc)
         self.answered.add(rc)
         self.version += 1
         if accept:
@@ -204,7 +202,7 @@ class Votes:
         ballot.overdue.add(holders)
         self.answered.add(rc)
         self.version += 1
-        self._silent.add(rc)
+        self.silent.add(rc)
         if not ballot.silent:
             ballot.silent = True
             ballot.ask_again = now + QUANTUM
@@ -214,7 +212,7 @@ class Votes:
         """The RC left, came anew or changed its rules: no vote of it stands, no proposal is out."""
         self.invalidated.add(rc)
         self.version += 1
-        self._silent.discard(rc)
+        self.silent.discard(rc)
         ballot = self._ballots.pop(rc, None)
         if ballot is not None:
             for holders in list(ballot.out):

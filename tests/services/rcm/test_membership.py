@@ -6,8 +6,8 @@ from zscout.messages import RcState
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined, Requested
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.services.rcm import convert
 from zscout.services.rcm.membership import discrepancies
+from zscout.services.rcm.rcm import holders_of
 from zscout.types import SECOND, Term
 
 RC = "robot/x"
@@ -25,7 +25,7 @@ def granted() -> Core:
 
 def reports(core: Core, *, holds: bool = True) -> RcState:
     """What an RC reports that has received all that was published so far."""
-    holders = convert.holders(core.holders(RC), RC, NOW) if holds else []
+    holders = holders_of(core.holders(RC), RC, NOW) if holds else []
     return RcState(
         rc=RC, host="d", instance="i", sharable=False, term=TERM, seq=core.seq, holders=list(holders)
     )

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 import click
 from click.shell_completion import CompletionItem
 
-from zscout import types
+from zscout import messages
 from zscout.cli.common import json_option
 from zscout.cli.requests.run_command import check_command
 from zscout.config.strict import BadInput, quoted
@@ -116,7 +116,7 @@ def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
     if zero and seconds == 0:
         return seconds
     try:
-        types.duration(seconds, what)
+        messages.duration(seconds, what)
     except ValueError as error:
         raise BadInput(f"{error}; {remedy}") from None
     return seconds
@@ -147,7 +147,7 @@ def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
     if len(params) > MAX_PARAMS:
         raise BadInput(f"need {quoted(text)}: {len(params)} parameters; at most {MAX_PARAMS} are allowed")
     try:
-        types.exact_amounts(params)
+        messages.exact_amounts(params)
     except ValueError as error:
         raise BadInput(f"need {quoted(text)}: {error}") from None
     return rc, params
@@ -175,7 +175,7 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
             name = next(one for one in numbered if one not in needs and one not in written)
         needs[name] = params
     try:
-        check_patterns({need: types.exact_amounts(params) for need, params in needs.items()})
+        check_patterns({need: messages.exact_amounts(params) for need, params in needs.items()})
     except ValueError as error:
         raise BadInput(str(error)) from None
     return needs

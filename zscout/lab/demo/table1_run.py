@@ -18,9 +18,8 @@ from zscout.lab.demo.arc import ArcReport, ArcSpec
 from zscout.lab.demo.runner import HOSTS, DemoRunner
 from zscout.lab.demo.tables import Observed
 from zscout.mesh import Mesh, ZenohMesh
-from zscout.messages import Grants, LoadReport, RcmState, StateAsk
+from zscout.messages import Grants, LoadReport, RcmState, StateAsk, decimal_seconds
 from zscout.scheduling.workload import Arrival, Workload
-from zscout.services.rcm import convert
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 START: Final = 30.0
@@ -90,7 +89,7 @@ class Table1Demo(DemoRunner):
                 arc=request.arc,
                 needs=tuple(sorted(request.needs)),
                 priority=request.priority,
-                min_runtime=convert.seconds(request.min_runtime),
+                min_runtime=decimal_seconds(request.min_runtime),
             )
             process = await self.start(request.arc, ["-m", "zscout.lab.demo.arc"], piped=True)
             self._behaviors[request.arc] = process

@@ -42,8 +42,8 @@ class Membership:
         self._timeout = fleet.timing.rebuild / SECOND
         self._supervisor = supervisor
         self._emit, self._on_reported, self._on_newer = emit, on_reported, on_newer
-        self._clients: dict[ClientId, set[str]] = {}
-        """Instances alive of each client."""
+        self.clients: dict[ClientId, set[str]] = {}
+        """Instances alive of each client that has a token."""
         self._unseen: dict[ClientId, asyncio.TimerHandle] = {}
         self._rc_tokens: dict[RcName, dict[str, Token]] = {}
         self._joined: dict[RcName, RcState] = {}
@@ -68,13 +68,13 @@ class Membership:
 
     def expect(self, client: ClientId) -> None:
         """A client with requests must live; one that nobody has seen yet gets a lease to show itself."""
-        if client not in self._clients and client not in self._unseen:
+        if client not in self.clients and client not in self._unseen:
             self._unseen[client] = self._supervisor.call_later(self._lease, self._client_lost, client)
 
     def find(self, client: ClientId, then: Callable[[bool], None]) -> None:
         """Calls `then` with whether a client has a token: at once where it was seen, else once the mesh was
         queried, because a new leader does not know all tokens yet."""
-        if client in self._clients:
+        if client in self.clients:
             then(True)
         else:
             self._supervisor.spawn(self._find(client, then))
@@ -85,7 +85,7 @@ class Membership:
 
     def _on_client(self, token: Token, alive: bool) -> None:
         client = f"{token.host}/{token.name}"
-        instances = self._clients.setdefault(client, set())
+        instances = self.clients.setdefault(client, set())
         if alive:
             instances.add(token.instance)
             if timer := self._unseen.pop(client, None):
@@ -93,7 +93,7 @@ class Membership:
             return
         instances.discard(token.instance)
         if not instances:
-            del self._clients[client]
+            del self.clients[client]
             self._client_lost(client)
 
     def _client_lost(self, client: ClientId) -> None:

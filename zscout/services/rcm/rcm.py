@@ -18,14 +18,30 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Grants, Holder, Operation, RcmState, RcState, Revocation, StateAsk
+from zscout.messages import (
+    Grants,
+    Holder,
+    HoldView,
+    Operation,
+    RcmState,
+    RcState,
+    RcView,
+    Revocation,
+    StateAsk,
+    WaitView,
+    decimal_seconds,
+    decimals,
+)
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
+    ArcRequest,
+    ArcStatus,
     ClientLost,
     Effect,
     Event,
     Granted,
     HandedOver,
+    Hold,
     HoldEnded,
     LeadTaken,
     Propose,
@@ -35,10 +51,9 @@ from zscout.scheduling.model import (
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.services.rcm import convert
 from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.recovery import RecoveredState
-from zscout.services.rcm.registry import RequestRegistry
+from zscout.services.rcm.registry import RequestRegistry, reason_info, request_id
 from zscout.services.rcm.request_handler import RequestHandler
 from zscout.services.rcm.voting import Voting
 from zscout.types import SECOND, Ns, RcName, Term
@@ -138,10 +153,9 @@ class Rcm:
         """One instant. RCs that are `named` are published, whatever becomes of them."""
         for event in events:
             match event:
-                case Requested(request):
-                    self.membership.expect(request.client)
-                case HandedOver(to=client):
-                    self.membership.expect(client)
+                case Requested(ArcRequest(client=client)) | HandedOver(to=client):
+                    if client not in self.membership.clients:
+                        self.membership.expect(client)
         effects = self.core.handle(self.mesh.now(), *events)
         self.publisher.publish(effects, named)
         self.registry.report(effects, self.requests.waiting, self.requests.given_up)
@@ -181,7 +195,7 @@ class Rcm:
     def _on_state_asked(self, query: IncomingQuery[StateAsk]) -> None:
         asked, now = query.message, self.mesh.now()
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
-        holds = [convert.hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
+        holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
         if asked.holds_only:
             query.answer(RcmState(self.term, self.publisher.seq, self.mesh.me.host, holds))
             return
@@ -192,8 +206,11 @@ class Rcm:
                 seq=self.publisher.seq,
                 host=self.mesh.me.host,
                 holds=holds,
-                queue=[convert.wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
-                rcs=convert.rc_views(status.rcs),
+                queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
+                rcs=[
+                    RcView(rc.name, rc.present, rc.sharable, [request_id(arc) for arc in rc.holders])
+                    for rc in status.rcs
+                ],
                 story=self.registry.story(asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
             )
@@ -221,7 +238,7 @@ class GrantsPublisher:
         if not changed and rcs is None:
             return
         revoked = [
-            convert.revocation(effect, self._registry.name(effect.arc))
+            _revocation(effect, self._registry.name(effect.arc))
             for effect in changed
             if isinstance(effect, HoldEnded)
         ]
@@ -229,7 +246,7 @@ class GrantsPublisher:
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
         names = sorted({*(rcs or ()), *(rc for effect in changed for rc in effect.rcs)})
         self._named |= dict.fromkeys(names, number)
-        holders = {name: convert.holders(self.core.holders(name), name, now) for name in names}
+        holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
         self._put(number, holders, revoked)
 
     def is_current(self, rc: RcName, seq: int) -> bool:
@@ -255,3 +272,76 @@ class GrantsPublisher:
             Grants(term=term, seq=number, prev=previous, every=every, rcs=rcs, revoked=revoked)
         )
         self.seq, self._at = number, self.mesh.now()
+
+
+# The core's values as messages
+
+
+def _holder(arc: ArcStatus, hold: Hold, rc: str, now: Ns) -> Holder:
+    return Holder(
+        id=request_id(arc.id),
+        arc=arc.name,
+        client=arc.request.client,
+        grant=hold.grant,
+        place=arc.place,
+        rcs=sorted(arc.needs),
+        min_runtime=decimal_seconds(arc.request.min_runtime),
+        remaining=(hold.end - now) / SECOND,
+        priority=arc.request.priority,
+        keep=arc.request.keep,
+        params=decimals(arc.needs[rc]),
+        bound=dict(arc.bound),
+    )
+
+
+def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[Holder]:
+    """All holders of an RC."""
+    return [_holder(arc, arc.hold, rc, now) for arc in arcs if arc.hold is not None]
+
+
+def _revocation(effect: HoldEnded, name: str) -> Revocation:
+    return Revocation(
+        id=request_id(effect.arc),
+        arc=name,
+        client=effect.client,
+        grant=effect.grant,
+        rcs=list(effect.rcs),
+        outcome=effect.outcome,
+        reason=str(effect.reason),
+        by=effect.by,
+        why=reason_info(effect.reason),
+    )
+
+
+def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> HoldView:
+    return HoldView(
+        id=request_id(arc.id),
+        arc=arc.name,
+        client=arc.request.client,
+        priority=arc.request.priority,
+        grant=hold.grant,
+        place=arc.place,
+        needs={rc: decimals(params) for rc, params in sorted(arc.needs.items())},
+        min_runtime=decimal_seconds(arc.request.min_runtime),
+        held=(now - hold.start) / SECOND,
+        remaining=(hold.end - now) / SECOND,
+        keep=arc.request.keep,
+        bound=dict(arc.bound),
+    )
+
+
+def _wait_view(arc: ArcStatus, now: Ns, start: Ns | None = None) -> WaitView:
+    return WaitView(
+        id=request_id(arc.id),
+        arc=arc.name,
+        client=arc.request.client,
+        priority=arc.request.priority,
+        place=arc.place,
+        needs={need: decimals(params) for need, params in sorted(arc.request.needs.items())},
+        min_runtime=decimal_seconds(arc.request.min_runtime),
+        waited=(now - arc.since) / SECOND,
+        reason=str(arc.reason or ""),
+        preemptions=arc.preemptions,
+        starts_in=None if start is None else (start - now) / SECOND,
+        why=reason_info(arc.reason),
+    )

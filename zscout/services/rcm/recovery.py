@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
-from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState
+from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
 from zscout.scheduling.model import ArcRequest, RecoveredHold, RecoveredRequest
-from zscout.services.rcm import convert
-from zscout.types import SECOND, Grant, Need, Ns, RcName, duration, exact_amounts
+from zscout.services.rcm.registry import arc_id, request_id
+from zscout.types import SECOND, Grant, Need, Ns, RcName
 
 log = logging.getLogger(__name__)
 
@@ -41,14 +41,14 @@ def recover(states: Iterable[RcState], clients: Iterable[ClientRequests], now: N
     parts: dict[tuple[str, Grant], dict[RcName, Holder]] = {}
     for state in result.rcs.values():
         for holder in state.holders:
-            arc = convert.arc_id(holder.client, holder.id)
+            arc = arc_id(holder.client, holder.id)
             parts.setdefault((arc, holder.grant), {})[state.rc] = holder
     asked: dict[str, tuple[str, OpenRequest]] = {}
     answered: set[str] = set()
     for answer in clients:
         answered.add(answer.client)
         for request in answer.requests:
-            asked[convert.arc_id(answer.client, request.id)] = (answer.client, request)
+            asked[arc_id(answer.client, request.id)] = (answer.client, request)
 
     seen: set[str] = set()
     for (arc, grant), held in sorted(parts.items(), key=lambda item: item[0][1], reverse=True):
@@ -74,9 +74,9 @@ def recover(states: Iterable[RcState], clients: Iterable[ClientRequests], now: N
         except (BadName, ValueError) as error:
             log.warning("the request %s is not carried on: %s", arc, error)
     # A client that handed over a hold, and missed the answer, lists it as well: what the RCs hold counts.
-    stands = {(held.place, convert.request_id(held.request.arc)) for held in result.standing}
+    stands = {(held.place, request_id(held.request.arc)) for held in result.standing}
     result.waiting = sorted(
-        (one for one in result.waiting if (one.place, convert.request_id(one.request.arc)) not in stands),
+        (one for one in result.waiting if (one.place, request_id(one.request.arc)) not in stands),
         key=lambda one: one.place,
     )
     return result

@@ -16,12 +16,12 @@ from msgspec.structs import replace
 from zscout.keyexpr import BadName, client_of, is_pattern
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Notice, State, StoryLine
+from zscout.messages import Notice, ReasonInfo, ReasonParty, State, StoryLine
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.services.rcm import convert
-from zscout.types import SECOND, ArcId, Ns, Term
+from zscout.scheduling.reason import Reason
+from zscout.types import SECOND, ArcId, ClientId, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +40,28 @@ LOG_EVERY = 0.1
 """Seconds that lines for the log are gathered: an entry of its own for each would cost as much as a grant."""
 MAX_LOGGED = 50
 """Lines in one entry of the log; the history has them all."""
+
+
+def arc_id(client: str, request_id: str) -> ArcId:
+    """The core's name of a request: unique on the mesh, as a client's own id is not."""
+    return f"{client}/{request_id}"
+
+
+def request_id(arc: ArcId) -> str:
+    """The client's own id in an ArcId."""
+    return arc.rpartition("/")[2]
+
+
+def client_id(arc: ArcId) -> ClientId:
+    """The client whose request it is."""
+    return arc.rpartition("/")[0]
+
+
+def reason_info(reason: Reason | None) -> ReasonInfo | None:
+    if reason is None:
+        return None
+    by = [ReasonParty(request_id(one.arc), one.name, client_id(one.arc), one.priority) for one in reason.by]
+    return ReasonInfo(reason.code, list(reason.rcs), by, reason.detail, reason.number, reason.pattern)
 
 
 class RequestRegistry:
@@ -70,7 +92,7 @@ class RequestRegistry:
             self._estimated.add(arc)
 
     def name(self, arc: ArcId) -> str:
-        return self._names.get(arc, convert.request_id(arc))
+        return self._names.get(arc, request_id(arc))
 
     def ended(self, arc: ArcId) -> bool:
         """Whether `arc` ended lately."""
@@ -93,7 +115,7 @@ class RequestRegistry:
             "queued" if hold is None else "running",
             priority=arc.request.priority,
             reason=str(arc.reason or ""),
-            why=convert.reason_info(arc.reason),
+            why=reason_info(arc.reason),
             place=arc.place,
             ahead=arc.ahead,
             grant=hold.grant if hold is not None else None,
@@ -111,9 +133,9 @@ class RequestRegistry:
     def _notice(self, arc: ArcId, state: State, **details: Any) -> Notice:
         self._step += 1
         return Notice(
-            id=convert.request_id(arc),
+            id=request_id(arc),
             arc=self.name(arc),
-            client=convert.client_id(arc),
+            client=client_id(arc),
             state=state,
             term=self._term,
             step=self._step,
@@ -165,7 +187,7 @@ class RequestRegistry:
     def _close(self, effect: HoldEnded | Dropped) -> Notice:
         """How a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
         details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome}
-        details["why"] = convert.reason_info(effect.reason)
+        details["why"] = reason_info(effect.reason)
         requeued = isinstance(effect, HoldEnded) and effect.requeued
         arc = self._core.arc(effect.arc)
         if isinstance(effect, HoldEnded):
@@ -223,7 +245,7 @@ class RequestRegistry:
         lines = [
             StoryLine(ago=(now - at) / SECOND, text=text)
             for at, full, name, text in self._lines
-            if arc in (name, full, convert.request_id(full))
+            if arc in (name, full, request_id(full))
         ]
         return lines[-MAX_ANSWERED:]
 

@@ -14,7 +14,18 @@ from zscout.config.fleet import Fleet, RcmLimits
 from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import MAX_PARAMS, Ask, Cancel, Foresee, Foresight, HandOver, Operation, Release
+from zscout.messages import (
+    MAX_PARAMS,
+    Ask,
+    Cancel,
+    Foresee,
+    Foresight,
+    HandOver,
+    Operation,
+    Release,
+    duration,
+    exact_amounts,
+)
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
@@ -28,10 +39,9 @@ from zscout.scheduling.model import (
     Released,
     Requested,
 )
-from zscout.services.rcm import convert
 from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.registry import RequestRegistry
-from zscout.types import SECOND, ArcId, ClientId, duration, exact_amounts
+from zscout.services.rcm.registry import RequestRegistry, arc_id, request_id
+from zscout.types import SECOND, ArcId, ClientId
 
 Query: TypeAlias = IncomingQuery[Operation]
 
@@ -92,7 +102,7 @@ class RequestHandler:
                 self._forecast(query, operation, sender)
 
     def _ask(self, query: Query, ask: Ask, sender: Sender) -> None:
-        arc = convert.arc_id(str(sender), ask.id)
+        arc = arc_id(str(sender), ask.id)
         self._keep_order(arc)
         if arc in self.waiting:
             self.waiting[arc].append(query)
@@ -114,7 +124,7 @@ class RequestHandler:
 
     def _end(self, query: Query, operation: Cancel | Release, sender: Sender) -> None:
         owner = client_of(operation.client) if operation.client is not None else sender
-        arc = convert.arc_id(str(owner), operation.id)
+        arc = arc_id(str(owner), operation.id)
         self._keep_order(arc)
         if owner == sender:
             self.given_up.add(arc)
@@ -124,7 +134,7 @@ class RequestHandler:
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
         same_place = self.core.at_place(ask.place) if ask.place is not None else ()
-        return any(convert.request_id(arc) == ask.id for arc in same_place)
+        return any(request_id(arc) == ask.id for arc in same_place)
 
     def _check_room(self, client: ClientId) -> None:
         """Refuses what is too much at once; what this burst has brought already counts."""
@@ -137,7 +147,7 @@ class RequestHandler:
 
     def _forecast(self, query: Query, asked: Foresee, sender: Sender) -> None:
         self.flush()
-        arc = convert.arc_id(str(sender), asked.id)
+        arc = arc_id(str(sender), asked.id)
         if self.core.arc(arc) is not None:
             raise Refused("bad_request", f"{asked.id} is a request already; ask how it stands")
         now = self.mesh.now()
@@ -209,7 +219,7 @@ class RequestHandler:
         for other in operation.others:
             check_name(other, "id")
         self.flush()
-        if sender == to or self.core.arc(convert.arc_id(sender, operation.id)) is None:
+        if sender == to or self.core.arc(arc_id(sender, operation.id)) is None:
             self._answer_handed_over(query, operation, sender, to)
             return
         if len(self._moving) >= MAX_BATCH:
@@ -237,7 +247,7 @@ class RequestHandler:
         """All in one batch of events, and so in one publication: nobody gets in between."""
         self.flush()
         moves = self._moves(operation, sender, to)
-        if not moves or moves[0].arc != convert.arc_id(sender, operation.id):
+        if not moves or moves[0].arc != arc_id(sender, operation.id):
             self._answer_handed_over(query, operation, sender, to)
             return
         room = self.limits.max_requests_per_client - len(self.core.arcs_of(to))
@@ -252,25 +262,25 @@ class RequestHandler:
     def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[HandedOver]:
         """What a hand-over comes to: of the ARCs that it names, those that are open at the sender."""
         moves = []
-        for request_id in dict.fromkeys((operation.id, *operation.others)):
-            arc = self.core.arc(convert.arc_id(sender, request_id))
+        for name in dict.fromkeys((operation.id, *operation.others)):
+            arc = self.core.arc(arc_id(sender, name))
             if arc is None:
                 continue
-            renamed = convert.arc_id(to, request_id)
+            renamed = arc_id(to, name)
             taken = self.core.arc(renamed)
             if taken is not None and taken.place != arc.place:
-                raise Refused("bad_request", f"{to} has a request {request_id} already; ask under random ids")
+                raise Refused("bad_request", f"{to} has a request {name} already; ask under random ids")
             moves.append(HandedOver(arc.id, to, renamed))
         return moves
 
     def _answer_handed_over(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId) -> None:
         """Answers a hand-over that was done before. Raises Refused if it was not."""
-        goal = convert.arc_id(to, operation.id)
-        over = self._registry.ended(goal) and self._registry.ended(convert.arc_id(sender, operation.id))
+        goal = arc_id(to, operation.id)
+        over = self._registry.ended(goal) and self._registry.ended(arc_id(sender, operation.id))
         if self.core.arc(goal) is None and not over:
             raise Refused("not_running", f"{operation.id} is not open at {sender}")
         # The new client may have missed it, where the RCM changed just then.
-        self._registry.publish(convert.arc_id(to, one) for one in (operation.id, *operation.others))
+        self._registry.publish(arc_id(to, one) for one in (operation.id, *operation.others))
         query.answer(self._registry.notice(goal))
 
 

@@ -10,10 +10,10 @@ from functools import partial
 from zscout.config.fleet import Fleet
 from zscout.mesh import Mesh, MeshError, Reply
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Ballot, Proposal
+from zscout.messages import Ballot, Proposal, ProposedHolder, decimals
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Propose, Vote, VoteOverdue
-from zscout.services.rcm import convert
+from zscout.services.rcm.registry import request_id
 from zscout.types import SECOND, RcName
 
 log = logging.getLogger(__name__)
@@ -42,7 +42,11 @@ class Voting:
 
     def propose(self, effect: Propose) -> None:
         arcs = ((self.core.arc(arc), params) for arc, params in effect.holders.items())
-        holders = [convert.proposed(arc, params) for arc, params in arcs if arc is not None]
+        holders = [
+            ProposedHolder(request_id(arc.id), arc.name, arc.request.client, decimals(params))
+            for arc, params in arcs
+            if arc is not None
+        ]
         proposal = Proposal(proposal=effect.proposal, term=self.core.term, holders=holders)
         # Overdue once; an answer that comes before the query ends still counts.
         overdue = self._supervisor.call_later(self._timeout, self._emit, VoteOverdue(effect.proposal))
