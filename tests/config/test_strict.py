@@ -69,10 +69,6 @@ def test_seconds_out_of_range(seconds: str) -> None:
     assert str(caught.value) == f"f: at: is {Decimal(seconds)} s; write 0 to 1000000000 seconds"
 
 
-def test_exact_loses_nothing() -> None:
-    assert strict.exact(Decimal("0.1")) + strict.exact(Decimal("0.2")) == strict.exact(Decimal("0.3"))
-
-
 def test_a_place_is_written_as_toml_writes_keys() -> None:
     where = ((Where("f") / "arc").item(2, "arc2") / "needs" / "robot/scout33" / 'a"b\\c') / "rate"
     assert where.key == r'arc[2].needs."robot/scout33"."a\"b\\c".rate'

@@ -12,7 +12,7 @@ from functools import partial
 from random import Random
 
 from tests.placement.placer_hosts import Host, Hosts, Say, seen_of, told_of
-from zscout.config.placement_policy import PlacementPolicy
+from zscout.config.fleet import PlacementPolicy
 from zscout.messages import (
     Incarnation,
     ListComponents,

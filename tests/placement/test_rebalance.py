@@ -10,7 +10,7 @@ from random import Random
 import pytest
 from msgspec.structs import replace
 
-from zscout.config.placement_policy import PlacementPolicy
+from zscout.config.fleet import PlacementPolicy
 from zscout.lab.study.placement.simulation import Machine, SimulatedJob, _Host, _Running
 from zscout.messages import (
     ComponentSpec,

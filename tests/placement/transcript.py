@@ -24,7 +24,7 @@ from random import Random
 from typing import Any
 
 from tests.transcripts import ns, seconds, settings
-from zscout.config.placement_policy import PlacementPolicy
+from zscout.config.fleet import PlacementPolicy
 from zscout.messages import (
     ComponentSpec,
     ComponentView,

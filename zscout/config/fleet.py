@@ -9,7 +9,6 @@ from typing import Annotated, Final
 from msgspec import Meta, Struct
 
 from zscout.config.endpoints import check_links, check_multicast
-from zscout.config.placement_policy import DEFAULT_PLACEMENT, PlacementPolicy
 from zscout.config.scheduling_policy import (
     OPERATOR_PRIORITY,
     PATIENCE,
@@ -22,7 +21,7 @@ from zscout.config.strict import (
     BadInput,
     Where,
     check_name,
-    check_unique,
+    check_names,
     key,
     read_toml,
     seconds,
@@ -79,6 +78,34 @@ class Timing(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 3 * SECOND
     vote_timeout: Annotated[Ns, seconds("0.01", "10", "A vote is overdue after this long.")] = SECOND // 4
     rebuild: Annotated[Ns, seconds("0.01", "10", "A new RCM waits this long for what stands.")] = SECOND // 5
+
+
+class PlacementPolicy(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [placement]: how hard a fleet tries to place, and whether it moves what pays. Durations in
+    ns."""
+
+    start_timeout: Annotated[
+        Ns, seconds("0.05", "600", "A start without an answer for this long has failed.")
+    ] = 15 * SECOND
+    restarts: Annotated[int, key("Starts in a row that fail soon until it is given up.", 0, 1_000)] = 5
+    back_off: Annotated[
+        Ns, seconds("0.05", "3600", "Before the first restart after a failure; doubled each time.")
+    ] = SECOND // 2
+    longest_back_off: Annotated[Ns, seconds("0.05", "86400", "Up to this.")] = 30 * SECOND
+    settled: Annotated[
+        Ns, seconds("0.05", "86400", "After running this long its failures are counted anew.")
+    ] = 30 * SECOND
+    rebalance: Annotated[bool, key("Whether running components are moved when that pays.")] = False
+    gain: Annotated[
+        float, key("How much better it must run elsewhere, as a share of now, to be moved.", 0.05, 100)
+    ] = 0.3
+    steady: Annotated[Ns, seconds("0.05", "3600", "For how long that must be so.")] = 10 * SECOND
+    rest: Annotated[
+        Ns, seconds("0.05", "86400", "A component that was placed or moved stays for this long.")
+    ] = 60 * SECOND
+
+
+DEFAULT_PLACEMENT: Final = PlacementPolicy()
 
 
 class Fleet(Struct, frozen=True):
@@ -160,9 +187,7 @@ def fleet_from_env() -> Fleet:
 def _fleet(file: FleetFile, top: Where) -> Fleet:
     table, mesh, at = file.fleet, file.mesh, top / "fleet"
     check_name(table.name, at / "name")
-    for number, host in enumerate(table.candidates):
-        check_name(host, (at / "candidates").item(number))
-    check_unique(table.candidates, at / "candidates")
+    check_names(table.candidates, at / "candidates")
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")
     _check_timing(file.timing, mesh.lease, top / "timing")

@@ -15,6 +15,7 @@ from zscout.config.strict import (
     BadInput,
     Where,
     check_name,
+    check_names,
     check_unique,
     key,
     quoted,
@@ -141,9 +142,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     own = {name: value for name, value in structs.asdict(file.mesh).items() if value is not None}
     mesh = structs.replace(fleet.mesh, **own)
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
-    for number, label in enumerate(file.node.labels):
-        check_name(label, (top / "node" / "labels").item(number))
-    check_unique(file.node.labels, top / "node" / "labels")
+    check_names(file.node.labels, top / "node" / "labels")
     for number, kind in enumerate(file.components.kinds or ()):
         check_name(kind, (top / "components" / "kinds").item(number))
     check_unique((rc.name for rc in file.rc), top / "rc", "name")

@@ -152,10 +152,9 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
         raise where.bad("is nested too deep", "no key goes deeper than a few tables") from None
     except ValueError:  # Python's limit of digits, the only one that tomllib does not turn into its own error
         raise where.bad("a whole number has thousands of digits", "shorten it") from None
-    checked = _checked(inspect.type_info(type), data, where)
     try:
-        return msgspec.convert(checked, type)
-    except msgspec.ValidationError as error:
+        return msgspec.convert(_checked(inspect.type_info(type), data, where), type)
+    except msgspec.ValidationError as error:  # what only msgspec knows of, as other bounds than `key` gives
         raise where.bad(str(error), "mend it") from None
 
 
@@ -173,6 +172,13 @@ def check_rc_name(value: str, where: Where) -> str:
         remedy = f'write kind/name, as in "robot/scout33", each of {_NAME_RULE}'
         raise where.bad(f"{quoted(value)} is not the name of an RC", remedy)
     return value
+
+
+def check_names(values: Iterable[str], where: Where) -> None:
+    """The same for each of a list, none of which stands twice. Raises BadInput."""
+    for number, value in enumerate(values):
+        check_name(value, where.item(number))
+    check_unique(values, where)
 
 
 def check_unique(values: Iterable[str], where: Where, key: str = "") -> None:
@@ -209,33 +215,24 @@ def key(
 ) -> Meta:
     """What the reference says of a key, and its bounds, as metadata of a struct's field. `most` is the number
     of its entries at most; `remedy` is what an error says where a required key is missing."""
-    bounds: dict[str, Any] = {"ge": low, "le": high, "max_length": most}
     extra = {name: text for name, text in (("unit", unit), ("remedy", remedy)) if text}
-    return Meta(
-        **{name: bound for name, bound in bounds.items() if bound is not None},
-        description=description,
-        examples=None if example is None else [example],
-        extra=extra or None,
-    )
+    bounds: dict[str, Any] = {"ge": low, "le": high, "max_length": most}
+    examples = None if example is None else [example]
+    return Meta(**bounds, description=description, examples=examples, extra=extra or None)
 
 
 def seconds(low: str, high: str, description: str) -> Meta:
     """The same for a duration: written in seconds, held as whole nanoseconds."""
-    extra = {"unit": "s", "low": Decimal(low), "high": Decimal(high)}
-    return Meta(description=description, extra=extra)
-
-
-def exact(value: Decimal) -> Fraction:
-    """A finite number without any loss, so that 0.1 + 0.2 is 0.3."""
-    return Fraction(value)
+    return Meta(description=description, extra={"unit": "s", "low": Decimal(low), "high": Decimal(high)})
 
 
 def amounts(values: Mapping[str, Decimal], where: Where) -> dict[str, Fraction]:
-    """Bandwidth parameters or capacities, exact; a negative one is refused. Raises BadInput."""
+    """Bandwidth parameters or capacities without any loss, so that 0.1 + 0.2 is 0.3; a negative one is
+    refused. Raises BadInput."""
     for name, value in values.items():
         if value < 0:
             raise (where / name).bad(f"is {value}", "write 0 or more")
-    return {name: exact(value) for name, value in values.items()}
+    return {name: Fraction(value) for name, value in values.items()}
 
 
 def _decimal(text: str) -> Decimal:
@@ -245,24 +242,34 @@ def _decimal(text: str) -> Decimal:
         return Decimal("Infinity")
 
 
+_LEAVES: Final[Mapping[type[inspect.Type], tuple[tuple[type, ...], str]]] = {
+    inspect.IntType: ((int,), "a whole number"),
+    inspect.FloatType: ((int, Decimal), "a number"),
+    inspect.DecimalType: ((int, Decimal), "a number"),
+    inspect.StrType: ((str,), "a text in quotes"),
+    inspect.BoolType: ((bool,), "true or false"),
+}
+"""What TOML gives for a type, and how people call that."""
+
+
 def _checked(kind: inspect.Type, value: object, where: Where) -> object:
     """`value`, as TOML gave it, with durations in ns. Raises BadInput where it is not of this kind."""
     match kind:
         case inspect.Metadata(extra={"low": low, "high": high}):
-            _check_number(value, (int, Decimal), "a number", None, None, where)
+            _check_leaf(inspect.DecimalType(), value, where)
             return seconds_to_ns(Decimal(str(value)), where, low=low, high=high)
         case inspect.Metadata(type=of):
             return _checked(of, value, where)
+        case inspect.LiteralType(values=values):
+            _check_choice(values, value, where)
         case inspect.UnionType(types=(inspect.BoolType(), inspect.LiteralType(values=values))):
-            if not isinstance(value, bool) and value not in values:
-                words = ["true", "false", *(quoted(str(one)) for one in values)]
-                raise where.bad(f"is {_shown(value)}", f"write {_either(words)}")
-        case inspect.UnionType(types=(inspect.StructType(), inspect.StructType(), *_)):
-            return _checked_union(kind, _expect(dict, value, where, "a table"), where)
+            _check_choice((True, False, *values), value, where)
+        case inspect.UnionType(types=(inspect.StructType(), inspect.StructType(), *_) as structs):
+            table = _expect(dict, value, where, "a table")
+            return _checked_struct(_tagged(structs, table, where), table, where)
         case inspect.UnionType(types=kinds):  # else only X | None: absent in TOML, or X
-            return _checked(
-                next(kind for kind in kinds if not isinstance(kind, inspect.NoneType)), value, where
-            )
+            one = next(kind for kind in kinds if not isinstance(kind, inspect.NoneType))
+            return _checked(one, value, where)
         case inspect.StructType():
             return _checked_struct(kind, _expect(dict, value, where, f"a table, under [{where.key}]"), where)
         case inspect.DictType(value_type=of):
@@ -273,64 +280,47 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
             tables = isinstance(of, inspect.StructType | inspect.UnionType)
             items = _expect(list, value, where, f"tables, each under [[{where.key}]]" if tables else "a list")
             _check_count(len(items), kind.max_length, where)
-            names = [inner.get("name") if isinstance(inner, dict) else None for inner in items]
-            places = [where.item(number, name) for number, name in enumerate(names)]
-            return [
-                _checked(of, _expect(dict, inner, place, "a table") if tables else inner, place)
-                for inner, place in zip(items, places, strict=True)
-            ]
-        case inspect.LiteralType(values=values):
-            if value not in values:
-                raise where.bad(f"is {_shown(value)}", f"write {_either(quoted(str(one)) for one in values)}")
-        case inspect.IntType(ge=low, le=high):
-            _check_number(value, int, "a whole number", low, high, where)
-        case inspect.FloatType(ge=low, le=high):
-            _check_number(value, (int, Decimal), "a number", low, high, where)
-        case inspect.DecimalType():
-            _check_number(value, (int, Decimal), "a number", None, None, where)
-        case inspect.StrType():
-            _expect(str, value, where, "a text in quotes")
-        case inspect.BoolType():
-            _expect(bool, value, where, "true or false")
+            found = []
+            for number, inner in enumerate(items):
+                place = where.item(number, inner.get("name") if isinstance(inner, dict) else None)
+                inner = _expect(dict, inner, place, "a table") if tables else inner
+                found.append(_checked(of, inner, place))
+            return found
         case _:
-            raise TypeError(f"{kind} at {where.key}: strict knows no such type")
+            _check_leaf(kind, value, where)
     return value
 
 
-def _checked_union(kind: inspect.UnionType, table: Mapping[str, object], where: Where) -> object:
-    """Of structs that are told apart by a tag."""
-    structs = {str(one.tag): one for one in kind.types if isinstance(one, inspect.StructType)}
-    tag_field = str(next(iter(structs.values())).tag_field)
+def _tagged(structs: Iterable[inspect.Type], table: Mapping[str, object], where: Where) -> inspect.StructType:
+    """The struct that the table's tag names."""
+    known = {str(one.tag): one for one in structs if isinstance(one, inspect.StructType)}
+    tag_field = str(next(iter(known.values())).tag_field)
     if tag_field not in table:
         raise (where / tag_field).bad("is missing", "add it")
     tag = table[tag_field]
-    if not isinstance(tag, str) or tag not in structs:
-        known = _either(map(quoted, sorted(structs)))
-        raise (where / tag_field).bad(f"is {_shown(tag)}", f"write {known}")
+    _check_choice(sorted(known), tag, where / tag_field)
     for key in table:
-        others = [quoted(name) for name, one in structs.items() if key in _names(one)]
-        if others and quoted(tag) not in others:
+        others = [
+            name for name, one in known.items() if any(key == field.encode_name for field in one.fields)
+        ]
+        if others and tag not in others:
             raise (where / key).bad(
-                f"the {tag_field} {quoted(tag)} has none",
-                f"remove it, or write {tag_field} = {_either(others)}",
+                f"the {tag_field} {quoted(str(tag))} has none",
+                f"remove it, or write {tag_field} = {_either(map(quoted, others))}",
             )
-    return _checked_struct(structs[tag], table, where)
-
-
-def _names(kind: inspect.StructType) -> list[str]:
-    return [field.encode_name for field in kind.fields]
+    return known[str(tag)]
 
 
 def _checked_struct(kind: inspect.StructType, table: Mapping[str, object], where: Where) -> dict[str, object]:
     fields = {field.encode_name: field for field in kind.fields}
-    tags = {kind.tag_field: kind.tag} if kind.tag_field else {}
+    found: dict[str, object] = {kind.tag_field: kind.tag} if kind.tag_field else {}
     for key in table:
-        if key not in fields and key not in tags:
+        if key not in fields and key not in found:
             near = difflib.get_close_matches(key[:MAX_NAME], fields, n=3)
-            known = sorted((*fields, *map(str, tags)))
-            hint = f"did you mean {_either(near)}?" if near else f"known here: {', '.join(known)}"
-            raise (where / key).bad("unknown key", hint)
-    found: dict[str, object] = {str(key): tag for key, tag in tags.items()}
+            known = ", ".join(sorted((*fields, *found)))
+            raise (where / key).bad(
+                "unknown key", f"did you mean {_either(near)}?" if near else f"known here: {known}"
+            )
     for name, field in fields.items():
         if name in table:
             found[name] = _checked(field.type, table[name], where / name)
@@ -342,7 +332,7 @@ def _checked_struct(kind: inspect.StructType, table: Mapping[str, object], where
 
 def _expect(types: type | tuple[type, ...], value: object, where: Where, wanted: str) -> Any:
     # bool is an int to Python, and is none to whoever writes a file.
-    if not isinstance(value, types) or (isinstance(value, bool) and types is not bool):
+    if not isinstance(value, types) or (isinstance(value, bool) and types != (bool,)):
         raise where.bad(f"is {_shown(value)}", f"write {wanted}")
     return value
 
@@ -352,18 +342,23 @@ def _check_count(count: int, most: int | None, where: Where) -> None:
         raise where.bad(f"has {count:,} entries", f"at most {most:,} are allowed")
 
 
-def _check_number(
-    value: object,
-    types: type | tuple[type, ...],
-    wanted: str,
-    low: float | None,
-    high: float | None,
-    where: Where,
-) -> None:
+def _check_choice(values: Iterable[object], value: object, where: Where) -> None:
+    # 1 == True, and is another value to whoever writes a file.
+    if not any(value == one and type(value) is type(one) for one in values):
+        words = [str(one).lower() if isinstance(one, bool) else quoted(str(one)) for one in values]
+        raise where.bad(f"is {_shown(value)}", f"write {_either(words)}")
+
+
+def _check_leaf(kind: inspect.Type, value: object, where: Where) -> None:
     """Beyond the type and the bounds, refuses NaN, infinities and what is unreasonably long when exact."""
+    types, wanted = _LEAVES[type(kind)]
+    low, high = getattr(kind, "ge", None), getattr(kind, "le", None)
     if low is not None and high is not None:
         wanted += f" from {low} to {high}"
-    number = Decimal(_expect(types, value, where, wanted))
+    _expect(types, value, where, wanted)
+    if not isinstance(value, int | Decimal) or isinstance(value, bool):
+        return
+    number = Decimal(value)
     if not number.is_finite():
         raise where.bad("is not a finite number", f"write {wanted}")
     if (low is not None and number < Decimal(str(low))) or (high is not None and number > Decimal(str(high))):

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from zscout.config.placement_policy import DEFAULT_PLACEMENT, PlacementPolicy
+from zscout.config.fleet import DEFAULT_PLACEMENT, PlacementPolicy
 from zscout.messages import (
     DrainHost,
     EndComponent,

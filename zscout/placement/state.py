@@ -12,7 +12,7 @@ from enum import IntEnum
 from itertools import islice
 from typing import Final, Literal, TypeAlias
 
-from zscout.config.placement_policy import PlacementPolicy
+from zscout.config.fleet import PlacementPolicy
 from zscout.messages import (
     ComponentSpec,
     ComponentState,
