@@ -47,14 +47,14 @@ class StopOrder(msgspec.Struct, frozen=True, tag="stop"):
 
 
 class CheckpointOrder(msgspec.Struct, frozen=True, tag="checkpoint"):
-    """Answered with Taken."""
+    """Answered with CheckpointTaken."""
 
     number: int
     patience: float
 
 
 class MoveOrder(msgspec.Struct, frozen=True, tag="move"):
-    """Answered with Gone, and then it ends."""
+    """Answered with MovedAway, and then it ends."""
 
     number: int
     to: str
@@ -63,7 +63,7 @@ class MoveOrder(msgspec.Struct, frozen=True, tag="move"):
 
 
 class RestoreOrder(msgspec.Struct, frozen=True, tag="restore"):
-    """Answered with Done."""
+    """Answered with OrderDone."""
 
     number: int
     state: bytes
@@ -161,14 +161,13 @@ def _unpack(body: bytes, kind: Any) -> Any:
 
 
 def _exactly(connection: socket.socket, count: int) -> bytes | None:
-    parts, missing = [], count
-    while missing:
+    data = bytearray()
+    while len(data) < count:
         try:
-            part = connection.recv(min(missing, 1 << 20))
+            part = connection.recv(min(count - len(data), 1 << 20))
         except ConnectionError:
             return None
         if not part:
             return None
-        parts.append(part)
-        missing -= len(part)
-    return b"".join(parts)
+        data += part
+    return bytes(data)

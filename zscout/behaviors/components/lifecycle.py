@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import traceback
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import Final
 
@@ -38,6 +38,10 @@ CLOSE: Final = 4.0
 """Seconds for giving back what it holds."""
 SUPERSEDED: Final = 0.5
 """Seconds that a superseded one has to clean up."""
+
+
+class _Unusable(Exception):
+    """It can't be made here; one line that says why."""
 
 
 class ComponentLifecycle:
@@ -96,11 +100,11 @@ class ComponentLifecycle:
             case channel.ActivateOrder():
                 self._activated.set()
             case channel.CheckpointOrder():
-                self._supervisor.spawn(self._take_checkpoint(order))
+                self._supervisor.spawn(self._or_decline(order.number, self._take_checkpoint(order)))
             case channel.MoveOrder():
-                self._supervisor.spawn(self._move_away(order))
+                self._supervisor.spawn(self._or_decline(order.number, self._move_away(order)))
             case channel.RestoreOrder():
-                self._supervisor.spawn(self._take_in(order))
+                self._supervisor.spawn(self._or_decline(order.number, self._take_in(order)))
 
     def end(self, ends: EndReport) -> None:
         """Has it end; of several ends that are wanted the first is told. A move that has begun is called off;
@@ -122,15 +126,14 @@ class ComponentLifecycle:
         )
         # It joins the mesh in a thread: what follows is done meanwhile.
         await asyncio.sleep(0)
-        kind = self._load()
         try:
-            client = self._client = await connecting
-        except MeshError as error:
+            try:
+                kind = self._load()
+            finally:
+                client = self._client = await connecting
+            made = self._component = self._make(kind)
+        except (_Unusable, MeshError) as error:
             return EndReport("failed", str(error))
-        made = kind if isinstance(kind, EndReport) else self._make(kind)
-        if isinstance(made, EndReport):
-            return made
-        self._component = made
         movable = is_movable(made)
         watch = client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)
         try:
@@ -145,33 +148,31 @@ class ComponentLifecycle:
         finally:
             watch.close()
 
-    def _load(self) -> type[Component] | EndReport:
+    def _load(self) -> type[Component]:
         try:
             return kinds.load(self._job.kind, self._job.where)
         except kinds.BadKind as error:
-            return EndReport("failed", str(error))
+            raise _Unusable(str(error)) from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            return EndReport("failed", f"its kind can't be imported: {_words(error)}")
+            raise _Unusable(f"its kind can't be imported: {_words(error)}") from None
 
-    def _make(self, kind: type[Component]) -> Component | EndReport:
+    def _make(self, kind: type[Component]) -> Component:
         limit_allocations(self._job.memory)
         try:
             return kind(self._job.params)
         except ValueError as error:
-            return EndReport("failed", f"these parameters are no good: {_words(error, named=False)}")
+            raise _Unusable(f"these parameters are no good: {_words(error, named=False)}") from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            return EndReport("failed", f"it can't be made: {_words(error)}")
+            raise _Unusable(f"it can't be made: {_words(error)}") from None
 
     async def _linked(self, client: Client) -> None:
+        """Where no RCM leads now, there may be one when it matters."""
         found = asyncio.Event()
         watch = client.mesh.watch(client.mesh.keys.alive_any(Role.RCM), lambda _, alive: found.set())
         try:
-            async with asyncio.timeout(LINKED):
-                await found.wait()
-        except TimeoutError:
-            pass  # no RCM leads now; there may be one when it matters
+            await _first(LINKED, found)
         finally:
             watch.close()
 
@@ -213,85 +214,69 @@ class ComponentLifecycle:
             async with asyncio.timeout(SUPERSEDED if ends.how == "superseded" else CLOSE):
                 await self._client.close()
 
-    # What it is asked for
+    # Orders that are answered
+
+    async def _or_decline(self, number: int, carried_out: Awaitable[None]) -> None:
+        try:
+            await carried_out
+        except NotMoved as refused:
+            await self._tell(channel.OrderDeclined(number, refused.code, str(refused)))
+
+    def _movable(self, *, standby: bool = False) -> tuple[Component, Client]:
+        """Raises NotMoved where it does not run, or stand by, or can't be moved at all."""
+        component, client = self._component, self._client
+        fits = self._job.standby and not self._running if standby else self._running
+        if component is None or client is None or not fits:
+            raise NotMoved("bad_request", "it does not stand by" if standby else "it does not run")
+        if not is_movable(component):
+            raise NotMoved("not_movable", "it can't be moved: its kind has no checkpoint() and restore()")
+        return component, client
 
     async def _take_checkpoint(self, order: channel.CheckpointOrder) -> None:
-        component = self._component
-        if component is None or not self._running:
-            await self._decline(order.number, "bad_request", "it does not run")
-            return
-        if not is_movable(component):
-            await self._decline(order.number, "not_movable", _NOT_MOVABLE)
-            return
+        component, _ = self._movable()
         async with self._holding:
             if not await self._gate.hold(order.patience):
-                words = f"it came to no safe point within {order.patience:g} s"
-                await self._decline(order.number, "not_safe", words)
-                return
+                raise NotMoved("not_safe", f"it came to no safe point within {order.patience:g} s")
             try:
                 state = state_of(component)
-            except NotMoved as refused:
-                await self._decline(order.number, refused.code, str(refused))
-                return
             finally:
                 self._gate.release()
         await self._tell(channel.CheckpointTaken(order.number, state))
 
     async def _move_away(self, order: channel.MoveOrder) -> None:
-        component, client = self._component, self._client
-        if component is None or client is None or not self._running:
-            await self._decline(order.number, "bad_request", "it does not run")
-            return
-        if not is_movable(component):
-            await self._decline(order.number, "not_movable", _NOT_MOVABLE)
-            return
+        component, client = self._movable()
+        name = self._job.component
         async with self._holding:
-            move = OutgoingMove(
-                client, component, self._gate, self._job.component, order.to, order.incarnation
-            )
-            self._move = move
+            self._move = OutgoingMove(client, component, self._gate, name, order.to, order.incarnation)
             try:
-                dead = await move.carry_out(order.patience)
+                dead = await self._move.carry_out(order.patience)
             except BaseException as error:
                 self._move = None
                 if self._wanted is not None and self._story is not None:
                     self._story.cancel()
-                if not isinstance(error, Exception):
+                if isinstance(error, NotMoved) or not isinstance(error, Exception):
                     raise
-                refused = error if isinstance(error, NotMoved) else NotMoved("move_failed", _words(error))
-                if refused is not error:
-                    traceback.print_exc()
-                await self._decline(order.number, refused.code, str(refused))
-                return
+                traceback.print_exc()
+                raise NotMoved("move_failed", _words(error)) from None
             self._away = EndReport("moved")
             await self._tell(channel.MovedAway(order.number, dead))
             self._left.set()
 
     async def _take_in(self, order: channel.RestoreOrder) -> None:
-        component, client = self._component, self._client
-        if component is None or client is None or not self._job.standby or self._running:
-            await self._decline(order.number, "bad_request", "it does not stand by")
-            return
-        if not is_movable(component):
-            await self._decline(order.number, "not_movable", _NOT_MOVABLE)
-            return
+        component, client = self._movable(standby=True)
         try:
             component.restore(order.state)
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            await self._decline(order.number, "start_failed", f"restore() failed: {_words(error)}")
-            self.end(EndReport("failed", f"restore() failed: {_words(error)}"))
-            return
+            words = f"restore() failed: {_words(error)}"
+            self.end(EndReport("failed", words))
+            raise NotMoved("start_failed", words) from None
         try:
             client.expect(order.requests)
         except (BadName, ValueError) as error:
-            await self._decline(order.number, "bad_request", _words(error, named=False))
-            return
+            raise NotMoved("bad_request", _words(error, named=False)) from None
         self._restored.set()
         await self._tell(channel.OrderDone(order.number))
-
-    async def _decline(self, number: int, code: str, message: str) -> None:
-        await self._tell(channel.OrderDeclined(number, code, message[:MAX_ERROR]))
 
     def _on_component(self, token: Token, alive: bool) -> None:
         if not alive or token.name != self._job.component:
@@ -310,9 +295,6 @@ class ComponentLifecycle:
         self._away = self._away or ends
         self.end(ends)
         asyncio.get_running_loop().call_later(SUPERSEDED, self._left.set)
-
-
-_NOT_MOVABLE: Final = "it can't be moved: its kind has no checkpoint() and restore()"
 
 
 async def _first(timeout: float, *events: asyncio.Event) -> bool:
