@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 from zscout.messages import ComponentSpec, ComponentState, RankedHost
-from zscout.placement.events import StartAnswered, StopAnswered
+from zscout.placement.events import StartAnswered
 from zscout.placement.repeating import Probes, SurplusIncarnations
 from zscout.placement.state import (
     OVER,
     PROBE_TIMEOUT,
-    STOP_TIMEOUT,
     ComponentRecord,
     PlacementState,
     Termination,
@@ -76,14 +75,9 @@ class Lifecycle:
         if record.state == "given_up":
             self._finish(record, "ended", "stopped")
         elif record.state not in ("ended", "stopping"):
-            nowhere = record.state in ("waiting", "backing_off")
             record.enter("stopping")
             record.reason = "asked to stop"
-            if nowhere:
-                self.check_stopped(record)
-            else:
-                record.unanswered = 0
-                self._command_stop(record)
+            self._end_incarnation(record)
 
     # Choosing a host
 
@@ -165,13 +159,7 @@ class Lifecycle:
     def start_answered(self, record: ComponentRecord, answer: StartAnswered) -> None:
         """Of the record's own incarnation, not of a migration's target."""
         record.start_until = None
-        if record.state == "stopping":
-            # The stop may have come before the start: once more.
-            if answer.result in ("refused", "failed"):
-                self.stopped(record)
-            else:
-                self._command_stop(record)
-        elif answer.result == "failed" and record.state != "starting":
+        if answer.result == "failed" and record.state != "starting":
             self.ended(record, Termination("failed", answer.reason, answer.tail))
         elif answer.result == "ok":
             record.movable, record.confirmed = answer.movable, True
@@ -256,7 +244,9 @@ class Lifecycle:
         """The record's incarnation has ended, or is taken for lost."""
         state, rules = self.state, self.state.rules
         if record.state == "stopping":
-            self.stopped(record, certain=end.cause != "lost")
+            if end.cause != "lost":
+                record.ended_incarnations.append(record.incarnation)
+            self._stopped(record)
             return
         if record.state == "starting" and end.cause in ("failed", "lost") and not end.with_host:
             self._start_failed(record, end)
@@ -304,44 +294,30 @@ class Lifecycle:
     def host_lost(self, record: ComponentRecord, host: HostName) -> None:
         self.ended(record, Termination("lost", f"host {host} is gone", with_host=True))
 
-    # Stopping
+    # Stopping: what is to end is surplus
 
-    def _command_stop(self, record: ComponentRecord) -> None:
-        state = self.state
-        if record.host is not None and record.host in state.alive:
-            record.stop_confirmed = False
-            state.stop(record.component, record.incarnation, record.host)
-            state.wake(record, state.now + STOP_TIMEOUT)
-        elif record.host is None or state.now >= record.not_before:
-            self.stopped(record, certain=False)
-        else:
+    def _end_incarnation(self, record: ComponentRecord) -> None:
+        state, host = self.state, record.host
+        if host is not None and host in state.alive:
+            start_until, token = record.start_until, record.token
+            self.surplus.add(record.component, record.incarnation, host, start_until, token=token)
+            state.wake(record, None)
+        elif host is not None and state.now < record.not_before:
             # Inherited: its host may be there, and has not joined yet.
             state.wake(record, record.not_before)
-
-    def stop_answered(self, record: ComponentRecord, answer: StopAnswered) -> None:
-        state = self.state
-        record.stop_confirmed = answer.done
-        if not answer.done:
-            record.unanswered += 1
-            state.wake(record, state.now + state.back_off_time(record.unanswered))
-        elif record.start_until is not None or record.token:
-            # It began after that was reported, or its token goes in a moment.
-            state.wake(record, state.now + SECOND)
         else:
-            self.stopped(record)
+            if host is not None:
+                self.probes.add(host, record.component)
+            self._stopped(record)
 
-    def stopped(self, record: ComponentRecord, *, certain: bool = True) -> None:
-        """What was stopped has ended; `certain` False: its host is gone."""
-        if certain:
-            record.ended_incarnations.append(record.incarnation)
-        elif record.host is not None:
-            self.probes.add(record.host, record.component)
+    def _stopped(self, record: ComponentRecord) -> None:
+        """What was stopped has ended, or its host is gone."""
         record.start_until = None
         self.state.component_left(record)
         self.state.wake(record, None)
-        self.check_stopped(record)
+        self._check_stopped(record)
 
-    def check_stopped(self, record: ComponentRecord) -> None:
+    def _check_stopped(self, record: ComponentRecord) -> None:
         """Stopped is a component once its surplus incarnations have ended, too."""
         if record.host is not None or self.surplus.any(record.component):
             return
@@ -352,9 +328,14 @@ class Lifecycle:
             self._finish(record, "ended", "stopped")
 
     def surplus_ended(self, component: ComponentId) -> None:
+        """Surplus incarnations of it may have ended, its own among them if it is being stopped."""
         record = self.state.get(component)
-        if record is not None and record.state == "stopping":
-            self.check_stopped(record)
+        if record is None or record.state != "stopping":
+            return
+        if record.host in self.state.alive and not self.surplus.has(component, record.incarnation):
+            self._stopped(record)
+        else:
+            self._check_stopped(record)
 
     # Time
 
@@ -372,9 +353,7 @@ class Lifecycle:
                 if (end := self.check(record)) is not None:
                     self.ended(record, end)
             case "stopping":
-                if record.start_until is not None and record.start_until <= state.now:
-                    record.start_until = None
-                self._command_stop(record)
+                self._end_incarnation(record)
             case _:
                 state.forget(record.component)
 

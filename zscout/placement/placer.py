@@ -157,13 +157,7 @@ class Placer:
 
     def _stop_answered(self, answer: StopAnswered) -> None:
         self._surplus.stop_answered(answer.component, answer.incarnation, done=answer.done)
-        record = self._state.get(answer.component)
-        if record is None or record.state != "stopping":
-            return
-        if (answer.incarnation, answer.host) == (record.incarnation, record.host):
-            self._lifecycle.stop_answered(record, answer)
-        else:
-            self._lifecycle.check_stopped(record)
+        self._lifecycle.surplus_ended(answer.component)
 
     def _move_answered(self, answer: MoveAnswered) -> None:
         record = self._state.get(answer.component)

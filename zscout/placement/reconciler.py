@@ -66,8 +66,6 @@ class Reconciler:
             elif record.state == "running":
                 record.unanswered = 0
                 self.lifecycle.timer(record)
-            elif record.state == "stopping" and record.stop_confirmed:
-                self.lifecycle.stopped(record)
         elif move is not None and incarnation == move.incarnation:
             move.token, move.target = False, "unknown"
 
@@ -233,7 +231,7 @@ class Reconciler:
         state.mark_changed(record.component)
         if record.migration is not None:
             self.migrations.source_ended(record, record.migration, end)
-        elif record.state in ("running", "stopping"):
+        elif record.state == "running":
             self.lifecycle.ended(record, end)
 
     # Hosts

@@ -140,8 +140,6 @@ class ComponentRecord:
     """Its host reported that it runs, and whether it is movable."""
     probed: bool = False
     """A probe is sent, and not answered."""
-    stop_confirmed: bool = False
-    """Its host reported that it has ended, or never was there."""
     no_host: tuple[Mapping[HostName, str], str] | None = None
     """The causes for which no host would do (`EligibleHosts.causes`), and the reason given for that."""
     tried: dict[HostName, str] = field(default_factory=dict)
