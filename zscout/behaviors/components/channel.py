@@ -1,14 +1,12 @@
-"""What a node and a component's process exchange: frames over a socket pair.
+"""What a node and a component's process exchange over a socket pair: JSON objects, one in each line.
 
-A frame is its length in 4 bytes, big-endian, and one JSON object. The node sends orders, the process reports.
+The node sends orders, the process reports.
 """
 
 from __future__ import annotations
 
 import asyncio
-import socket
-import struct
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, BinaryIO, Final, Literal, TypeAlias
 
 import msgspec
 
@@ -17,7 +15,6 @@ from zscout.messages import MAX_MOVE, HowEnded, OpenRequest
 
 MAX_FRAME: Final = MAX_MOVE + 65_536
 """Bytes."""
-_HEADER: Final = struct.Struct(">I")
 
 
 class BadFrame(Exception):
@@ -122,35 +119,35 @@ ComponentReport: TypeAlias = PhaseReport | OrderAnswer | EndReport
 def pack(message: msgspec.Struct) -> bytes:
     """A message as a frame. Raises BadFrame if it is too long."""
     body = msgspec.json.encode(message, enc_hook=str)
-    if len(body) > MAX_FRAME:
-        raise BadFrame(f"{len(body)} bytes are too many; at most {MAX_FRAME} go in one frame")
-    return _HEADER.pack(len(body)) + body
+    if len(body) >= MAX_FRAME:
+        raise BadFrame(f"{len(body)} bytes are too many; less than {MAX_FRAME} go in one frame")
+    return body + b"\n"
 
 
-def receive(connection: socket.socket, kind: Any) -> Any:
-    """The next message, of `kind`, on a blocking socket; None when the other side has closed, be it half-way.
-
-    Raises BadFrame."""
-    header = _exactly(connection, _HEADER.size)
-    body = _exactly(connection, _length(header)) if header is not None else None
-    return None if body is None else _unpack(body, kind)
+def receive(connection: BinaryIO, kind: Any) -> Any:
+    """The next message, of `kind`; None when the other side has closed, be it half-way. Raises BadFrame."""
+    try:
+        line = connection.readline(MAX_FRAME)
+    except ConnectionError:
+        return None
+    if line.endswith(b"\n"):
+        return _unpack(line, kind)
+    if len(line) == MAX_FRAME:
+        raise BadFrame(_TOO_LONG)
+    return None
 
 
 async def read(stream: asyncio.StreamReader, kind: Any) -> Any:
-    """The same for a stream."""
+    """The same for a stream, whose limit is MAX_FRAME."""
     try:
-        header = await stream.readexactly(_HEADER.size)
-        body = await stream.readexactly(_length(header))
+        return _unpack(await stream.readuntil(b"\n"), kind)
     except (asyncio.IncompleteReadError, ConnectionError):
         return None
-    return _unpack(body, kind)
+    except asyncio.LimitOverrunError:
+        raise BadFrame(_TOO_LONG) from None
 
 
-def _length(header: bytes) -> int:
-    length: int = _HEADER.unpack(header)[0]
-    if length > MAX_FRAME:
-        raise BadFrame(f"a frame of {length} bytes is announced; at most {MAX_FRAME} are taken")
-    return length
+_TOO_LONG: Final = f"a frame of more than {MAX_FRAME} bytes comes"
 
 
 def _unpack(body: bytes, kind: Any) -> Any:
@@ -158,16 +155,3 @@ def _unpack(body: bytes, kind: Any) -> Any:
         return msgspec.json.decode(body, type=kind)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise BadFrame(f"a frame is not understood: {str(error)[:200]}") from None
-
-
-def _exactly(connection: socket.socket, count: int) -> bytes | None:
-    data = bytearray()
-    while len(data) < count:
-        try:
-            part = connection.recv(min(count - len(data), 1 << 20))
-        except ConnectionError:
-            return None
-        if not part:
-            return None
-        data += part
-    return bytes(data)

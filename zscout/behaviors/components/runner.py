@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import Final
+from typing import BinaryIO, Final
 
 import uvloop
 
@@ -46,17 +46,18 @@ def main() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)
     connection = socket.socket(fileno=int(sys.argv[1]))
     connection.set_inheritable(False)
+    orders = connection.makefile("rb")
     try:
-        job: ComponentJob | None = channel.receive(connection, ComponentJob)
+        job: ComponentJob | None = channel.receive(orders, ComponentJob)
     except BadFrame as error:
         sys.exit(f"zscout.behaviors.components.runner: {error}")
     if job is None:
         return
-    ends = uvloop.run(_live(job, connection))
+    ends = uvloop.run(_live(job, connection, orders))
     sys.exit(1 if ends.how == "failed" else 0)
 
 
-async def _live(job: ComponentJob, connection: socket.socket) -> EndReport:
+async def _live(job: ComponentJob, connection: socket.socket, orders: BinaryIO) -> EndReport:
     loop = asyncio.get_running_loop()
     # In a thread: a node that stands still must not hold up the component. In one, so that frames stay whole.
     speaker = ThreadPoolExecutor(1)
@@ -69,7 +70,7 @@ async def _live(job: ComponentJob, connection: socket.socket) -> EndReport:
     def deliver(order: Order) -> None:
         loop.call_soon_threadsafe(life.order, order)
 
-    threading.Thread(target=_listen, args=(connection, job.tag, deliver), daemon=True).start()
+    threading.Thread(target=_listen, args=(orders, job.tag, deliver), daemon=True).start()
     loop.add_signal_handler(signal.SIGTERM, life.end, EndReport("failed", "ended by SIGTERM"))
     ends = await life.run()
     with suppress(TimeoutError):
@@ -88,12 +89,11 @@ def _send(connection: socket.socket, frame: bytes) -> None:
         connection.sendall(frame)
 
 
-def _listen(connection: socket.socket, tag: str, deliver: Callable[[Order], None]) -> None:
-    """Hears orders until there is nobody any more who gives them. In a thread: it must work while the
-    component computes."""
+def _listen(orders: BinaryIO, tag: str, deliver: Callable[[Order], None]) -> None:
+    """Receives orders until the node has closed. In a thread: it must work while the component computes."""
     try:
         while True:
-            order: Order | None = channel.receive(connection, Order)
+            order: Order | None = channel.receive(orders, Order)
             if order is None:
                 break
             deliver(order)
