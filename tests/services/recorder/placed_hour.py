@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 
 from zscout.messages import ComponentUse, LoadReport, Placement, Placements
-from zscout.services.recorder.host_pane import Use
+from zscout.services.recorder.hosts import Use
 from zscout.services.recorder.placement_tracker import PlacementTracker
 from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import Term
@@ -99,8 +99,10 @@ def play(timeline: Timeline) -> None:
             if host == "crucible" and 3000 <= at < 3300:
                 continue
             report = report_of(host, at, loads, [name for name, where in runs.items() if where == host])
-            timeline.load(at, host, report.load_average[0], report.cpu / 100)
-            timeline.uses(at, host, [Use(one.component, one.cpu, one.memory) for one in report.components])
+            timeline.hosts.load(at, host, report.load_average[0], report.cpu / 100)
+            timeline.hosts.uses(
+                at, host, [Use(one.component, one.cpu, one.memory) for one in report.components]
+            )
     for arc, begin, end in (("counter", 600, 1500), ("survey", 1700, 2800)):
         timeline.holders(begin, "robot/scout33", [HolderRow(arc)])
         timeline.arc(begin, arc, "running", "priority 1")

@@ -301,7 +301,7 @@ def _frames(tracker: RobotTracker, at: float, grants: dict[tuple[int, float], Gr
 
 def _second(tracker: RobotTracker, timeline: Timeline, at: float) -> None:
     for number, host in enumerate(("anvil", "basil", "crucible")):
-        timeline.load(at, host, 0.4 + 0.3 * number + 0.2 * math.sin(at / 9 + number), 0.3)
+        timeline.hosts.load(at, host, 0.4 + 0.3 * number + 0.2 * math.sin(at / 9 + number), 0.3)
     for robot in ROBOTS:
         figures = {"commands": 5 + math.sin(at / 5 + ord(robot[-1])), "latency_ms": 20 + 4 * math.sin(at)}
         tracker.state(

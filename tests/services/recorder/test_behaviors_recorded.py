@@ -22,7 +22,8 @@ from zscout.messages import (
     BehaviorSaid,
     RcState,
 )
-from zscout.services.recorder import robot_panes, robot_tracker
+from zscout.services.recorder import robot_tracker
+from zscout.services.recorder import robots as robot_panes
 from zscout.services.recorder.colours import DOING, OTHER
 from zscout.services.recorder.rate_limit import MAX_WAITING, RATE, RateLimiter
 from zscout.services.recorder.robot_tracker import RobotTracker

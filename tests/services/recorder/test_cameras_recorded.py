@@ -24,7 +24,7 @@ from tests.services.recorder.robot_run import (
     say,
 )
 from zscout.drivers.image_size import jpeg_size, png_size
-from zscout.services.recorder import pictures
+from zscout.services.recorder import robots
 from zscout.services.recorder.colours import PALE
 from zscout.services.recorder.robot_tracker import RobotHold, RobotTracker
 from zscout.services.recorder.timeline import Timeline
@@ -93,7 +93,7 @@ def test_boxes_end_with_what_they_mark(tmp_path: Path) -> None:
 
 
 def test_what_is_no_picture_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "MAX_CAMERAS", 2)
+    monkeypatch.setattr(robots, "MAX_CAMERAS", 2)
     path = tmp_path / "run.rrd"
     good = jpeg(0, "scout33", None)
     size = good.index(b"\xff\xc0") + 5

@@ -73,7 +73,7 @@ def test_words_that_the_viewer_can_t_draw_do_not_end_it(tmp_path: Path) -> None:
         words = "日本 \U0001f916 ✖ عربى"
         timeline.arc(0, words, "waiting", words)
         timeline.event(0, f"{words}: Grüße, Ελλάδα, Москва, Łódź → “…”")
-        timeline.load(0, words, 1.0)
+        timeline.hosts.load(0, words, 1.0)
         tracker = PlacementTracker(timeline)
         tracker.published(0, Placements(Term(1, words)))
     with viewer(path, tmp_path) as client:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,8 +22,8 @@ from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Sender
 from zscout.mesh import IncomingQuery, Supervisor, ZenohMesh
 from zscout.messages import ListPlacements, Placement, Placements, PlacerOperation
-from zscout.services.recorder import host_pane as module
-from zscout.services.recorder.host_pane import Running, Use
+from zscout.services.recorder import hosts as module
+from zscout.services.recorder.hosts import Running, Use
 from zscout.services.recorder.placement_tracker import PlacementFollower, PlacementTracker
 from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import Term
@@ -100,7 +100,7 @@ def test_a_component_has_the_colour_of_its_arc(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         timeline.holders(0, "robot/a", [HolderRow("first"), HolderRow("counter")])
-        timeline.runs(1, "anvil", [Running("counter"), Running("other")])
+        timeline.hosts.runs(1, "anvil", [Running("counter"), Running("other")])
         timeline.holders(2, "robot/a", [HolderRow("other"), HolderRow("next")])
     rc, host = colours(path, "/rc/**")["/rc/robot/a"], colours(path, "/host/**")["/host/anvil"]
     assert host == {name: rc[name] for name in ("counter", "other")}
@@ -173,12 +173,14 @@ def test_the_heaviest_components_have_curves(tmp_path: Path, monkeypatch: pytest
     path = tmp_path / "run.rrd"
     many = [Use(f"c{number}", cpu=0.1 * number, memory=0) for number in range(1, 7)]
     with Timeline("lab", path=path) as timeline:
-        timeline.uses(0, "anvil", many)
-        timeline.uses(1, "basil", [Use("heavy", cpu=0.3, memory=2e9)])
-        timeline.uses(2, "anvil", many)
-        timeline.uses(3, "anvil", [Use("c6", cpu=0.6, memory=5e6)])
-        timeline.uses(4, "anvil", [Use(f"d{number}", cpu=9, memory=float("nan")) for number in range(3)])
-        timeline.uses(5, "anvil", [Use(f"d{number}", cpu=9, memory=0) for number in range(3)])
+        timeline.hosts.uses(0, "anvil", many)
+        timeline.hosts.uses(1, "basil", [Use("heavy", cpu=0.3, memory=2e9)])
+        timeline.hosts.uses(2, "anvil", many)
+        timeline.hosts.uses(3, "anvil", [Use("c6", cpu=0.6, memory=5e6)])
+        timeline.hosts.uses(
+            4, "anvil", [Use(f"d{number}", cpu=9, memory=float("nan")) for number in range(3)]
+        )
+        timeline.hosts.uses(5, "anvil", [Use(f"d{number}", cpu=9, memory=0) for number in range(3)])
     drawn = {entity for entity, _, _ in rows(path, "/use/cpu/**", SCALARS)}
     assert drawn == {
         "/use/cpu/anvil/c6",
@@ -199,7 +201,7 @@ def test_no_line_is_drawn_through_a_host_s_silence(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         for at in (0, 9, 60):
-            timeline.load(at, "anvil", 1.0, 0.5)
+            timeline.hosts.load(at, "anvil", 1.0, 0.5)
     for folder in ("load", "cpu"):
         breaks = [at for _, at, _ in rows(path, f"/{folder}/anvil", "Clear:is_recursive")]
         assert breaks == [9 + module.SILENCE]
@@ -209,9 +211,9 @@ def test_no_line_is_drawn_through_a_host_s_silence(tmp_path: Path) -> None:
 def test_marks_of_one_moment_stand_above_each_other(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        timeline.load(0, "anvil", 2.0)
+        timeline.hosts.load(0, "anvil", 2.0)
         for at, name in ((1.0, "a"), (1.5, "b"), (1.9, "c"), (9.0, "d")):
-            timeline.mark(at, "anvil", "placed", name)
+            timeline.hosts.mark(at, "anvil", "placed", name)
     heights = curve(path, "/mark/placed")
     assert heights[0] == heights[3] == 2.0
     assert heights[0] < heights[1] < heights[2]
@@ -239,7 +241,13 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
                 with Timeline("lab", path=path) as timeline:
                     follower = PlacementFollower(ears, timeline, lambda: 1.0, supervisor)
                     there = asyncio.Event()
-                    follower.tracker.timeline = Watched(timeline, there)  # type: ignore[assignment]
+                    runs = timeline.hosts.runs
+
+                    def shown(at: float, host: str, components: Iterable[Running]) -> None:
+                        runs(at, host, components)
+                        there.set()
+
+                    timeline.hosts.runs = shown  # type: ignore[method-assign]
                     heard = follower.subscribe()
                     reading = asyncio.create_task(follower.keep_reading())
                     async with asyncio.timeout(HANG):
@@ -262,17 +270,3 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
         "counter (counter) runs on anvil already",
         "counter moved anvil -> basil, dead 500 ms",
     ]
-
-
-class Watched:
-    """A timeline, and an event whenever lanes were written."""
-
-    def __init__(self, timeline: Timeline, there: asyncio.Event) -> None:
-        self._timeline, self._there = timeline, there
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._timeline, name)
-
-    def runs(self, at: float, host: str, components: list[Running]) -> None:
-        self._timeline.runs(at, host, components)
-        self._there.set()

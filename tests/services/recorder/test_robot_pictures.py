@@ -107,7 +107,7 @@ def test_garbled_pictures_and_words_do_not_end_the_viewer(tmp_path: Path) -> Non
         robots.old_picture(1, "half", words, PALE)
         for number in range(4):
             robots.picture(1, f"fgrab{number}", good, "", PALE)
-        timeline._recording.flush(timeout_sec=10)
+        timeline.recording.flush(timeout_sec=10)
         live.write_bytes(path.read_bytes())
     # Seven cameras on two pages, and each of the other panes.
     with viewer(live, tmp_path, panes=7 + 7, height=HEIGHT) as client:

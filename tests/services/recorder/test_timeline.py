@@ -29,8 +29,7 @@ from tests.services.recorder.paper_run import (
     rows,
     second_by_second,
 )
-from zscout.services.recorder import host_pane
-from zscout.services.recorder import lanes as lanes_module
+from zscout.services.recorder import drawing, hosts
 from zscout.services.recorder import timeline as module
 from zscout.services.recorder.colours import LINES, OPERATOR, PALETTE, STATES
 from zscout.services.recorder.timeline import (
@@ -164,13 +163,13 @@ def test_what_does_not_change_is_not_written_again(tmp_path: Path) -> None:
 def test_names_past_the_limit_are_noted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_ARCS", 3)
     monkeypatch.setattr(module, "MAX_RCS", 2)
-    monkeypatch.setattr(host_pane, "MAX_HOSTS", 1)
+    monkeypatch.setattr(hosts, "MAX_HOSTS", 1)
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         for number in range(6):
             timeline.arc(number, f"arc{number}", "waiting")
             timeline.holders(number, f"robot/r{number}", [])
-            timeline.load(number, f"host{number}", 0.5)
+            timeline.hosts.load(number, f"host{number}", 0.5)
         timeline.holders(7, "robot/r0", [HolderRow("arc5")])
     assert set(lanes(path, "/arc/**")) == {"/arc/arc0", "/arc/arc1", "/arc/arc2"}
     assert set(lanes(path, "/rc/**")) == {"/rc/robot/r0", "/rc/robot/r1"}
@@ -195,15 +194,15 @@ def test_hostile_names_and_texts_are_tamed(tmp_path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         timeline.arc(0, "../a b\n/\x00/" + "x" * 1000, "waiting", "because\n\x1b[31mof " + "y" * 1000)
         timeline.event(0, "one\ntwo\x07 \u65e5\u2716 é " + "z" * 10_000, "SHOUT")
-        timeline.load(0, "anvil", math.nan, math.inf)
-        timeline.load(1, "anvil", 0.5, 0.25)
+        timeline.hosts.load(0, "anvil", math.nan, math.inf)
+        timeline.hosts.load(1, "anvil", 0.5, 0.25)
     ((lane, changes),) = lanes(path, "/arc/**").items()
     assert lane == "/arc/../a_b_/_/" + "x" * 64
     assert changes[0][1][0].startswith("waiting · because [31mof yyy")
-    assert len(changes[0][1][0]) == lanes_module.MAX_STATE
+    assert len(changes[0][1][0]) == drawing.MAX_STATE
     (text,) = events(path)
     assert text.startswith("one two ?? é zzz")
-    assert len(text) == module.MAX_EVENT
+    assert len(text) == drawing.MAX_EVENT
     assert [value for _, _, value in rows(path, "/load/**", "Scalars:scalars")] == [[0.5]]
     assert [value for _, _, value in rows(path, "/cpu/**", "Scalars:scalars")] == [[0.25]]
 
@@ -325,7 +324,7 @@ def test_closing_twice_and_writing_afterwards_do_nothing(tmp_path: Path) -> None
     timeline.event(2, "late")
     timeline.holders(2, SCOUT33, [])
     timeline.arc(2, "arc0", "done")
-    timeline.load(2, "anvil", 1.0)
+    timeline.hosts.load(2, "anvil", 1.0)
     timeline.close()
     assert events(path) == ["first"]
 

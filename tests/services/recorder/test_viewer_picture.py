@@ -58,7 +58,7 @@ def record(path: Path) -> None:
         for quarter in range(SECONDS * 4 + 1):
             for host, peak in HOSTS.items():
                 load = 0.1 + 1.5 * math.exp(-(((quarter / 4 - peak) / 3.5) ** 2))
-                timeline.load(quarter / 4, host, load, cpu=0.5)
+                timeline.hosts.load(quarter / 4, host, load, cpu=0.5)
 
 
 @contextmanager

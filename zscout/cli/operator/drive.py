@@ -21,7 +21,7 @@ from zscout.types import SECOND
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
     from zscout.behaviors.teleop import Teleop
-    from zscout.services.recorder.picture_stream import PictureStream
+    from zscout.cli.operator.picture_recording import PictureRecording
 
 REFRESH: Final = 0.2
 """Seconds between two drawings of the live line."""
@@ -132,16 +132,18 @@ async def _drive(
 
 async def _stream(
     stack: AsyncExitStack, robot: str, record: Path | None, console: _Console, *, view: bool
-) -> PictureStream:
+) -> PictureRecording:
     """The picture's stream, and a window onto it where there is a display."""
     from zscout.cli.fleet.children import child, viewer_binary
     from zscout.cli.fleet.view import free_port
 
     # Rerun takes seconds to load on a busy machine, and the operator may be in a hurry.
-    await asyncio.to_thread(importlib.import_module, "zscout.services.recorder.picture_stream")
-    from zscout.services.recorder.picture_stream import PictureStream
+    await asyncio.to_thread(importlib.import_module, "zscout.cli.operator.picture_recording")
+    from zscout.cli.operator.picture_recording import PictureRecording
 
-    stream = stack.enter_context(PictureStream(robot, free_port("127.0.0.1", 0), record))
+    stream = stack.enter_context(
+        PictureRecording("drive", robot, port=free_port("127.0.0.1", 0), file=record)
+    )
     window = view and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     words = f"picture at {stream.url}" if window else f"see the picture with: rerun {stream.url}"
     console.event("picture", words, url=stream.url)
@@ -153,7 +155,7 @@ async def _stream(
     return stream
 
 
-async def show_pictures(client: Client, teleop: Teleop, stream: PictureStream, console: _Console) -> None:
+async def show_pictures(client: Client, teleop: Teleop, stream: PictureRecording, console: _Console) -> None:
     """Passes the newest picture of the held framegrabber on, without end."""
     mesh = client.mesh
     zero = mesh.now()
@@ -162,14 +164,14 @@ async def show_pictures(client: Client, teleop: Teleop, stream: PictureStream, c
         if robot is None or held is None:
             await asyncio.sleep(REFRESH)
             continue
-        stream.event(
+        stream.words(
             (mesh.now() - zero) / SECOND, f"{robot.robot} is yours, seen through {robot.framegrabber}"
         )
         with mesh.frames(mesh.keys.frame(robot.framegrabber)) as frames:
             while teleop.robot is robot:
                 frame = await frames.next(REFRESH)
                 if frame is not None and frame.head.grant == held.grant:
-                    stream.show((frame.arrived - zero) / SECOND, frame.jpeg)
+                    stream.picture((frame.arrived - zero) / SECOND, frame.jpeg)
                     console.seen(frame.arrived)
 
 

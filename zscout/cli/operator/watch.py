@@ -21,8 +21,8 @@ from zscout.types import SECOND
 
 if TYPE_CHECKING:
     from zscout.behaviors.perception.motion import Event
+    from zscout.cli.operator.picture_recording import WatchRecording
     from zscout.cli.operator.watch_source import Source
-    from zscout.services.recorder.watch_recording import WatchRecording
 
 MAX_SECONDS: Final = 1e9
 DRAWN: Final = 0.1
@@ -115,7 +115,7 @@ def _watch(source: Source, report: _WatchReport, ending: _Ending, limit: float |
             ended = tracker.see(time, seen)
             report.pictures += 1
             if report.recording is not None:
-                report.recording.picture(time, picture, seen.boxes, moving=seen.moving)
+                report.recording.seen(time, picture, seen.boxes, moving=seen.moving)
         if ended is not None:
             report.event(ended)
         report.show(source, tracker.current)
@@ -169,7 +169,7 @@ class _WatchReport(LiveLine):
         self._events += 1
         self._moving += event.end - event.start
         if self.recording is not None:
-            self.recording.event(event.start, _words(event))
+            self.recording.words(event.start, _words(event))
         text = _as_json(event) if self._json else _words(event)
         if terminal.at_terminal():
             self.print(text, "" if self._json else "yellow")
@@ -180,7 +180,7 @@ class _WatchReport(LiveLine):
         """A word about the source, on stderr."""
         text = terminal.clean(text)
         if self.recording is not None:
-            self.recording.event(self.at, text)
+            self.recording.words(self.at, text)
         if terminal.at_terminal(sys.stderr):
             self.print(text, "red")
         else:
@@ -210,8 +210,8 @@ class _WatchReport(LiveLine):
 
 
 def _recording(stack: ExitStack, source: Source, file: Path) -> WatchRecording:
+    from zscout.cli.operator.picture_recording import WatchRecording
     from zscout.services.recorder.timeline import TimelineError
-    from zscout.services.recorder.watch_recording import WatchRecording
 
     try:
         return stack.enter_context(WatchRecording(source.name, file))

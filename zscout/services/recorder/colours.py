@@ -6,12 +6,9 @@ yet, yellow an alert.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 OPERATOR: Final = 0xFF1463FF
 """RGBA of operator takeovers and preemptions."""
@@ -86,8 +83,3 @@ def faded(colour: int, part: float) -> int:
 def bright(colour: int) -> int:
     """The colour of a text: halfway to white, for the viewer writes on what is half dark."""
     return sum((((colour >> shift & 0xFF) + 0xFF) // 2) << shift for shift in (24, 16, 8)) | colour & 0xFF
-
-
-def rgba(colours: Sequence[int]) -> NDArray[np.uint32]:
-    """Colours as Rerun takes them: of a list of three or four it could not tell whether they are one."""
-    return np.array(colours, np.uint32)

@@ -1,30 +1,20 @@
 """The floor's part of the timeline: a building's plan, who is where in it, and where robots came from.
 
-Everything is logged at the time that the recording stands at, in pixels of the plan's picture.
+Drawn in pixels of the plan's picture.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
 
 import rerun as rr
 
 from zscout.drivers.image_size import png_size
-from zscout.services.recorder.colours import (
-    ALERT,
-    CAMERA,
-    HIDDEN,
-    IN_THE_OPEN,
-    PALE,
-    PERSON,
-    bright,
-    faded,
-    rgba,
-)
-from zscout.services.recorder.lanes import clean_text
+from zscout.services.recorder.colours import ALERT, CAMERA, HIDDEN, IN_THE_OPEN, PALE, PERSON, bright, faded
+from zscout.services.recorder.drawing import Drawing, clean_text
 
 MIN_METRES: Final = 0.5
 MAX_METRES: Final = 200.0
@@ -56,7 +46,32 @@ MAX_STACK: Final = 6
 RING: Final = 24
 """Corners of a circle."""
 
-Spots = list[tuple[float, float]]
+Spot = tuple[float, float]
+
+
+class Layer(NamedTuple):
+    """How one kind of thing on the plan is drawn."""
+
+    shape: Callable[..., rr.AsComponents]
+    field: str
+    """Of the shape: where it is."""
+    radius: float
+    """Below 0: in points of the screen, whatever the zoom."""
+    order: float | None = None
+    """A layer of a higher one covers it."""
+
+
+LAYERS: Final = {
+    "trails": Layer(rr.LineStrips2D, "strips", -1.0, 5.0),
+    "views": Layer(rr.LineStrips2D, "strips", -1.0, 10.0),
+    "people": Layer(rr.Points2D, "positions", -9.0, 15.0),
+    "alerts": Layer(rr.LineStrips2D, "strips", -2.5, 20.0),
+    "headings": Layer(rr.Arrows2D, "vectors", -1.5, 25.0),
+    "robots": Layer(rr.Points2D, "positions", -7.0, 30.0),
+    "names": Layer(rr.Points2D, "positions", 0.0, 40.0),
+    "caption": Layer(rr.Points2D, "positions", 0.0),
+}
+"""By entity below `floor`."""
 
 
 class RobotMark(NamedTuple):
@@ -73,6 +88,12 @@ class RobotMark(NamedTuple):
     words: str = ""
     alert: bool = False
 
+    @property
+    def shade(self) -> int:
+        if self.colour is not None:
+            return self.colour
+        return HIDDEN if self.hidden else IN_THE_OPEN
+
 
 class PersonMark(NamedTuple):
     name: str
@@ -83,17 +104,16 @@ class PersonMark(NamedTuple):
 class FloorPlan:
     """One building at a time."""
 
-    def __init__(self, recording: rr.RecordingStream) -> None:
-        self._recording = recording
+    def __init__(self, drawing: Drawing) -> None:
+        self._drawing = drawing
         self.size: tuple[int, int] | None = None
         """Of the plan's picture, in pixels; None before there is one."""
         self._metres = (1.0, 1.0)
-        self._trails: dict[str, deque[tuple[float, float, float]]] = {}
-        """Seconds, x and y in pixels, by robot."""
-        self._drawn: dict[str, object] = {}
-        """What was logged last, by entity."""
+        self._longer = 1.0
+        self._trails: dict[str, deque[tuple[float, Spot]]] = {}
+        """Seconds and place, by robot."""
 
-    def plan(self, width: float, depth: float, png: bytes) -> str:
+    def plan(self, at: float, width: float, depth: float, png: bytes) -> str:
         """Takes the plan of a building of `width` by `depth` metres; returns why not, or an empty text."""
         if not (MIN_METRES <= width <= MAX_METRES and MIN_METRES <= depth <= MAX_METRES):
             return f"it is {width:g} by {depth:g} m; a building has {MIN_METRES:g} to {MAX_METRES:g} m"
@@ -102,184 +122,114 @@ class FloorPlan:
             return "its plan is not a PNG picture"
         if max(size) > MAX_SIDE:
             return f"its plan is {size[0]} by {size[1]} pixels; {MAX_SIDE} a side are shown at most"
-        self.clear()
-        self.size, self._metres = size, (width, depth)
-        # Static: a server that forgets its oldest data for want of memory must keep the plan.
+        self.clear(at)
+        self.size, self._longer = size, float(max(size))
+        self._metres = width, depth
+        # For all times: a server that forgets its oldest data for want of memory must keep the plan.
         image = rr.EncodedImage(contents=png, media_type="image/png", draw_order=-20.0)
-        self._recording.log("floor/plan", image, static=True)
+        self._drawing.log(None, "/floor/plan", image)
         return ""
 
-    def clear(self) -> None:
-        """Nobody is known to be anywhere; the plan stays."""
-        for entity in list(self._drawn):
-            self._erase(entity)
+    def clear(self, at: float) -> None:
+        """From `at` on, it is not known where anybody is; the plan stays."""
+        for layer in LAYERS:
+            self._draw(at, layer, [], [])
         self._trails.clear()
 
     def show(
         self, at: float, robots: Sequence[RobotMark], people: Sequence[PersonMark], caption: str
     ) -> None:
-        """Where all are from now on; nothing before there is a plan. Who is far outside is left out."""
+        """Where all are from `at` on; nothing before there is a plan. Who is far outside is left out."""
         if self.size is None:
             return
-        inside = [robot for robot in robots if self._is_near(robot.x, robot.y)]
-        walking = [person for person in people if self._is_near(person.x, person.y)]
-        self._follow(at, inside)
-        self._robots(inside)
-        self._people(walking)
-        self._names(inside, walking)
-        words = clean_text(caption)
-        middle = [(self.size[0] / 2, 0.0)]
-        self._draw(
-            "floor/caption",
-            words or None,
-            lambda: rr.Points2D(middle, radii=[0.0], colors=[PALE], labels=[words], show_labels=True),
-        )
-
-    def _robots(self, robots: Sequence[RobotMark]) -> None:
-        spots = [self._pixel(robot.x, robot.y) for robot in robots]
-        colours = [_colour(robot) for robot in robots]
-        self._draw(
-            "floor/robots",
-            (spots, colours) if robots else None,
-            lambda: rr.Points2D(spots, radii=[-7.0], colors=rgba(colours), draw_order=30.0),
-        )
+        robots = [robot for robot in robots if self._is_near(robot)]
+        people = [person for person in people if self._is_near(person)]
+        spots = [self._pixel(robot) for robot in robots]
+        walkers = [self._pixel(person) for person in people]
+        shades = [robot.shade for robot in robots]
+        self._draw_trails(at, robots, spots)
+        self._draw(at, "robots", spots, shades)
         vectors = [self._vector(robot.heading, ARROW) for robot in robots]
-        self._draw(
-            "floor/headings",
-            (spots, vectors, colours) if robots else None,
-            lambda: rr.Arrows2D(
-                origins=spots, vectors=vectors, colors=rgba(colours), radii=[-1.5], draw_order=25.0
-            ),
-        )
-        views = [self._view(robot) for robot in robots if robot.camera]
-        self._draw(
-            "floor/views",
-            views or None,
-            lambda: rr.LineStrips2D(views, colors=[faded(CAMERA, 0.8)], radii=[-1.0], draw_order=10.0),
-        )
-        rings = [self._ring(robot.x, robot.y) for robot in robots if robot.alert]
-        self._draw(
-            "floor/alerts",
-            rings or None,
-            lambda: rr.LineStrips2D(rings, colors=[ALERT], radii=[-2.5], draw_order=20.0),
-        )
-
-    def _people(self, people: Sequence[PersonMark]) -> None:
-        spots = [self._pixel(person.x, person.y) for person in people]
-        self._draw(
-            "floor/people",
-            spots or None,
-            lambda: rr.Points2D(spots, radii=[-9.0], colors=[PERSON], draw_order=15.0),
-        )
-
-    def _names(self, robots: Sequence[RobotMark], people: Sequence[PersonMark]) -> None:
-        """Apart from the points: a text must be brighter, and gives way to one that it would cover."""
+        self._draw(at, "headings", vectors, shades, origins=spots)
+        seen = [
+            [spot, *(self._beside(spot, one.heading + turn * VIEW / 8, SIGHT) for turn in range(-4, 5)), spot]
+            for one, spot in zip(robots, spots, strict=True)
+            if one.camera
+        ]
+        self._draw(at, "views", seen, [faded(CAMERA, 0.8)])
+        rings = [
+            [self._beside(spot, math.tau * corner / RING, ARROW) for corner in range(RING + 1)]
+            for one, spot in zip(robots, spots, strict=True)
+            if one.alert
+        ]
+        self._draw(at, "alerts", rings, [ALERT])
+        self._draw(at, "people", walkers, [PERSON])
+        # Names stand apart from the points: a text must be brighter.
         in_full = len(robots) <= MAX_NAMED
-        words = [f"{one.name} · {one.words}" if one.words and in_full else one.name for one in robots]
-        names = [clean_text(word) for word in (*words, *(person.name for person in people))]
-        colours = [bright(colour) for colour in (*map(_colour, robots), *(PERSON for _ in people))]
-        places: Spots = []
-        for place in [*((one.x, one.y) for one in robots), *((one.x, one.y) for one in people)]:
-            x, y = self._pixel(*place)
-            for _ in range(MAX_STACK):
-                if not any(
-                    abs(x - left) < WIDE * self._longer and abs(y - top) < LINE * self._longer
-                    for left, top in places
-                ):
-                    break
-                y += LINE * self._longer
-            places.append((x, round(y, 1)))
-        self._draw(
-            "floor/names",
-            (places, names, colours) if names else None,
-            lambda: rr.Points2D(
-                places, radii=[0.0], colors=rgba(colours), labels=names, show_labels=True, draw_order=40.0
-            ),
-        )
+        names = [f"{one.name} · {one.words}" if one.words and in_full else one.name for one in robots]
+        texts = [clean_text(name) for name in (*names, *(person.name for person in people))]
+        colours = [bright(colour) for colour in (*shades, *(PERSON for _ in people))]
+        places = self._places([*spots, *walkers])
+        self._draw(at, "names", places, colours, labels=texts, show_labels=True)
+        words = clean_text(caption)
+        middle = [(self.size[0] / 2, 0.0)] if words else []
+        self._draw(at, "caption", middle, [PALE], labels=[words], show_labels=True)
 
-    def _follow(self, at: float, robots: Sequence[RobotMark]) -> None:
-        step = MOVED * self._scale
-        for robot in robots:
+    def _draw(self, at: float, layer: str, what: Sequence[Any], colours: list[int], **more: Any) -> None:
+        shape, field, radius, order = LAYERS[layer]
+        fields = {field: what, "colors": colours, "radii": [radius], "draw_order": order}
+        self._drawing.show(at, f"/floor/{layer}", shape, **fields, **more)
+
+    def _places(self, spots: Sequence[Spot]) -> list[Spot]:
+        """Where names stand: each gives way to one that it would cover."""
+        wide, line = WIDE * self._longer, LINE * self._longer
+        places: list[Spot] = []
+        for x, y in spots:
+            for _ in range(MAX_STACK):
+                if not any(abs(x - left) < wide and abs(y - top) < line for left, top in places):
+                    break
+                y += line
+            places.append((x, round(y, 1)))
+        return places
+
+    def _draw_trails(self, at: float, robots: Sequence[RobotMark], spots: Sequence[Spot]) -> None:
+        assert self.size is not None  # noqa: S101
+        step = MOVED * self.size[0] / self._metres[0]
+        for robot, spot in zip(robots, spots, strict=True):
             if robot.name not in self._trails and len(self._trails) >= MAX_TRAILS:
                 continue
             trail = self._trails.setdefault(robot.name, deque(maxlen=round(TRAIL / TRAIL_STEP)))
-            x, y = self._pixel(robot.x, robot.y)
-            if not trail or (at - trail[-1][0] >= TRAIL_STEP and math.dist(trail[-1][1:], (x, y)) >= step):
-                trail.append((at, x, y))
-        colours = {robot.name: _colour(robot) for robot in robots}
-        strips: list[Spots] = []
-        shades: list[int] = []
-        for name in list(self._trails):
-            trail = self._trails[name]
+            if not trail or (at - trail[-1][0] >= TRAIL_STEP and math.dist(trail[-1][1], spot) >= step):
+                trail.append((at, spot))
+        for name, trail in list(self._trails.items()):
             while trail and at - trail[0][0] > TRAIL:
                 trail.popleft()
             if not trail:
                 del self._trails[name]
-            elif len(trail) > 1 and name in colours:
-                strips.append([(x, y) for _, x, y in trail])
-                shades.append(faded(colours[name], 0.55))
-        self._draw(
-            "floor/trails",
-            (strips, shades) if strips else None,
-            lambda: rr.LineStrips2D(strips, colors=rgba(shades), radii=[-1.0], draw_order=5.0),
-        )
-
-    def _draw(self, entity: str, what: object, shape: Callable[[], rr.AsComponents]) -> None:
-        """Logs what differs from what was logged last; None takes it away."""
-        if self._drawn.get(entity) == what:
-            return
-        if what is None:
-            self._erase(entity)
-        else:
-            self._drawn[entity] = what
-            self._recording.log(entity, shape())
-
-    def _erase(self, entity: str) -> None:
-        del self._drawn[entity]
-        self._recording.log(entity, rr.Clear(recursive=False))
+        colours = {robot.name: robot.shade for robot in robots}
+        shown = [name for name, trail in self._trails.items() if len(trail) > 1 and name in colours]
+        strips = [[spot for _, spot in self._trails[name]] for name in shown]
+        self._draw(at, "trails", strips, [faded(colours[name], 0.55) for name in shown])
 
     # From metres to pixels
 
-    @property
-    def _scale(self) -> float:
-        """Pixels of a metre."""
-        assert self.size is not None  # noqa: S101
-        return self.size[0] / self._metres[0]
-
-    @property
-    def _longer(self) -> float:
-        assert self.size is not None  # noqa: S101
-        return float(max(self.size))
-
-    def _is_near(self, x: float, y: float) -> bool:
+    def _is_near(self, one: RobotMark | PersonMark) -> bool:
         width, depth = self._metres
-        return -MARGIN * width <= x <= (1 + MARGIN) * width and -MARGIN * depth <= y <= (1 + MARGIN) * depth
+        return (
+            -MARGIN * width <= one.x <= (1 + MARGIN) * width
+            and -MARGIN * depth <= one.y <= (1 + MARGIN) * depth
+        )
 
-    def _pixel(self, x: float, y: float) -> tuple[float, float]:
+    def _pixel(self, one: RobotMark | PersonMark) -> Spot:
         """The plan's rows begin at the largest y."""
         assert self.size is not None  # noqa: S101
         (width, height), (metres_x, metres_y) = self.size, self._metres
-        return round(x * width / metres_x, 1), round((metres_y - y) * height / metres_y, 1)
+        return round(one.x * width / metres_x, 1), round((metres_y - one.y) * height / metres_y, 1)
 
-    def _vector(self, heading: float, part: float) -> tuple[float, float]:
+    def _vector(self, heading: float, part: float) -> Spot:
         length = part * self._longer
         return round(length * math.cos(heading), 1), round(-length * math.sin(heading), 1)
 
-    def _view(self, robot: RobotMark) -> Spots:
-        x, y = self._pixel(robot.x, robot.y)
-        ends = [self._vector(robot.heading + turn * VIEW / 8, SIGHT) for turn in range(-4, 5)]
-        return [(x, y), *((x + dx, y + dy) for dx, dy in ends), (x, y)]
-
-    def _ring(self, x: float, y: float) -> Spots:
-        left, top = self._pixel(x, y)
-        return [(left + dx, top + dy) for dx, dy in self._circle()]
-
-    def _circle(self) -> Iterator[tuple[float, float]]:
-        for corner in range(RING + 1):
-            yield self._vector(2 * math.pi * corner / RING, ARROW)
-
-
-def _colour(robot: RobotMark) -> int:
-    if robot.colour is not None:
-        return robot.colour
-    return HIDDEN if robot.hidden else IN_THE_OPEN
+    def _beside(self, spot: Spot, heading: float, part: float) -> Spot:
+        dx, dy = self._vector(heading, part)
+        return spot[0] + dx, spot[1] + dy

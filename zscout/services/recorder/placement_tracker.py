@@ -12,7 +12,7 @@ from typing import Final
 from zscout.keyexpr import NAME
 from zscout.mesh import Declaration, Mesh, Supervisor
 from zscout.messages import MAX_PLACED, ListPlacements, Placement, Placements, absurd
-from zscout.services.recorder.host_pane import Running
+from zscout.services.recorder.hosts import Running
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import NO_TERM, Term
 
@@ -113,16 +113,16 @@ class PlacementTracker:
             if not news:
                 timeline.event(at, f"{name} ({now.spec.kind}) runs on {now.host} already")
             elif not known.ran or known.where is None:
-                timeline.mark(at, now.host, "placed", name)
+                timeline.hosts.mark(at, now.host, "placed", name)
                 timeline.event(at, f"{name} ({now.spec.kind}) is placed on {now.host}{why}")
             elif before is not None and now.moves > before.moves:
                 dead = "" if now.dead is None else f", dead {_duration(now.dead)}"
-                timeline.mark(at, known.where, "left", name)
-                timeline.mark(at, now.host, "came", name)
+                timeline.hosts.mark(at, known.where, "left", name)
+                timeline.hosts.mark(at, now.host, "came", name)
                 timeline.event(at, f"{name} moved {known.where} -> {now.host}{dead}")
             else:
                 was = "" if now.host == known.where else f", it was on {known.where}"
-                timeline.mark(at, now.host, "restarted", name)
+                timeline.hosts.mark(at, now.host, "restarted", name)
                 timeline.event(at, f"{name} is restarted on {now.host}{was}{why}", "WARN")
             return
         if before is not None and (before.state, before.reason) == (now.state, now.reason):
@@ -142,7 +142,7 @@ class PlacementTracker:
             case "given_up":
                 host = known.where or now.host
                 if host is not None and news:
-                    timeline.mark(at, host, "given_up", name)
+                    timeline.hosts.mark(at, host, "given_up", name)
                 timeline.event(at, f"{name} is given up{why}", "ERROR")
             case _:
                 pass
@@ -161,7 +161,7 @@ class PlacementTracker:
 
     def _show(self, at: float, hosts: set[str]) -> None:
         for host in sorted(hosts):
-            self.timeline.runs(at, host, list(self._hosts[host].values()))
+            self.timeline.hosts.runs(at, host, list(self._hosts[host].values()))
 
     def _cordon(self, at: float, news: Placements) -> None:
         cordoned, before = frozenset(news.cordoned), self._cordoned or frozenset()

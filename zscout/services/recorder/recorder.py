@@ -18,7 +18,7 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Role, Token, new_instance
 from zscout.mesh import Declaration, Mesh, Supervisor
 from zscout.messages import Grants, LoadReport, Notice, RcmState, RcState, StateAsk
-from zscout.services.recorder.host_pane import Use
+from zscout.services.recorder.hosts import Use
 from zscout.services.recorder.placement_tracker import PlacementFollower
 from zscout.services.recorder.request_tracker import RequestTracker
 from zscout.services.recorder.robot_follower import RobotFollower
@@ -131,8 +131,8 @@ class Recorder:
         host = self.mesh.keys.host_of(key)
         if host == report.host:
             at = self._now()
-            self.timeline.load(at, host, report.load_average[0], report.cpu / 100)
-            self.timeline.uses(
+            self.timeline.hosts.load(at, host, report.load_average[0], report.cpu / 100)
+            self.timeline.hosts.uses(
                 at, host, [Use(one.component, one.cpu, one.memory) for one in report.components]
             )
 

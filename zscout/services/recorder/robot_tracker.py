@@ -21,8 +21,8 @@ from zscout.messages import (
     RcState,
 )
 from zscout.services.recorder.colours import DOING, OPERATOR, PALE
+from zscout.services.recorder.drawing import clean_text
 from zscout.services.recorder.floor_plan import PersonMark, RobotMark
-from zscout.services.recorder.lanes import clean_text
 from zscout.services.recorder.rate_limit import RateLimiter
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import Grant
@@ -135,7 +135,7 @@ class RobotTracker:
         building = self._building
         if building is not None and building.planned and at - building.seen_at > SILENCE:
             building.planned = False
-            self.panes.nobody(at)
+            self.panes.floor.clear(at)
             self.timeline.event(
                 at, f"building {building.name} is silent: who is where is not known any more", "WARN"
             )
@@ -267,7 +267,7 @@ class RobotTracker:
         if building.planned:
             robots = [self._robot(placed) for placed in poses.robots]
             people = [PersonMark(clean_text(one.name, MAX_NAMED), one.x, one.y) for one in poses.people]
-            self.panes.poses(at, robots, people, _caption_of(building.name, poses))
+            self.panes.floor.show(at, robots, people, _caption_of(building.name, poses))
 
     def wants_plan(self, at: float) -> Sender | None:
         """Whom to ask for a building's plan now, if anybody."""

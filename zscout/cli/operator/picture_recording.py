@@ -1,0 +1,119 @@
+"""What `zscout drive` and `zscout watch` see of a camera, as a Rerun recording of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Self
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from zscout.behaviors.perception.motion import Box
+from zscout.keyexpr import new_instance
+from zscout.services.recorder.blueprint import APPLICATION, page
+from zscout.services.recorder.colours import OPERATOR, OTHER
+from zscout.services.recorder.drawing import Drawing, clean_text
+from zscout.services.recorder.timeline import TimelineError
+
+MEMORY: Final = "100MB"
+"""What is kept for a viewer that opens late."""
+DISCONNECT_SECONDS: Final = 3.0
+WIDTH: Final = 640
+"""Columns of a picture of a watch; larger ones are reduced."""
+QUALITY: Final = 75
+MAX_BYTES: Final = 2 << 30
+"""Of pictures of one watch; then only boxes and events are written."""
+
+
+class PictureRecording(Drawing):
+    """Pictures above events, in a file or served on loopback, or both. A context manager.
+
+    `at` is seconds since whatever zero the caller chose."""
+
+    def __init__(
+        self,
+        command: str,
+        title: str,
+        *,
+        port: int | None = None,
+        file: Path | None = None,
+        between: Sequence[rrb.View] = (),
+        shares: Sequence[int] = (5, 1),
+    ) -> None:
+        """`port` must be free. Raises TimelineError where `file` can't be written."""
+        super().__init__(rr.RecordingStream(APPLICATION, recording_id=f"{command}-{new_instance()}"))
+        self.url = f"rerun+http://127.0.0.1:{port}/proxy" if port is not None else ""
+        """Where a viewer finds it, if it is served."""
+        layout = page(
+            rrb.Vertical(
+                rrb.Spatial2DView(origin="/picture", name=clean_text(title)),
+                *between,
+                rrb.TextLogView(origin="/events", name="Events"),
+                row_shares=list(shares),
+            ),
+            play_state="following" if self.url else None,
+        )
+        sinks: list[rr.GrpcServerSink | rr.FileSink] = []
+        if port is not None:
+            sinks.append(rr.GrpcServerSink(bind_ip="127.0.0.1", port=port, server_memory_limit=MEMORY))
+        try:
+            if file is not None:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                sinks.append(rr.FileSink(file))
+            self.recording.set_sinks(*sinks, default_blueprint=layout)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise TimelineError(
+                f"can't record to {file} ({error}); name a file that can be written"
+            ) from error
+
+    def words(self, at: float, text: str) -> None:
+        self.log(at, "events", rr.TextLog(clean_text(text)))
+
+    def picture(self, at: float, jpeg: bytes) -> None:
+        self.log(at, "picture", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self.url:
+            self.recording.disconnect()
+            return
+        # A viewer that hangs can hold this up: then it is left to a thread that dies with the process.
+        thread = threading.Thread(target=self.recording.disconnect, daemon=True)
+        thread.start()
+        thread.join(DISCONNECT_SECONDS)
+
+
+class WatchRecording(PictureRecording):
+    """Pictures with boxes where something moves, in a file."""
+
+    def __init__(self, title: str, file: Path) -> None:
+        share = rrb.TimeSeriesView(origin="/moving", name="Share of the picture that moves, %")
+        super().__init__("watch", title, file=file, between=[share], shares=[6, 1, 1])
+        self._bytes = 0
+
+    def seen(self, at: float, picture: NDArray[np.uint8], boxes: Sequence[Box], *, moving: bool) -> None:
+        """A picture with boxes in its pixels: `moving`, or else not sure yet."""
+        height, width = picture.shape[:2]
+        scale = min(1.0, WIDTH / width)
+        if self._bytes < MAX_BYTES:
+            if scale < 1:
+                size = (WIDTH, max(1, round(height * scale)))
+                picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+            jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+            self._bytes += len(jpeg)
+            self.picture(at, jpeg)
+        shapes = rr.Boxes2D(
+            array=[[side * scale for side in box] for box in boxes] or np.zeros((0, 4)),
+            array_format=rr.Box2DFormat.XYWH,
+            colors=np.full(len(boxes), OPERATOR if moving else OTHER, np.uint32),
+        )
+        self.log(at, "picture/moving", shapes)
+        share = sum(box.width * box.height for box in boxes) / (height * width) if moving else 0.0
+        self.log(at, "moving", rr.Scalars(100 * share))

@@ -1,0 +1,192 @@
+"""What a recording is drawn with: lanes of bars, curves, shapes that stay until they change, and events.
+
+Names and texts come from the mesh: their number and length are bounded here, and what the viewer can't show
+is replaced.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sized
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+
+from zscout.services.recorder.blueprint import TIME
+from zscout.services.recorder.colours import OTHER
+
+MAX_SECONDS: Final = 9e9
+"""Rerun counts nanoseconds in 64 bits."""
+MAX_SLOTS: Final = 8
+"""Rows of one lane that shows several things; more of them are summed up in the last row."""
+MAX_STATE: Final = 120
+MAX_EVENT: Final = 500
+"""Characters."""
+LEVELS: Final = frozenset({"CRITICAL", "ERROR", "WARN", "INFO", "DEBUG", "TRACE"})
+# Latin, Greek and Cyrillic letters, dashes, quotation marks, arrows. The viewer's font lacks others, and the
+# viewer ends where it is to draw what its font lacks.
+_UNKNOWN: Final = re.compile(
+    "[^ -~\u00a1-\u0148\u014a-\u017f\u0391-\u03c9\u0400-\u045f"
+    "\u2013\u2014\u2018\u2019\u201c\u201d\u2026\u20ac\u2190\u2192]"
+)
+
+
+class Drawing:
+    """One recording on one timeline. `at` is seconds, of a size below `MAX_SECONDS`; any other number is a
+    ValueError. After `closed` nothing is written."""
+
+    def __init__(self, recording: rr.RecordingStream) -> None:
+        self.recording = recording
+        self.closed = False
+        self.begin, self.end = math.inf, -math.inf
+        self._shown: dict[str, object] = {}
+        """What was logged last, by entity."""
+        self._noted: set[str] = set()
+
+    def log(self, at: float | None, entity: str, *what: rr.AsComponents) -> None:
+        """Logs at a time, or for all times if that is None."""
+        if self.closed:
+            return
+        if at is not None:
+            if not abs(at) < MAX_SECONDS:
+                raise ValueError(f"timeline: {at} is no time in seconds; give a number below {MAX_SECONDS:g}")
+            self.begin, self.end = min(self.begin, at), max(self.end, at)
+            # Rerun keeps it for each thread.
+            self.recording.set_time(TIME, duration=at)
+        self.recording.log(entity, *what, static=at is None)
+
+    def show(self, at: float, entity: str, shape: Callable[..., rr.AsComponents], **fields: Any) -> None:
+        """From `at` on, the entity shows this shape; nothing if its first field is empty."""
+        if not next(iter(fields.values())):
+            if entity in self._shown:
+                self.erase(at, entity)
+        elif self._shown.get(entity) != fields:
+            self._shown[entity] = fields
+            if "colors" in fields:
+                # Of a list of three or four, Rerun could not tell whether they are one.
+                fields = fields | {"colors": np.array(fields["colors"], np.uint32)}
+            self.log(at, entity, shape(**fields))
+
+    def erase(self, at: float, entity: str) -> None:
+        """What the entity shows ends, and so does a curve: no line goes on to its next point."""
+        self._shown.pop(entity, None)
+        self.log(at, entity, rr.Clear(recursive=False))
+
+    def curve(self, entity: str, name: str, colour: int, width: float, **more: Any) -> None:
+        """How the points of this entity are joined."""
+        self.log(
+            None, entity, rr.SeriesLines(names=[clean_text(name)], colors=[colour], widths=[width], **more)
+        )
+
+    def event(self, at: float, text: str, level: str = "INFO") -> None:
+        """One line in words; `level` as in logging, WARN for what people should look at."""
+        known = level if level in LEVELS else "INFO"
+        self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=known))
+
+    def note(self, at: float, text: str) -> None:
+        """Reports, once, that something is left out."""
+        if text not in self._noted:
+            self._noted.add(text)
+            self.event(at, f"timeline: {text}", "WARN")
+
+    def room(self, at: float, known: Sized, limit: int, others: str) -> bool:
+        """Whether there may be one more; if not, that is noted: more than so many of what, and what of the
+        others."""
+        if len(known) < limit:
+            return True
+        self.note(at, f"more than {limit} {others}")
+        return False
+
+    def arrange(self) -> None:
+        """There may be something new to lay out."""
+
+
+@dataclass(slots=True)
+class _Lane:
+    colours: dict[str, int] = field(default_factory=dict)
+    """By text, the one longest unused first."""
+    slots: list[str] = field(default_factory=list)
+    """What each row shows, "" where it is free."""
+    rows: int = 1
+
+
+class Lanes:
+    """The lanes in one folder, at most `limit`; `others` says of what, and what of the others.
+
+    `colours`: distinct texts of one lane that keep their colour; past it, the one longest unused loses it.
+    `depth`: parts of a name, with `/` between, that have parts of the entity of their own."""
+
+    def __init__(
+        self, drawing: Drawing, folder: str, limit: int, others: str, *, colours: int = 256, depth: int = 4
+    ) -> None:
+        self._drawing, self._folder, self._limit, self._others = drawing, folder, limit, others
+        self._colours, self._depth = colours, depth
+        self._lanes: dict[str, _Lane] = {}
+        """By entity: names that differ may be cleaned to the same."""
+
+    @property
+    def rows(self) -> int:
+        return sum(lane.rows for lane in self._lanes.values())
+
+    def texts(self, name: str) -> Mapping[str, int] | None:
+        """The texts that have a colour in the lane of this name; None if there is no such lane."""
+        lane = self._lanes.get(clean_path(self._folder, name, self._depth))
+        return None if lane is None else lane.colours
+
+    def show(self, at: float, name: str, shown: Mapping[str, tuple[str, int]]) -> None:
+        """From `at` on, the lane of this name shows exactly these: text and RGBA by what they are about. Each
+        gets a row."""
+        entity = clean_path(self._folder, name, self._depth)
+        lane = self._lanes.get(entity)
+        if lane is None:
+            if not self._drawing.room(at, self._lanes, self._limit, self._others):
+                return
+            lane = self._lanes[entity] = _Lane()
+        rows = [shown.get(row, (row, OTHER)) for row in _seat(lane, (name for name in shown if name))]
+        news = [self._learn(lane, text, colour) for text, colour in rows if text]
+        if any(news):
+            colours = np.array(list(lane.colours.values()), np.uint32)
+            self._drawing.log(None, entity, rr.StateConfiguration(values=list(lane.colours), colors=colours))
+        lane.rows = len(rows)
+        self._drawing.show(at, entity, rr.StateChange, state=[text for text, _ in rows])
+
+    def _learn(self, lane: _Lane, text: str, colour: int) -> bool:
+        """Whether the colour is new to the viewer."""
+        known = lane.colours.pop(text, None)
+        lane.colours[text] = colour
+        if len(lane.colours) > self._colours:
+            del lane.colours[next(iter(lane.colours))]
+        return known != colour
+
+
+def _seat(lane: _Lane, names: Iterable[str]) -> list[str]:
+    """Names by row. What stays keeps its row, so that no bar jumps; no row is taken away."""
+    wanted = dict.fromkeys(names)
+    crowded = len(wanted) > MAX_SLOTS
+    rows = MAX_SLOTS - 1 if crowded else MAX_SLOTS
+    slots = [name if name in wanted and row < rows else "" for row, name in enumerate(lane.slots)]
+    for name in (name for name in wanted if name not in slots):
+        if "" in slots[:rows]:
+            slots[slots.index("")] = name
+        elif len(slots) < rows:
+            slots.append(name)
+    lane.slots = slots
+    if not crowded:
+        return slots or [""]
+    return [*slots[:rows], f"{len(wanted) - rows} more"]
+
+
+def clean_path(folder: str, name: str, depth: int = 4) -> str:
+    """The entity of something with this name, which may have up to `depth` parts with `/` between."""
+    parts = (re.sub(r"[^A-Za-z0-9_.-]", "_", part)[:64] for part in name.split("/")[:depth])
+    return f"/{folder}/{'/'.join(part or '_' for part in parts)}"
+
+
+def clean_text(text: str, limit: int = MAX_STATE) -> str:
+    """One line of at most `limit` characters, of letters that the viewer has: one that it lacks ends it."""
+    line = " ".join(text[: 2 * limit].split())
+    line = _UNKNOWN.sub("?", "".join(filter(str.isprintable, line)))
+    return line if len(line) <= limit else line[: limit - 1] + "…"
