@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import signal
+from decimal import Decimal
 from pathlib import Path
 
 import psutil
@@ -30,12 +31,14 @@ from zscout.messages import (
     ListComponents,
     LoadReport,
     MoveComponent,
+    OpenRequest,
     Output,
     ReadOutput,
     RestoreComponent,
     StartComponent,
     StopComponent,
 )
+from zscout.types import Grant, Term
 
 COUNTER = ComponentSpec("counter", {"period": 0.02}, restart="never")
 
@@ -295,6 +298,27 @@ def test_who_sees_a_higher_incarnation_ends_itself(tmp_path: Path) -> None:
                 "deaf": ("superseded", "incarnation 9 runs on b"),
                 "d": (None, ""),
             }
+
+    asyncio.run(story())
+
+
+def test_one_that_does_not_reach_a_device_takes_over_no_hold_of_it(tmp_path: Path) -> None:
+    """It would have to give back at once what it was handed over, to whoever waits for it."""
+
+    async def story() -> None:
+        async with ComponentLab(tmp_path) as lab:
+            lab.node("a", "robot/x")
+            client = await lab.client()
+            hosts = Hosts(client)
+            await hosts.start("a", "c", "counter", {"period": 0.02, "rc": "robot/x"}, standby=True)
+
+            def held(rc: str) -> RestoreComponent:
+                request = OpenRequest("r1", "c", {rc: {}}, 0, Decimal(60), grant=Grant(Term(1, "x"), 1))
+                return RestoreComponent("c", 1, b'{"count": 41}', [request])
+
+            assert await hosts.refused("a", held("robot/elsewhere")) == "start_failed"
+            view = await hosts.get("a", held("robot/x"), ComponentView)
+            assert view.phase == "standby"
 
     asyncio.run(story())
 

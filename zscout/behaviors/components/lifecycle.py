@@ -25,7 +25,7 @@ from zscout.behaviors.components.component import (
 )
 from zscout.behaviors.components.migration import NotMoved, OutgoingMove, state_of
 from zscout.behaviors.components.processes import limit_allocations
-from zscout.keyexpr import BadName, Role, Token, incarnation_of, new_instance
+from zscout.keyexpr import BadName, Role, Token, incarnation_of, matcher, new_instance
 from zscout.mesh import Declaration, MeshError
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import MAX_ERROR
@@ -34,6 +34,8 @@ STAND_BY: Final = 30.0
 """Seconds that one stands by without being restored or activated, and then again until it is activated."""
 LINKED: Final = 1.0
 """Seconds in which one that stands by may find the RCM: without a link to it, it can't be handed anything."""
+REACHED: Final = 3.0
+"""Seconds in which it may find the RCs that it is to hold: without a link to them it would lose the holds."""
 CLOSE: Final = 4.0
 """Seconds for giving back what it holds."""
 SUPERSEDED: Final = 0.5
@@ -138,7 +140,7 @@ class ComponentLifecycle:
         watch = client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)
         try:
             if job.standby:
-                await self._linked(client)
+                await _finds(client, Role.RCM, [lambda _: True], LINKED)
                 await self._tell(PhaseReport("standby", movable))
                 if not await self._called(client):
                     return EndReport(
@@ -166,15 +168,6 @@ class ComponentLifecycle:
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
             raise _Unusable(f"it can't be made: {_words(error)}") from None
-
-    async def _linked(self, client: Client) -> None:
-        """Where no RCM leads now, there may be one when it matters."""
-        found = asyncio.Event()
-        watch = client.mesh.watch(client.mesh.keys.alive_any(Role.RCM), lambda _, alive: found.set())
-        try:
-            await _first(LINKED, found)
-        finally:
-            watch.close()
 
     async def _called(self, client: Client) -> bool:
         """Waits until it is to run: it was activated, or handed an ARC."""
@@ -264,6 +257,10 @@ class ComponentLifecycle:
 
     async def _take_in(self, order: channel.RestoreOrder) -> None:
         component, client = self._movable(standby=True)
+        held = [need for request in order.requests if request.grant is not None for need in request.needs]
+        if not await _finds(client, Role.RC, [matcher(need) for need in held], REACHED):
+            words = f"{self._job.host} does not reach {', '.join(held)}, or not all of them"
+            raise NotMoved("start_failed", words)
         try:
             component.restore(order.state)
         except Exception as error:  # noqa: BLE001 - the author's code
@@ -295,6 +292,22 @@ class ComponentLifecycle:
         self._away = self._away or ends
         self.end(ends)
         asyncio.get_running_loop().call_later(SUPERSEDED, self._left.set)
+
+
+async def _finds(client: Client, role: str, names: list[Callable[[str], bool]], timeout: float) -> bool:
+    """Waits until for each of `names` a token of this role is seen, at most `timeout` seconds."""
+    missing, found = list(names), asyncio.Event()
+
+    def on_token(token: Token, alive: bool) -> None:
+        missing[:] = [name for name in missing if not (alive and name(token.name))]
+        if not missing:
+            found.set()
+
+    watch = client.mesh.watch(client.mesh.keys.alive_any(role), on_token)
+    try:
+        return not missing or await _first(timeout, found)
+    finally:
+        watch.close()
 
 
 async def _first(timeout: float, *events: asyncio.Event) -> bool:
