@@ -47,6 +47,8 @@ class Lab:
         self.fleet_file = folder / "fleet.toml"
         names = ", ".join(f'"{name}"' for name in candidates)
         port = random.randint(20_000, 60_000)  # noqa: S311
+        if "[placement]" not in extra:
+            extra += f"\n[placement]\nstart_timeout = {HANG}"
         self.fleet_file.write_text(
             f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\nstrategy = "{strategy}"\n'
             f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\n'

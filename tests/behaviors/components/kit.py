@@ -55,7 +55,7 @@ class ComponentLab(Lab):
     """Nodes that can start the odd kinds."""
 
     def __init__(
-        self, folder: Path, *, start_timeout: float = 15, candidates: Sequence[str] = (), rules: str = ""
+        self, folder: Path, *, start_timeout: float = HANG, candidates: Sequence[str] = (), rules: str = ""
     ) -> None:
         extra = f"[placement]\nstart_timeout = {start_timeout}\n{rules}"
         super().__init__(folder, candidates=candidates, extra=extra)

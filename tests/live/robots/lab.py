@@ -32,7 +32,7 @@ P = TypeVar("P", bound=Packet)
 
 RULES = """
 [placement]
-start_timeout = 20
+start_timeout = 120
 [timing]
 hold_lease = 2.0
 """
