@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from tests.thorough import times
 from zscout.drivers.airtime import (
     MAX_RATE,
-    URGENT,
     Bucket,
     Share,
     line_rate,
@@ -30,6 +29,7 @@ from zscout.drivers.airtime import (
 from zscout.drivers.commands import RadioCamera, RadioDrive
 from zscout.drivers.packets import (
     MAX_PACKET,
+    OVERHEAD,
     CameraPacket,
     DrivePacket,
     HaltPacket,
@@ -221,8 +221,8 @@ def test_no_packet_waits_longer_than_the_bound_however_holders_time_it(
     at = Fraction(0)
     while at < seconds * SECOND:
         for robot in range(len(wanted)):
-            if halts.ready(URGENT) <= at:
-                halts.take(URGENT, int(at))
+            if halts.ready(OVERHEAD) <= at:
+                halts.take(OVERHEAD, int(at))
                 kind: type[StopPacket] | type[HaltPacket] = StopPacket if rng.random() < 0.5 else HaltPacket
                 actions.append((int(at), partial(queue.send_urgent, robot + 200, kind, int(at))))
         at += SECOND if greedy else rng.randrange(SECOND)
@@ -334,7 +334,7 @@ def test_what_is_said_again_keeps_to_the_reserve() -> None:
     assert Counter(out.packet.robot for out in told.outgoing) == dict.fromkeys(range(20), 3)
     # And then at a tenth of the line, what went out at once paid back first.
     reserve = line_rate(9600) / 10
-    assert told.written[-1] / SECOND >= (len(told.outgoing) * URGENT - urgent_burst(0)) / reserve
+    assert told.written[-1] / SECOND >= (len(told.outgoing) * OVERHEAD - urgent_burst(0)) / reserve
 
 
 def test_the_first_packet_ever_is_said_again_under_a_new_number() -> None:

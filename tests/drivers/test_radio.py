@@ -14,6 +14,7 @@ from tests.hang import HANG
 from tests.live.bench import answer, comes_to, until
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import CommandRefused
+from zscout.drivers.generic import VideoDriver
 from zscout.drivers.packets import (
     CameraPacket,
     DrivePacket,
@@ -21,7 +22,6 @@ from zscout.drivers.packets import (
     StopPacket,
 )
 from zscout.drivers.radio import RadioDriver
-from zscout.drivers.video import VideoDriver
 from zscout.types import SECOND
 
 pytestmark = pytest.mark.live

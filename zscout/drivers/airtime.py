@@ -41,8 +41,6 @@ RESERVE: Final = Fraction(1, 10)
 """Share of the line that is kept for halts, stops and what is sent again."""
 MAX_RATE: Final = Fraction(5_000)
 """Bytes a second that are counted on at most: a faster line is not what holds commands up."""
-URGENT: Final = OVERHEAD
-"""Bytes of a halt or a stop."""
 
 
 def line_rate(baud: int) -> Fraction:
@@ -75,12 +73,12 @@ def share_of(params: Mapping[str, Decimal]) -> Share:
 
 
 def urgent_burst(holders: int) -> int:
-    """`U`: bytes of halts, stops and repeats that may come at once."""
-    return max(URGENT * holders, MAX_PACKET)
+    """`U`: bytes of halts, stops and repeats that may come at once. A halt or a stop is all overhead."""
+    return max(OVERHEAD * holders, MAX_PACKET)
 
 
 def longest_wait(rate: Fraction, shares: Iterable[Share]) -> Fraction:
-    """Seconds from when a packet enters the queue until it is through the line, at most. See above."""
+    """Seconds from when a packet enters the queue until it is through the line, at most: the bound above."""
     sizes = [share.size for share in shares]
     return (MAX_PACKET + sum(sizes) + urgent_burst(len(sizes))) / (rate * (1 - RESERVE))
 
@@ -103,12 +101,11 @@ def objection(rate: Fraction, bound: Fraction, shares: Iterable[Share]) -> str:
 
 
 class Bucket:
-    """A token bucket in bytes. Times are whole ns going in, exact ns coming out."""
+    """A token bucket in bytes, of a positive rate. Times are whole ns going in, exact ns coming out."""
 
     __slots__ = ("_full_at", "_ns_per_byte", "size")
 
     def __init__(self, size: Fraction, bytes_per_second: Fraction, now: Ns, *, full: bool = True) -> None:
-        """`bytes_per_second` must be positive."""
         self.size = size
         self._ns_per_byte = SECOND / bytes_per_second
         self._full_at = now + (0 if full else size * self._ns_per_byte)
@@ -122,7 +119,6 @@ class Bucket:
         self._full_at = max(self._full_at, at) + needed * self._ns_per_byte
 
     def fill(self, now: Ns) -> None:
-        """Makes it full."""
         self._full_at = min(self._full_at, now)
 
 

@@ -72,12 +72,11 @@ class RobotCamera(DeviceCommand, frozen=True, tag="camera"):
 
 RadioCommand: TypeAlias = RadioDrive | RadioCamera | RadioStop | RadioHalt
 RobotCommand: TypeAlias = RobotDrive | RobotStop | RobotCamera
-_NAMES: Final = ("drive", "camera", "stop", "halt")
 
 
 def radio_command(do: Mapping[str, Any]) -> RadioCommand:
     """The command of a radio. Raises Refused."""
-    order: RadioCommand = _read(do, RadioCommand, _NAMES)
+    order: RadioCommand = _read(do, RadioCommand, ("drive", "camera", "stop", "halt"))
     if isinstance(order, RadioStop | RadioHalt) and order.rc is not None:
         try:
             check_rc(order.rc)
@@ -88,7 +87,7 @@ def radio_command(do: Mapping[str, Any]) -> RadioCommand:
 
 def robot_command(do: Mapping[str, Any]) -> RobotCommand:
     """The command of a robot. Raises Refused."""
-    order: RobotCommand = _read(do, RobotCommand, _NAMES[:3])
+    order: RobotCommand = _read(do, RobotCommand, ("drive", "camera", "stop"))
     return order
 
 

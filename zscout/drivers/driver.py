@@ -27,8 +27,8 @@ class RcHandle(Protocol):
 
     @property
     def supervisor(self) -> Supervisor:
-        """Of tasks, timers and handlers of the driver: it is closed before `safe` and `close` are called at
-        the end. What fails there fails the RC."""
+        """Of tasks, timers and handlers of the driver: at the end it is closed before `safe` and `close` are
+        called. What fails there fails the RC."""
 
     @property
     def health(self) -> str:
@@ -53,13 +53,13 @@ class Driver:
     sharable = False
     relays = False
     """Whether, besides a holder's client, the nodes of other RCs of its gang may command under the grant: a
-    robot speaks through its radio."""
+    robot's does so at its radio."""
     activation: float = 0.0
     """Seconds after a grant until the device has its full use, like a camera that warms up."""
 
     async def open(self, rc: RcHandle) -> None:
-        """The RC is about to be offered: the time to take what is needed of `rc.mesh`. A device that is not
-        there is no error: call `rc.fail`, go on trying, and `rc.recover`."""
+        """The RC is about to be offered. A device that is not there is no error: call `rc.fail`, go on
+        trying, and `rc.recover`."""
 
     async def close(self) -> None:
         """The RC has left the mesh, and `safe` has been called."""
@@ -69,7 +69,7 @@ class Driver:
 
     async def end(self, holder: Holder) -> None:
         """Somebody ceases to hold the device; `safe` follows if nobody else does. Not called for a hold
-        that was handed over: it goes on."""
+        that was handed over."""
 
     async def safe(self) -> None:
         """Nobody holds the device any more: motors stopped, transmitter off. Must not raise."""
@@ -81,7 +81,7 @@ class Driver:
         raise Refused("unknown_command", f"this device does not know {str(do.get('name'))[:64]!r}")
 
     async def command_without_grant(self, sender: Sender, do: Mapping[str, Any]) -> Any:
-        """Carries out what needs no hold. Raises Refused, as for anything of the sort by default."""
+        """Carries out what needs no hold. Raises Refused, by default always."""
         raise Refused("no_grant", "this RC does nothing without a grant; ask the RCM for it")
 
     def vote(self, holders: list[ProposedHolder]) -> str:
@@ -89,7 +89,7 @@ class Driver:
         return ""
 
     def capacity(self) -> Amounts:
-        """Bounds that people may like to see, by bandwidth parameter."""
+        """Bounds to show to people, by bandwidth parameter."""
         return {}
 
     def figures(self) -> Figures:

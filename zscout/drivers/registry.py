@@ -12,14 +12,12 @@ from zscout.config.devices import (
     VideoRc,
 )
 from zscout.drivers.driver import Driver
-from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
-from zscout.drivers.video import VideoDriver
+from zscout.drivers.generic import CapacityDriver, ExclusiveDriver, VideoDriver
 from zscout.messages import exact_amounts
 from zscout.types import SECOND
 
 
 def driver_for(rc: RcConfig) -> Driver:
-    """The driver of an RC of a node file."""
     # What a device needs is loaded where there is one: pyserial, OpenCV.
     match rc:
         case RadioRc():
