@@ -8,8 +8,7 @@ from typing import Any, cast
 import pytest
 
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.sensor_net.blindness import BAD_FOR, Blindness
-from zscout.behaviors.sensor_net.scout import QUIET, Alerts
+from zscout.behaviors.sensor_net.scout import BAD_FOR, QUIET, Alerts, Blindness
 from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, BehaviorContext, BehaviorStatus
 
 

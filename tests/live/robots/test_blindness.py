@@ -13,10 +13,9 @@ from tests.live.bench import comes_to
 from tests.live.robots.lab import RobotLab, comes_true
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.perception.lens import COLUMNS, ROWS
-from zscout.behaviors.sensor_net.blindness import SILENT
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot
-from zscout.behaviors.sensor_net.scout import PATIENCE, Scout
+from zscout.behaviors.sensor_net.scout import PATIENCE, SILENT, Scout
 from zscout.behaviors.tree import BehaviorStatus
 from zscout.drivers.packets import DrivePacket
 from zscout.mesh import clock

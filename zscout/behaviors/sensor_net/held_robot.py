@@ -41,7 +41,6 @@ class HeldRobot:
     def __init__(self, held: Held, needs: RobotNeeds, *, video: str | None = None) -> None:
         self.held = held
         self.robot = held.rc(needs.robot)
-        self.radio = held.rc(needs.radio)
         self.video = held.rc(video or needs.video)
         self.framegrabber = held.rc(needs.framegrabber)
         self._period: Ns = round(SECOND / needs.command_rate)
@@ -49,7 +48,7 @@ class HeldRobot:
         self._still = False
         """Whether the last that was sent is a stop."""
         self._transmits: bool | None = None
-        """As it was last commanded; None: it was not yet, or may not have received it."""
+        """As it was last commanded; None: not yet, or it may not have received it."""
         self.sent = self.refused = 0
 
     async def camera(self, on: bool, *, remind: bool = False) -> bool:

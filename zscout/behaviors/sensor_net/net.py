@@ -1,10 +1,5 @@
 """Which robots of a sensor net are active, and which replaces one that is lost. Pure; time is passed in.
 
-    events   report(robot, doing)     the status of the robot's own behavior
-             there(robots)            which robots are on the mesh
-             failed(robot, why)       its behavior could not be started, or was given up
-    effects  StartRobot, StopRobot
-
 `wanted` robots are to be placed. They are started in the order in which they were named; one that is lost
 (its camera shows nothing, it is gone from the mesh for PATIENCE, or its behavior can't be had) is replaced by
 the next that is free. One that comes back is free again; whoever has replaced it stays.
@@ -94,13 +89,9 @@ class SensorNet:
             return []
         member.doing = doing
         member.alerts += alert
-        if doing in HIDDEN:
-            member.hidden = True
-        elif doing not in PAUSED:
-            member.hidden = False
-        if doing == "lost":
-            return self._lose(now, member, "its camera shows nothing")
-        return []
+        if doing not in PAUSED:
+            member.hidden = doing in HIDDEN
+        return self._lose(now, member, "its camera shows nothing") if doing == "lost" else []
 
     def failed(self, now: float, robot: str, why: str) -> list[Effect]:
         """The robot's behavior can't be had."""
@@ -117,10 +108,9 @@ class SensorNet:
                 member.away_since = None
                 if member.standing == "lost" and member.why == GONE:
                     member.standing, member.why = "free", ""
-                continue
-            if member.away_since is None:
+            elif member.away_since is None:
                 member.away_since = now
-            if member.standing == "active" and now - member.away_since >= PATIENCE:
+            elif member.standing == "active" and now - member.away_since >= PATIENCE:
                 effects += self._lose(now, member, GONE)
         return effects + self._fill(now)
 
@@ -131,10 +121,7 @@ class SensorNet:
 
     def _fill(self, now: float) -> list[Effect]:
         effects: list[Effect] = []
-        while len(self._active) < self.wanted:
-            member = self._next(now)
-            if member is None:
-                break
+        while len(self._active) < self.wanted and (member := self._next(now)) is not None:
             member.standing, member.why, member.doing = "active", "", ""
             effects.append(StartRobot(member.robot))
         return effects
@@ -142,11 +129,9 @@ class SensorNet:
     def _next(self, now: float) -> Member | None:
         """Who begins next: of those on the mesh the first that is free, else the one lost for longest."""
         here = [member for member in self.members.values() if member.there]
-        free = next((member for member in here if member.standing == "free"), None)
-        if free is not None:
-            return free
-        stale = [m for m in here if m.standing == "lost" and now - m.lost_at >= RETRY]
-        return min(stale, key=lambda member: member.lost_at, default=None)
+        free = [member for member in here if member.standing == "free"]
+        lost = [member for member in here if member.standing == "lost" and now - member.lost_at >= RETRY]
+        return free[0] if free else min(lost, key=lambda member: member.lost_at, default=None)
 
     # What outlives a move
 

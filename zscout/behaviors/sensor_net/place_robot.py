@@ -8,18 +8,21 @@ they take turns. Hiding ranks above watching. `Scout` decides what to do with wh
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Final
 
+import cv2
+import numpy as np
+
 from zscout.behaviors.client.arc import Held, Revoked, holds
-from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
-from zscout.behaviors.sensor_net.camera_feed import CameraFeed, CameraPicture
+from zscout.behaviors.client.client import CommandRefused, RequestRefused
+from zscout.behaviors.perception.lens import COLUMNS, ROWS, grey_picture
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 from zscout.behaviors.sensor_net.scout import PATIENCE, Scout, Task
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
+from zscout.mesh import FrameWatch
 from zscout.mesh.supervision import supervised
-from zscout.messages import Box
 
 LOOK: Final = 0.5
 """Seconds that a picture is waited for."""
@@ -56,10 +59,7 @@ class PlaceRobot(Behavior):
         super().__init__(name)
         self.needs, self.slots = needs, slots or Slots()
         self.scout = Scout()
-        self._tasks: dict[Task, RobotTask] = {
-            "hide": RobotTask("hide", self),
-            "watch": RobotTask("watch", self),
-        }
+        self._tasks = {"hide": RobotTask("hide", self), "watch": RobotTask("watch", self)}
         for task in self._tasks.values():
             self.add(task)
         self._clock = CarriedClock()
@@ -68,22 +68,19 @@ class PlaceRobot(Behavior):
     async def run(self, context: BehaviorContext) -> None:
         self._now(context)
         async with supervised(self.path) as supervisor:
-            supervisor.spawn(self._idle(context))
-            await self._take_turns(context)
+            supervisor.spawn(self._offer_safe_points(context))
+            while True:
+                try:
+                    await self._tasks[self.scout.task].perform(context)
+                except CameraBlind as blind:
+                    lost = self.scout.blindness.dead
+                    self.report("lost" if lost else "wait", str(blind), robot=self.needs.robot)
+                    await asyncio.sleep((GIVEN_UP if lost else AGAIN) / context.speed)
+                except (Revoked, CommandRefused, RequestRefused) as error:
+                    self.report("wait", str(error), robot=self.needs.robot)
+                    await asyncio.sleep(AGAIN)
 
-    async def _take_turns(self, context: BehaviorContext) -> None:
-        while True:
-            try:
-                await self._tasks[self.scout.task].perform(context)
-            except CameraBlind as blind:
-                lost = self.scout.blindness.dead
-                self.report("lost" if lost else "wait", str(blind), robot=self.needs.robot)
-                await asyncio.sleep((GIVEN_UP if lost else AGAIN) / context.speed)
-            except (Revoked, CommandRefused, RequestRefused) as error:
-                self.report("wait", str(error), robot=self.needs.robot)
-                await asyncio.sleep(AGAIN)
-
-    async def _idle(self, context: BehaviorContext) -> None:
+    async def _offer_safe_points(self, context: BehaviorContext) -> None:
         """While the robot is not held nothing changes here, however long that takes: a time to be moved."""
         while True:
             if not self._holding:
@@ -91,10 +88,13 @@ class PlaceRobot(Behavior):
             await asyncio.sleep(IDLE)
 
     async def hold(self, context: BehaviorContext, task: RobotTask) -> None:
-        """Asks for all that `task` needs and plays it under the hold, anew when that was taken away, until it
-        is over or has had its slot. Raises Blind, and what a request raises."""
+        """Asks for all that `task` needs and does it under the hold, anew when that was taken away, until it
+        is over or has had its slot. Raises CameraBlind, and what a request raises."""
         priority, slot = self.slots.of(task.task)
-        video = self.scout.blindness.choose(self._now(context), await channels_of(context.client))
+        state = await context.client.state()
+        rcs = [rc.rc for rc in state.rcs if rc.present] if state is not None else []
+        channels = sorted(rc for rc in rcs if rc.startswith("video/"))
+        video = self.scout.blindness.choose(self._now(context), channels)
         task.report("wait", "for its turn", robot=self.needs.robot)
         async for attempt in holds(
             context.client,
@@ -106,7 +106,7 @@ class PlaceRobot(Behavior):
         ):
             async with attempt as held:
                 channel = held.rc(video or self.needs.video)
-                # Whoever waited for the hold may be about to be moved: nothing changes before that is over.
+                # It may be about to be moved: nothing changes before that is over.
                 await context.safe_point()
                 await self._use(context, task, held, video)
             if self.scout.silent and attempt.arc is not None and attempt.arc.open:
@@ -119,12 +119,11 @@ class PlaceRobot(Behavior):
         robot = HeldRobot(held, self.needs, video=video)
         self._holding = True
         self.scout.held(self._now(context))
+        mesh = context.client.mesh
         try:
-            with CameraFeed(context.client, robot.framegrabber, held.grant) as feed:
+            with closing(mesh.frames(mesh.keys.frame(robot.framegrabber))) as watch:
                 await robot.camera(True)
-                while await self._handle_picture(
-                    context, task, robot, await feed.next_picture(LOOK / context.speed)
-                ):
+                while await self._look(context, task, robot, watch):
                     await context.safe_point()
                     await robot.camera(True, remind=self.scout.blindness.remind(self._now(context)))
         finally:
@@ -132,11 +131,18 @@ class PlaceRobot(Behavior):
             self._holding = False
             task.report("wait", "the hold is over", robot=self.needs.robot)
 
-    async def _handle_picture(
-        self, context: BehaviorContext, task: RobotTask, robot: HeldRobot, picture: CameraPicture | None
+    async def _look(
+        self, context: BehaviorContext, task: RobotTask, robot: HeldRobot, watch: FrameWatch
     ) -> bool:
-        """Does what one picture asks for, or none; whether the task goes on."""
-        step = self.scout.see(self._now(context), picture.picture if picture else None, robot.video)
+        """Waits for a picture, and does what it asks for, or none; whether the task goes on."""
+        frame = await watch.next(LOOK / context.speed)
+        # A frame taken under another grant shows another robot.
+        picture = grey_picture(frame.jpeg) if frame and frame.head.grant == robot.held.grant else None
+        across = down = 1.0
+        if picture is not None and picture.shape != (ROWS, COLUMNS):
+            across, down = picture.shape[1] / COLUMNS, picture.shape[0] / ROWS
+            picture = np.asarray(cv2.resize(picture, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA), np.uint8)
+        step = self.scout.see(self._now(context), picture, robot.video)
         if step.blind:
             raise CameraBlind(f"no picture on {robot.video} for {PATIENCE:g} s")
         await robot.drive(step.left, step.right, step.lasts)
@@ -146,7 +152,10 @@ class PlaceRobot(Behavior):
             robot=robot.robot,
             camera=robot.framegrabber if step.boxes or step.quiet else "",
             alert=step.alert,
-            boxes=_in_frame(picture, step.boxes),
+            boxes=[
+                (round(x * across), round(y * down), round(w * across), round(h * down))
+                for x, y, w, h in step.boxes
+            ],
         )
         return not step.over
 
@@ -170,17 +179,3 @@ class RobotTask(Behavior):
 
     async def run(self, context: BehaviorContext) -> None:
         await self.of.hold(context, self)
-
-
-def _in_frame(picture: CameraPicture | None, boxes: Sequence[Box]) -> list[Box]:
-    """Boxes of the picture, in pixels of the frame."""
-    across, down = picture.scale if picture is not None else (1.0, 1.0)
-    return [(round(x * across), round(y * down), round(w * across), round(h * down)) for x, y, w, h in boxes]
-
-
-async def channels_of(client: Client) -> list[str]:
-    """The video channels of the fleet that are there, by name; none where no RCM answers."""
-    state = await client.state()
-    if state is None:
-        return []
-    return sorted(rc.rc for rc in state.rcs if rc.present and rc.rc.startswith("video/"))

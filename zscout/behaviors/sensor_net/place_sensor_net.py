@@ -17,6 +17,7 @@ from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.sensor_net.net import Effect, SensorNet, StartRobot
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
 from zscout.keyexpr import Role, Token
+from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor, supervised
 from zscout.messages import MAX_COMPONENT_NAME, BehaviorSaid, ComponentSpec, Placement, Placements
 
@@ -36,46 +37,44 @@ class PlaceSensorNet(Behavior):
         self._spec_for = spec_for
         self._there: dict[str, set[Token]] = {}
         self._components: dict[str, str] = {}
-        """Robots by the names of their components: named after the net's own, which is the only one."""
+        """Robots by the names of their components, which are unique: they contain the net's own."""
         self._placed: set[str] = set()
-        """Of these components, those that this net has had placed: what others placed is not its to stop."""
+        """Of these components, the ones that this net has had placed: it stops no others."""
         self._clock = CarriedClock()
         self._supervisor: Supervisor
+        self._mesh: Mesh
 
     async def run(self, context: BehaviorContext) -> None:
-        client, keys = context.client, context.client.mesh.keys
-        self._now(context)
+        mesh = self._mesh = context.client.mesh
+        self._now()
         self._components = {
             component_of(context.name or self.name, robot): robot for robot in self.net.members
         }
         declared = [
-            client.mesh.watch(keys.alive_any(Role.RC), self._on_token),
-            client.mesh.subscribe(
-                keys.behavior_any, BehaviorSaid, lambda key, status: self._on_status(context, key, status)
-            ),
-            client.mesh.subscribe(
-                keys.placements,
-                Placements,
-                lambda _, placements: self._on_placements(context, placements.components),
+            mesh.watch(mesh.keys.alive_any(Role.RC), self._on_token),
+            mesh.subscribe(mesh.keys.behavior_any, BehaviorSaid, self._on_status),
+            mesh.subscribe(
+                mesh.keys.placements, Placements, lambda _, news: self._on_placements(news.components)
             ),
         ]
         try:
             async with supervised(self.path) as self._supervisor:
                 while True:
-                    self._apply(context, self.net.there(self._now(context), self._there))
+                    self._apply(self.net.there(self._now(), self._there))
                     self._report_progress()
                     await context.safe_point()
                     await asyncio.sleep(PERIOD)
         finally:
             for one in declared:
                 one.close()
-            await self._end_all(context)
+            await self._end_all()
 
     def _report_progress(self) -> None:
         net = self.net
-        lost = [member.robot for member in net.members.values() if member.standing == "lost"]
         words = f"{net.hidden} of {net.wanted} hidden, {net.watching} watching, {net.alerts} alerts"
-        self.report("place" if net.hidden < net.wanted else "guard", words + _named(", lost: ", lost))
+        if lost := [member.robot for member in net.members.values() if member.standing == "lost"]:
+            words += f", lost: {', '.join(lost)}"
+        self.report("place" if net.hidden < net.wanted else "guard", words)
 
     # Events
 
@@ -86,62 +85,55 @@ class PlaceSensorNet(Behavior):
             if not tokens:
                 del self._there[token.name]
 
-    def _on_status(self, context: BehaviorContext, key: str, status: BehaviorSaid) -> None:
-        sender = context.client.mesh.keys.sender_of(key)
+    def _on_status(self, key: str, status: BehaviorSaid) -> None:
+        sender = self._mesh.keys.sender_of(key)
         robot = self._components.get(sender.client.rpartition(".")[0])
         # Only the component that was placed for a robot reports of it.
-        if robot is None or status.robot != robot:
-            return
-        self._apply(context, self.net.report(self._now(context), robot, status.doing, alert=status.alert))
+        if robot is not None and status.robot == robot:
+            self._apply(self.net.report(self._now(), robot, status.doing, alert=status.alert))
 
-    def _on_placements(self, context: BehaviorContext, placements: Iterable[Placement]) -> None:
+    def _on_placements(self, placements: Iterable[Placement]) -> None:
         for placement in placements:
             robot = self._components.get(placement.component)
-            if robot is None or placement.component not in self._placed:
-                continue
-            if placement.state in ("given_up", "ended"):
-                why = placement.reason or "it was stopped"
-                self._apply(context, self.net.failed(self._now(context), robot, why))
+            ended = placement.component in self._placed and placement.state in ("given_up", "ended")
+            if robot is not None and ended:
+                self._apply(self.net.failed(self._now(), robot, placement.reason or "it was stopped"))
 
     # Effects
 
-    def _apply(self, context: BehaviorContext, effects: Iterable[Effect]) -> None:
+    def _apply(self, effects: Iterable[Effect]) -> None:
         for effect in effects:
             component = next(name for name, robot in self._components.items() if robot == effect.robot)
             if isinstance(effect, StartRobot):
-                self._supervisor.spawn(self._start(context, component, effect.robot))
+                self._supervisor.spawn(self._start(component, effect.robot))
             else:
                 self.report(self.doing, f"{effect.robot} is lost: {effect.why}")
-                self._supervisor.spawn(self._stop(context, component))
+                self._supervisor.spawn(self._stop(component))
 
-    async def _start(self, context: BehaviorContext, component: str, robot: str) -> None:
+    async def _start(self, component: str, robot: str) -> None:
         try:
-            placer = PlacerClient(context.client.mesh)
-            placed = await placer.place(component, self._spec_for(robot, self.path))
+            placed = await PlacerClient(self._mesh).place(component, self._spec_for(robot, self.path))
         except RequestRefused as refused:
-            self._apply(context, self.net.failed(self._now(context), robot, str(refused)))
+            self._apply(self.net.failed(self._now(), robot, str(refused)))
         else:
             self._placed.add(component)
-            self._on_placements(context, [placed])
+            self._on_placements([placed])
 
-    async def _stop(self, context: BehaviorContext, component: str) -> None:
-        if component not in self._placed:
-            return
-        self._placed.discard(component)
-        with suppress(RequestRefused):
-            await PlacerClient(context.client.mesh).stop(component)
+    async def _stop(self, component: str) -> None:
+        if component in self._placed:
+            self._placed.discard(component)
+            with suppress(RequestRefused):
+                await PlacerClient(self._mesh).stop(component)
 
-    async def _end_all(self, context: BehaviorContext) -> None:
-        active = [name for name, robot in self._components.items() if self._is_active(robot)]
+    async def _end_all(self) -> None:
+        members = self.net.members
+        active = [name for name, robot in self._components.items() if members[robot].standing == "active"]
         with suppress(TimeoutError):
             async with asyncio.timeout(STOPPING):
-                await asyncio.gather(*(self._stop(context, name) for name in active))
+                await asyncio.gather(*(self._stop(name) for name in active))
 
-    def _is_active(self, robot: str) -> bool:
-        return self.net.members[robot].standing == "active"
-
-    def _now(self, context: BehaviorContext) -> float:
-        return self._clock.read(context.client.mesh.now())
+    def _now(self) -> float:
+        return self._clock.read(self._mesh.now())
 
     # What outlives a move
 
@@ -162,7 +154,3 @@ def component_of(net: str, robot: str) -> str:
     # Cut names could be alike.
     mark = hashlib.sha256(name.encode()).hexdigest()[:8]
     return f"{name[: MAX_COMPONENT_NAME - len(mark) - 1]}-{mark}"
-
-
-def _named(before: str, names: list[str]) -> str:
-    return before + ", ".join(names) if names else ""

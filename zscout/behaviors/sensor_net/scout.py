@@ -8,6 +8,7 @@ studies and tests run it under virtual time.
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
 
@@ -15,13 +16,22 @@ from zscout.behaviors.perception.garble import garbled
 from zscout.behaviors.perception.hiding.hider import Hider
 from zscout.behaviors.perception.lens import Picture
 from zscout.behaviors.perception.motion import Box, MotionDetector
-from zscout.behaviors.sensor_net.blindness import Blindness
 
 PATIENCE: Final = 10.0
 """Seconds from the beginning of a hold, or from the last picture, until the robot counts as not seen."""
 
 QUIET: Final = 2.0
 """Seconds without motion after which the next one is another event."""
+SUSPECTS: Final = 2
+"""Holds in a row without a picture that prove a robot dead."""
+BAD_FOR: Final = 60.0
+"""Seconds for which a channel that showed nothing is avoided."""
+SILENT: Final = 4.0
+"""Seconds without any picture at the end of a hold that prove a receiver dead: framegrabbers give up after
+five."""
+REMIND: Final = 4.0
+"""Seconds without a good picture, above any warm-up, after which a robot may not have received the command to
+transmit."""
 
 Task: TypeAlias = Literal["hide", "watch"]
 
@@ -83,6 +93,87 @@ class Alerts:
         self.count = int(memory["count"])
 
 
+class Blindness:
+    """Why there is no picture of a robot, over its holds: because of the channel, or of the robot.
+
+    A robot whose transmitter is on shows a picture within seconds. If none comes for `patience`, the channel
+    may be jammed, its receiver dead, or the robot. So another channel is tried where there is one: a robot
+    that is not seen on SUSPECTS in a row is dead; one that is seen had a bad channel, which is avoided for a
+    while. A channel without any picture, not even snow, has no receiver that works: its framegrabber gives
+    up, the hold ends before `patience` is over, and the robot is not to blame.
+    """
+
+    def __init__(self, patience: float) -> None:
+        self.patience = patience
+        """Seconds without a picture, warm-up included."""
+        self._dark_since: float | None = None
+        self._bad: dict[str, float] = {}
+        """Channels on which this robot was not seen, and when."""
+        self._in_row = 0
+        self._reminded = 0.0
+        self._channel = ""
+        self._silent_since: float | None = None
+
+    def begin(self, now: float) -> None:
+        """A hold has begun: the transmitter is being switched on."""
+        self._dark_since = now
+        self._channel, self._silent_since = "", now
+
+    def see(self, now: float, good: bool, channel: str, *, came: bool | None = None) -> bool:
+        """Takes what a look showed; `came`: any picture, if not a good one. True: no good picture for too
+        long on this channel."""
+        self._channel = channel
+        if good or came:
+            self._silent_since = now
+        if good:
+            self._dark_since = None
+            self._in_row = 0
+            self._bad.pop(channel, None)
+            return False
+        if self._dark_since is None:
+            self._dark_since = now
+        if now - self._dark_since < self.patience:
+            return False
+        self._bad[channel] = now
+        self._in_row += 1
+        self._dark_since = None
+        return True
+
+    def remind(self, now: float) -> bool:
+        """Whether the robot is to be commanded once more to transmit: its radio goes one way."""
+        since = self._dark_since
+        if since is None or now - max(since, min(self._reminded, now)) < REMIND:
+            return False
+        self._reminded = now
+        return True
+
+    def end(self, now: float) -> bool:
+        """The hold is over. True: its channel gave nothing at all, and is to be left."""
+        since, self._silent_since = self._silent_since, None
+        if since is None or not self._channel or now - since < SILENT:
+            return False
+        self._bad[self._channel] = now
+        return True
+
+    @property
+    def dead(self) -> bool:
+        """Whether that is enough to give the robot up; of a single channel, two tries on it are."""
+        return self._in_row >= SUSPECTS
+
+    def choose(self, now: float, channels: Iterable[str]) -> str | None:
+        """A channel to ask for by name, because another one is to be avoided; None: any will do."""
+        self._bad = {channel: at for channel, at in self._bad.items() if now - at < BAD_FOR}
+        good = sorted(set(channels) - self._bad.keys())
+        return good[0] if self._bad and good else None
+
+    def memory(self) -> dict[str, Any]:
+        return {"bad": self._bad, "in_row": self._in_row}
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        self._bad = {str(channel): float(at) for channel, at in memory["bad"].items()}
+        self._in_row = int(memory["in_row"])
+
+
 class Scout:
     """One robot's part of the net."""
 
@@ -136,11 +227,10 @@ class Scout:
 
     def _watch(self, now: float, picture: Picture) -> Step:
         seen = self._detector.see(now, picture)
-        edge = self.alerts.see(now, seen.moving)
-        doing = "alert" if self.alerts.moving else "watch"
-        words = f"motion {self.alerts.count}" if self.alerts.moving else f"{self.alerts.count} alerts so far"
-        boxes = tuple(seen.boxes) if self.alerts.moving else ()
-        return Step(0, 0, 0, doing, words, boxes, alert=edge == "start", quiet=edge == "end")
+        edge, count = self.alerts.see(now, seen.moving), self.alerts.count
+        if self.alerts.moving:
+            return Step(0, 0, 0, "alert", f"motion {count}", tuple(seen.boxes), alert=edge == "start")
+        return Step(0, 0, 0, "watch", f"{count} alerts so far", quiet=edge == "end")
 
     # What outlives a move
 
