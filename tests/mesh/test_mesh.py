@@ -45,7 +45,7 @@ class Strict(Message, frozen=True):
     number: int = 0
 
 
-messages.names_once(Strict)
+messages.NAMES_ONCE.add(Strict)
 
 
 class World:

@@ -27,6 +27,10 @@ MAX_JUMP = 1_000_000
 """A term whose counter is this far above all that were received is an error, not an election."""
 MAX_ERROR = 400
 """Characters in the text of an error: it may quote what was sent."""
+MAX_DIGITS = 25
+MAX_EXPONENT = 18
+MAX_SECONDS = Decimal(10 * 366 * 86_400)
+"""Ten years."""
 
 Amounts: TypeAlias = dict[str, Decimal]
 State: TypeAlias = Literal["queued", "running", "ended"]
@@ -55,7 +59,9 @@ class Problem(Message, frozen=True):
 T = TypeVar("T")
 _ENCODER = msgspec.json.Encoder(decimal_format="number")
 _DECODERS: dict[Any, msgspec.json.Decoder[Any]] = {}
-_ONCE_ONLY: set[Any] = set()
+NAMES_ONCE: set[Any] = set()
+"""Kinds in which a name that stands twice in one object is refused. The decoder alone takes the last, which
+in a request would silently drop a need; elsewhere the 6 us are not worth it."""
 
 
 class Malformed(ValueError):
@@ -82,17 +88,12 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
         decoder = _DECODERS[kind] = msgspec.json.Decoder(kind)
     try:
         message: T = decoder.decode(payload)
-        if kind in _ONCE_ONLY:
+        if kind in NAMES_ONCE:
             _ONCE.decode(payload.decode())
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise Malformed(f"not a valid {_name(kind)}: {str(error)[:MAX_ERROR]}") from None
+        name = getattr(kind, "__name__", "operation")
+        raise Malformed(f"not a valid {name}: {str(error)[:MAX_ERROR]}") from None
     return message
-
-
-def names_once(kind: Any) -> None:
-    """From now on a name that stands twice in one object of a `kind` is refused. The decoder alone takes the
-    last, which in a request would silently drop a need; elsewhere the 6 us are not worth it."""
-    _ONCE_ONLY.add(kind)
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -109,15 +110,6 @@ _ONCE = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=s
 def schema(kind: type) -> str:
     """The name under which a message travels in the encoding."""
     return f"zscout.{kind.__name__}.v1"
-
-
-def _name(kind: Any) -> str:
-    return getattr(kind, "__name__", "operation")
-
-
-MAX_DIGITS = 25
-MAX_EXPONENT = 18
-MAX_SECONDS = Decimal(10 * 366 * 86_400)
 
 
 def exact(value: Decimal, what: str) -> Fraction:

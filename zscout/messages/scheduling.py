@@ -7,7 +7,7 @@ from typing import Annotated, TypeAlias
 
 import msgspec
 
-from zscout.messages.base import Amounts, Elapsed, Message, Seconds, State, names_once
+from zscout.messages.base import NAMES_ONCE, Amounts, Elapsed, Message, Seconds, State
 from zscout.types import Grant, Place, Term
 
 MAX_OTHERS = 255
@@ -83,7 +83,7 @@ class Foresight(Message, frozen=True):
 
 
 Operation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
-names_once(Operation)
+NAMES_ONCE.add(Operation)
 
 
 class ReasonParty(Message, frozen=True):
