@@ -9,7 +9,8 @@ import pytest
 
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.scout import BAD_FOR, QUIET, Alerts, Blindness
-from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, BehaviorContext, BehaviorStatus
+from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, BehaviorContext
+from zscout.messages import BehaviorSaid
 
 
 class Count(Behavior):
@@ -41,8 +42,8 @@ class All(Behavior):
         self.failures = await self.side_by_side(context, self.children)
 
 
-def played(root: Behavior) -> list[BehaviorStatus]:
-    said: list[BehaviorStatus] = []
+def played(root: Behavior) -> list[BehaviorSaid]:
+    said: list[BehaviorSaid] = []
 
     async def safe_point() -> None:
         await asyncio.sleep(0)

@@ -17,30 +17,25 @@ people see the tree; the memory of each is checkpointed with the whole tree.
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec.structs import replace
 
 from zscout.behaviors.client.client import Client
 from zscout.keyexpr import check_name
-from zscout.messages import Box
+from zscout.messages import MAX_BOXES, MAX_DETAIL, BehaviorSaid, Box
 from zscout.types import SECOND, Ns
 
 MAX_DEPTH: Final = 8
 MAX_CHILDREN: Final = 64
-
-
-@dataclass(frozen=True, slots=True)
-class BehaviorStatus:
-    """What a behavior does; `doing` is empty when it has ended."""
-
-    path: str
-    doing: str
-    detail: str = ""
-    robot: str = ""
-    camera: str = ""
-    alert: bool = False
-    boxes: tuple[Box, ...] = ()
+MAX_RATE: Final = 20
+"""Publications of one client in a second; alerts and ends are always published."""
+AGAIN: Final = 5.0
+"""Seconds after which all that stands is published again."""
+MAX_PATH: Final = 200
+MAX_WORD: Final = 64
 
 
 class BehaviorContext:
@@ -50,7 +45,7 @@ class BehaviorContext:
         self,
         client: Client,
         safe_point: Callable[[], Awaitable[None]],
-        publish: Callable[[BehaviorStatus], None],
+        publish: Callable[[BehaviorSaid], None],
         *,
         speed: float = 1.0,
         name: str = "",
@@ -77,7 +72,7 @@ class Behavior:
         self.children: list[Behavior] = []
         self.doing = ""
         self.detail = ""
-        self._publish_status: Callable[[BehaviorStatus], None] | None = None
+        self._publish_status: Callable[[BehaviorSaid], None] | None = None
 
     def add(self, child: Behavior) -> None:
         """Puts `child` under this one. Raises ValueError for a name that is there, or a tree too large."""
@@ -139,7 +134,7 @@ class Behavior:
             return
         self.doing, self.detail = doing, detail
         if self._publish_status is not None:
-            self._publish_status(BehaviorStatus(self.path, doing, detail, robot, camera, alert, tuple(boxes)))
+            self._publish_status(BehaviorSaid(self.path, doing, detail, robot, camera, alert, list(boxes)))
 
     # What outlives a move
 
@@ -176,3 +171,44 @@ class CarriedClock:
             self.seconds += (at - self._read_at) / SECOND * speed
         self._read_at = at
         return self.seconds
+
+
+class StatusPublisher:
+    """Publishes the status of a client's behaviors, at a rate that a mesh can bear. Call it with each."""
+
+    def __init__(self, client: Client) -> None:
+        keys, me, self._now = client.mesh.keys, client.mesh.me, client.mesh.now
+        self._publisher = client.mesh.publisher(keys.behavior(me), BehaviorSaid)
+        self._published: deque[Ns] = deque(maxlen=MAX_RATE)
+        self._standing: dict[str, BehaviorSaid] = {}
+
+    def __call__(self, status: BehaviorSaid) -> None:
+        status = replace(
+            status,
+            path=status.path[:MAX_PATH],
+            doing=status.doing[:MAX_WORD],
+            detail=status.detail[:MAX_DETAIL],
+            robot=status.robot[:MAX_WORD],
+            camera=status.camera[:MAX_WORD],
+            boxes=status.boxes[:MAX_BOXES],
+        )
+        if status.doing:
+            self._standing[status.path] = replace(status, alert=False, boxes=[], camera="")
+        else:
+            self._standing.pop(status.path, None)
+        now = self._now()
+        crowded = len(self._published) == MAX_RATE and now - self._published[0] < SECOND
+        # One that is withheld is published later, if it still stands then.
+        if not crowded or not status.doing or status.alert:
+            self._published.append(now)
+            self._publisher.put(status)
+
+    async def keep_publishing(self) -> None:
+        """Publishes now and then what each behavior does, for new subscribers."""
+        while True:
+            await asyncio.sleep(AGAIN)
+            for status in list(self._standing.values()):
+                self._publisher.put(status)
+
+    def close(self) -> None:
+        self._publisher.close()

@@ -11,7 +11,7 @@ from zscout.behaviors.components.component import is_movable
 from zscout.behaviors.components.sensor_net import PlaceRobotComponent, PlaceSensorNetComponent, StatusPrinter
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
-from zscout.behaviors.tree import BehaviorStatus
+from zscout.messages import BehaviorSaid
 
 ONE: dict[str, Any] = {"robot": "robot/scout33"}
 TWO: dict[str, Any] = {"robots": ["robot/scout33", "robot/scout35"]}
@@ -150,10 +150,10 @@ def test_the_output_tells_each_word_once_and_every_alert(capsys: pytest.CaptureF
         ("enter", "", False),
     ]
     for doing, detail, alert in said:
-        printer(BehaviorStatus("net/scout33/hide", doing, detail, robot=robot, alert=alert))
-    printer(BehaviorStatus("net", "place", "0 of 2 hidden"))
-    printer(BehaviorStatus("net", "place", "1 of 2 hidden"))
-    printer(BehaviorStatus("net", "place", "1 of 2 hidden"))
+        printer(BehaviorSaid("net/scout33/hide", doing, detail, robot=robot, alert=alert))
+    printer(BehaviorSaid("net", "place", "0 of 2 hidden"))
+    printer(BehaviorSaid("net", "place", "1 of 2 hidden"))
+    printer(BehaviorSaid("net", "place", "1 of 2 hidden"))
     assert capsys.readouterr().out.splitlines() == [
         "net/scout33/hide approach: dark place 1.4 m ahead",
         "net/scout33/hide enter",

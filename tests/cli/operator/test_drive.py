@@ -17,9 +17,8 @@ import pytest
 
 from tests.hang import HANG
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.piloting import Pilot
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
-from zscout.behaviors.teleop import Teleop
+from zscout.behaviors.teleop import Pilot, Teleop
 from zscout.cli.operator.drive import _Console
 from zscout.cli.operator.hands import (
     AXIS,

@@ -14,7 +14,7 @@ from tests.behaviors.components.kit import ROOT
 from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.tree import BehaviorContext, BehaviorStatus
+from zscout.behaviors.tree import BehaviorContext
 from zscout.drivers.packets import DrivePacket, HaltPacket, Packet
 from zscout.lab.building.node_file import node_file
 from zscout.lab.building.plan import (
@@ -26,6 +26,7 @@ from zscout.lab.building.plan import (
 )
 from zscout.lab.building.serve import Served
 from zscout.mesh import clock
+from zscout.messages import BehaviorSaid
 from zscout.types import Ns
 
 P = TypeVar("P", bound=Packet)
@@ -150,7 +151,7 @@ class RobotLab(Lab):
         self.node(host, extra=extra + "\n" + "".join(f"[[rc]]{table}" for table in chosen))
 
     def context(
-        self, client: Client, heard: Callable[[BehaviorStatus], None], *, speed: float | None = None
+        self, client: Client, heard: Callable[[BehaviorSaid], None], *, speed: float | None = None
     ) -> BehaviorContext:
         """What a behavior in the test's own loop runs on. `speed` is the building's unless told otherwise."""
 

@@ -16,9 +16,9 @@ from zscout.behaviors.perception.lens import COLUMNS, ROWS
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot
 from zscout.behaviors.sensor_net.scout import PATIENCE, SILENT, Scout
-from zscout.behaviors.tree import BehaviorStatus
 from zscout.drivers.packets import DrivePacket
 from zscout.mesh import clock
+from zscout.messages import BehaviorSaid
 from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
@@ -30,7 +30,7 @@ class Placed:
     """`place_robot` for scout33 in the test's own loop, and all that it says."""
 
     def __init__(self, lab: RobotLab, client: Client, *, speed: float | None = None) -> None:
-        self.said: list[BehaviorStatus] = []
+        self.said: list[BehaviorSaid] = []
         self.behavior = PlaceRobot("scout33", RobotNeeds("robot/scout33"))
         self.task = asyncio.create_task(
             self.behavior.perform(lab.context(client, self.said.append, speed=speed))

@@ -12,11 +12,9 @@ from tests.hang import HANG
 from tests.live.placing import Placing
 from tests.live.robots.lab import RobotLab, comes_true
 from zscout.behaviors.components.sensor_net import PlaceSensorNetComponent
-from zscout.behaviors.piloting import Pilot
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
-from zscout.behaviors.teleop import Teleop
-from zscout.behaviors.tree import BehaviorStatus
+from zscout.behaviors.teleop import Pilot, Teleop
 from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket
 from zscout.lab.building.plan import (
     Furniture,
@@ -73,7 +71,7 @@ def test_a_net_at_work(tmp_path: Path) -> None:
                 BehaviorSaid,
                 lambda key, word: said.append((keys.sender_of(key).host, word)),
             )
-            own: list[BehaviorStatus] = []
+            own: list[BehaviorSaid] = []
             root = PlaceSensorNetComponent({"robots": ROBOTS, "wanted": 1, "speed": SPEED}).root
             assert isinstance(root, PlaceSensorNet)
             net = root.net

@@ -9,9 +9,8 @@ import pytest
 
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.behaviors.piloting import Pilot
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
-from zscout.behaviors.teleop import Teleop
+from zscout.behaviors.teleop import Pilot, Teleop
 
 pytestmark = pytest.mark.live
 

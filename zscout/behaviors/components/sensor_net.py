@@ -12,11 +12,10 @@ from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.net import SensorNet
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot, Slots
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
-from zscout.behaviors.status_publisher import StatusPublisher
-from zscout.behaviors.tree import Behavior, BehaviorContext, BehaviorStatus
+from zscout.behaviors.tree import Behavior, BehaviorContext, StatusPublisher
 from zscout.keyexpr import BadName, check_name, check_need, check_rc
 from zscout.mesh.supervision import supervised
-from zscout.messages import ComponentSpec
+from zscout.messages import BehaviorSaid, ComponentSpec
 
 MAX_ROBOTS: Final = 64
 MAX_SPEED: Final = 100.0
@@ -46,7 +45,7 @@ class TreeComponent(Component):
         publisher = StatusPublisher(context.client)
         printer = StatusPrinter()
 
-        def publish(status: BehaviorStatus) -> None:
+        def publish(status: BehaviorSaid) -> None:
             publisher(status)
             printer(status)
 
@@ -73,7 +72,7 @@ class StatusPrinter:
     def __init__(self) -> None:
         self._last: dict[str, tuple[str, str]] = {}
 
-    def __call__(self, status: BehaviorStatus) -> None:
+    def __call__(self, status: BehaviorSaid) -> None:
         # "dark place 1.3 m ahead" is no news after "dark place 1.4 m ahead".
         detail = re.sub(r"[0-9.]+", "", status.detail) if status.robot else status.detail
         news = status.doing, detail

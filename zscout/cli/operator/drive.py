@@ -93,9 +93,8 @@ async def _drive(
     record: Path | None,
     as_json: bool,
 ) -> int:
-    from zscout.behaviors.piloting import Pilot
     from zscout.behaviors.sensor_net.held_robot import RobotNeeds
-    from zscout.behaviors.teleop import Teleop
+    from zscout.behaviors.teleop import Pilot, Teleop
     from zscout.cli.operator.hands import Hands, game_pad
 
     fleet = common.the_fleet()

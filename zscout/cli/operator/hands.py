@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from zscout.behaviors.piloting import Way
-from zscout.behaviors.teleop import Teleop
+from zscout.behaviors.teleop import Teleop, Way
 from zscout.config.strict import BadInput, quoted
 from zscout.types import SECOND
 

@@ -15,9 +15,8 @@ from typing import Any, Final
 
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient
-from zscout.behaviors.piloting import Pilot, Way
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
-from zscout.behaviors.teleop import Teleop
+from zscout.behaviors.teleop import Pilot, Teleop, Way
 from zscout.lab.building.bodies import WARM_UP
 from zscout.lab.building.node_file import RADIO, device_tables, framegrabber_name
 from zscout.lab.demo.runner import BUILDING, HOSTS, DemoRunner, free_ports

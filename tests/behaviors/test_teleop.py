@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zscout.behaviors.piloting import FIRST, NEXT, SILENT, TURN, Pilot, Way
+from zscout.behaviors.teleop import FIRST, NEXT, SILENT, TURN, Pilot, Way
 
 WAYS: tuple[Way, ...] = ("forward", "back", "left", "right")
 
