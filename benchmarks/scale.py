@@ -16,9 +16,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from random import Random
+from unittest.mock import patch
 
 from benchmarks.stats import Samples
 from zscout.config.scheduling_policy import StrategyName
+from zscout.scheduling import priority
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     ArcRequest,
@@ -34,7 +36,8 @@ from zscout.scheduling.model import (
     Vote,
     WakeAt,
 )
-from zscout.scheduling.priority import FullPriority
+from zscout.scheduling.priority import Priority
+from zscout.scheduling.state import Actions, SchedulerState
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import excess
 from zscout.types import SECOND, ArcId, Ns, Params
@@ -65,6 +68,14 @@ class Point:
     rcs: int
     queue: int
     samples: Samples
+
+
+class _FullPriority(Priority):
+    """The same as if every RC had been freed before each pass."""
+
+    def run_pass(self, state: SchedulerState, actions: Actions) -> None:
+        state.index.freed = state.mask(state.rcs)
+        super().run_pass(state, actions)
 
 
 class Fleet:
@@ -135,9 +146,10 @@ class Fleet:
         self.fill_up()
 
     def full_passes(self, count: int) -> None:
-        self.core.strategy = FullPriority()
-        for _ in range(count):
-            self._timed("full pass", Tick())
+        self.core.strategy = _FullPriority()
+        with patch.object(priority, "MAX_REPORTED", 0):
+            for _ in range(count):
+                self._timed("full pass", Tick())
 
 
 def measure(rcs: int, queue: int, rounds: int, seed: int, strategy: StrategyName) -> list[Point]:

@@ -204,7 +204,8 @@ def main() -> None:
     load = os.getloadavg()[0]
     loop = additions()
     names = tuple(STRATEGIES)
-    best = [float(pack(problem(experiment(seed, 10, 20))).value) for seed in range(args.seeds)]
+    small = [problem(experiment(seed, 10, 20)) for seed in range(args.seeds)]
+    best = [float(one.value(pack(one).chosen)) for one in small]
     measured = rows(10, 20, args.seeds, best, names, paper=True)
     if optimal.solver_available():
         for rcs, arcs, seconds in ((50, 100, 20.0), (300, 600, args.solver)):

@@ -23,7 +23,7 @@ def validate(core: Core) -> None:
         assert arc.reason is None, f"{arc.id} runs and has a reason to wait"
     for arc in state.queued.values():
         assert arc.reason is not None, f"{arc.id} waits without a reason"
-    for _, rc, holders in state.votes.out():
+    for rc, holders in state.votes.out.values():
         assert state.rc(rc).present, f"a proposal is out at {rc}, which is absent"
         assert all(state.arc(arc) for arc in holders), f"a proposal at {rc} names an ARC that ended"
 

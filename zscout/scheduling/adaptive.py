@@ -32,9 +32,9 @@ from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.packing import PackingItem, PackingProblem, numbers, pack
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.reservations import Reservations, reservations
-from zscout.scheduling.state import Actions, SchedulerState
+from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
-from zscout.types import ArcId, Ns, RcName
+from zscout.types import ArcId, RcName
 
 WORK: Final = 20_000
 """Steps of branch and bound, times items: some 3 ms."""
@@ -61,38 +61,6 @@ SEARCHING: Final = Reason(ReasonCode.SEARCHING)
 def steps_for(size: int) -> int:
     """Steps that a group of so many ARCs is worth: 246 for 100, 5,480 for 600."""
     return min(MAX_STEPS, size * (85 + size) // 75)
-
-
-@dataclass(slots=True)
-class Gain:
-    """A better set that was taken: pairs in use at each priority, there and by the heuristic."""
-
-    at: Ns
-    pairs: dict[int, int]
-    heuristic: dict[int, int]
-    steps: int
-
-    def __str__(self) -> str:
-        changed = [
-            f"{self.heuristic[level]} to {self.pairs[level]} at priority {level}"
-            for level in sorted(self.pairs, reverse=True)
-            if self.pairs[level] != self.heuristic[level]
-        ]
-        return f"pairs in use from {', '.join(changed)}, in {self.steps} steps"
-
-
-@dataclass(slots=True)
-class Statistics:
-    """What the strategy did so far, and what it cost."""
-
-    passes: int = 0
-    searches: int = 0
-    """Groups for which the bound left something."""
-    steps: int = 0
-    gains: int = 0
-    given_up: int = 0
-    """Searches that used up their slices or rounds of votes."""
-    last: Gain | None = None
 
 
 @dataclass(slots=True)
@@ -131,13 +99,12 @@ class _Search:
         return self.problem.value(self.best) > self.problem.value(self.heuristic)
 
 
-class Adaptive:
+class Adaptive(Strategy):
     """One run of the strategy. It keeps unfinished searches, so each core has its own."""
 
     name: StrategyName = "adaptive"
 
     def __init__(self) -> None:
-        self.statistics = Statistics()
         self._news = ""
         self._reserved: Reservations | None = None
         self._searches: dict[ArcId, _Search] = {}
@@ -155,7 +122,6 @@ class Adaptive:
         return news
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
-        self.statistics.passes += 1
         if self._reserved is None and not self._searches and _one_without_choice(state):
             priority.run_pass(state, actions)
             return
@@ -219,7 +185,7 @@ class Adaptive:
                     return True
                 asked = self._ask(group, search, search.best, actions)
             if asked == YES:
-                self._record_gain(group, search)
+                self._report_gain(group, search)
                 group.take(search.best, actions)
                 return True
             if asked == OPEN:
@@ -259,13 +225,11 @@ class Adaptive:
             search.slices = max(search.slices, one.slices)
             search.rounds = max(search.rounds, one.rounds)
             search.exhausted |= one.exhausted
-        self.statistics.searches += not earlier
         return self._bounded(search)
 
     def _bounded(self, search: _Search) -> _Search:
         if not search.exhausted and (search.slices >= MAX_SLICES or search.rounds >= MAX_ROUNDS):
             search.exhausted, search.local = True, None
-            self.statistics.given_up += 1
         return search
 
     def _advance(self, search: _Search) -> bool:
@@ -280,7 +244,6 @@ class Adaptive:
         took = local.run(min(self._steps, limit - local.steps))
         self._steps -= took
         search.steps += took
-        self.statistics.steps += took
         search.best = max(search.best, local.best, key=search.problem.key)
         if local.done or local.steps >= limit:
             search.local = None
@@ -293,7 +256,6 @@ class Adaptive:
             packing = pack(problem, WORK // size)
             self._work -= packing.nodes * size
             search.steps += packing.nodes
-            self.statistics.steps += packing.nodes
             if packing.exact:
                 search.best = packing.chosen
                 return
@@ -301,11 +263,14 @@ class Adaptive:
         search.inexact = True
         search.local = LocalSearch(problem, search.best)
 
-    def _record_gain(self, group: ConflictGroup, search: _Search) -> None:
-        self.statistics.gains += 1
+    def _report_gain(self, group: ConflictGroup, search: _Search) -> None:
         found, heuristic = _pairs(group, search.best), _pairs(group, search.heuristic)
-        self.statistics.last = Gain(group.state.now, found, heuristic, search.steps)
-        self._news = f"adaptive: {self.statistics.last}"
+        changed = [
+            f"{heuristic[level]} to {found[level]} at priority {level}"
+            for level in found
+            if found[level] != heuristic[level]
+        ]
+        self._news = f"adaptive: pairs in use from {', '.join(changed)}, in {search.steps} steps"
 
 
 def _one_without_choice(state: SchedulerState) -> bool:
@@ -330,6 +295,7 @@ def _warm_start(earlier: list[_Search], arcs: list[ArcId]) -> int:
 
 
 def _pairs(group: ConflictGroup, chosen: int) -> dict[int, int]:
+    """Pairs in use at each priority, the highest first."""
     pairs = dict.fromkeys(sorted({arc.priority for arc in group.arcs}, reverse=True), 0)
     for number in numbers(chosen):
         item = group.items[number]

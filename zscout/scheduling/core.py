@@ -41,7 +41,7 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.priority import AdmissionCheck, Priority
 from zscout.scheduling.reason import Reason, ReasonCode
-from zscout.scheduling.state import ExpiryQueue, SchedulerState, Strategy
+from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
 
@@ -54,7 +54,6 @@ class Core:
         self.strategy, self.policy = strategy or Priority(), policy
         self._state = SchedulerState(policy)
         self._votes = self._state.votes
-        self._expiry = ExpiryQueue(self._state.running)
         self.term: Term = NO_TERM
         self.seq = 0
         self.batches = 0
@@ -279,8 +278,6 @@ class Core:
         self._state.hand_over(arc, to, renamed)
         if arc.hold is not None:
             arc.hold = replace(arc.hold, grant=self._next_grant())
-            if arc.hold.end > self._now:
-                self._expiry.note(arc, arc.hold)
             self._effects.append(self._granted(arc, arc.hold))
         elif arc.reason:
             self._effects.append(Queued(arc.id, to, arc.reason))
@@ -310,13 +307,13 @@ class Core:
                 outcome = Outcome.COMPLETED if over and not arc.request.keep else Outcome.LOST
                 self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=not over))
             else:
-                self._start_hold(arc, hold)
+                self._state.start(arc, hold)
         self._expire()
         for one in waiting:
             self._ask(*one)
 
     def _expire(self) -> None:
-        for arc in self._expiry.over(self._now):
+        for arc in self._state.over():
             if arc.request.keep:
                 self._state.min_runtime_over(arc)
             else:
@@ -327,7 +324,7 @@ class Core:
     def start(self, arc: Arc) -> None:
         grant = self._next_grant()
         hold = Hold(grant, self._now, self._now + arc.request.min_runtime, self._state.protected_below(arc))
-        self._start_hold(arc, hold)
+        self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold))
 
     def preempt(self, arc: Arc, by: Arc) -> bool:
@@ -356,10 +353,6 @@ class Core:
         self._run_again = True
 
     # Holds
-
-    def _start_hold(self, arc: Arc, hold: Hold) -> None:
-        self._state.start(arc, hold)
-        self._expiry.note(arc, hold)
 
     def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
         """Ends a hold. What has had its minimum runtime is not queued again."""
@@ -399,7 +392,7 @@ class Core:
         return HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
 
     def _set_wake(self) -> None:
-        at = self._expiry.next()
+        at = self._state.next_end()
         if self._state.queued:
             at = min(self._now + QUANTUM, at) if at is not None else self._now + QUANTUM
         if self._run_again:

@@ -27,7 +27,7 @@ from zscout.scheduling import priority
 from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups
 from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.packing import PackingProblem, numbers, pack
-from zscout.scheduling.state import Actions, SchedulerState
+from zscout.scheduling.state import Actions, SchedulerState, Strategy
 
 if TYPE_CHECKING:
     from ortools.sat.python import cp_model
@@ -156,7 +156,7 @@ MAX_VETOES: Final = 256
 for each of very many sets; beyond so many vetoes `priority` decides the group."""
 
 
-class Optimal:
+class Optimal(Strategy):
     """The strategy; it keeps nothing from pass to pass."""
 
     name: StrategyName = "optimal"
@@ -168,9 +168,6 @@ class Optimal:
                 held |= group.mask
         # Nothing is left for it to start; it reports to those who wait what they wait for.
         priority.run_pass(state, actions, off_limits=held)
-
-    def news(self) -> str:
-        return ""
 
 
 def decide(group: ConflictGroup, actions: Actions) -> bool:

@@ -41,9 +41,6 @@ class Packing:
     """The best set found, as a bit set of item numbers; `exact` if it is proven that none is better."""
 
     chosen: int
-    value: int
-    bound: int
-    """No set is worth more than this."""
     exact: bool
     nodes: int
 
@@ -161,10 +158,10 @@ class PackingProblem:
 
 def pack(problem: PackingProblem, nodes: int = NO_LIMIT) -> Packing:
     """The best set, or the best that is found in so many steps, at least the heuristic's."""
-    return _Search(problem, nodes).run()
+    return _BranchAndBound(problem, nodes).run()
 
 
-class _Search:
+class _BranchAndBound:
     def __init__(self, problem: PackingProblem, nodes: int) -> None:
         self.problem = problem
         self.limit = nodes
@@ -186,7 +183,6 @@ class _Search:
         problem = self.problem
         whole = [number for number in range(len(problem.items)) if problem.allowed(number, 0)]
         whole.sort(key=lambda number: (problem.items[number].level, not self.firm[number]))
-        bound = problem.bound(whole)
         out = sum(self.in_min_runtime) - sum(self.in_min_runtime[number] for number in whole)
         todo = [(whole, 0, 0, out)]
         cut = False
@@ -194,8 +190,7 @@ class _Search:
             cut = self._descend(todo, *todo.pop())
         if cut:
             self.chosen = max(self.chosen, problem.complete(), key=problem.key)
-            self.best = problem.value(self.chosen)
-        return Packing(self.chosen, self.best, bound if cut else self.best, not cut, self.nodes)
+        return Packing(self.chosen, not cut, self.nodes)
 
     def _descend(
         self,

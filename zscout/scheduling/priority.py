@@ -55,7 +55,7 @@ from zscout.scheduling.model import Arc, ArcState, Rank, Rc
 from zscout.scheduling.patterns import Binder, no_match
 from zscout.scheduling.reason import SHOWN, Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import ReservationConflict, Reservations
-from zscout.scheduling.state import Actions, SchedulerState
+from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.votes import Answer, HolderSet
 from zscout.types import ArcId, Need, RcName
 
@@ -223,25 +223,13 @@ _Verdict: TypeAlias = (
 )
 
 
-class Priority:
+class Priority(Strategy):
     """The strategy, on its own."""
 
     name: StrategyName = "priority"
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
         run_pass(state, actions)
-
-    def news(self) -> str:
-        return ""
-
-
-class FullPriority(Priority):
-    """The same as if every RC had been freed before each pass: whoever waits is checked, or the first who
-    watches the same RC, for what keeps that one out keeps out all below it. For tests and benchmarks."""
-
-    def run_pass(self, state: SchedulerState, actions: Actions) -> None:
-        state.index.freed = state.all_rcs()
-        Pass(state, actions, reported=0).run(state.index.ready.values())
 
 
 def run_pass(
@@ -251,26 +239,18 @@ def run_pass(
 
     `off_limits`: bits of RCs that another strategy is still deciding about. `reserved`: what is reserved for
     starving ARCs; the paper's own strategy knows no such thing."""
-    Pass(state, actions, reserved=reserved).run(state.index.ready.values(), off_limits)
+    Pass(state, actions, reserved).run(state.index.ready.values(), off_limits)
 
 
 class Pass:
     """Checks in rank order: those who are ready, and those who watch what has been freed."""
 
-    def __init__(
-        self,
-        state: SchedulerState,
-        actions: Actions,
-        *,
-        reported: int = MAX_REPORTED,
-        reserved: Reservations | None = None,
-    ) -> None:
+    def __init__(self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None) -> None:
         self.state, self.actions, self.reserved = state, actions, reserved
         self.votes, self.index = state.votes, state.index
         self.off_limits = 0
         self.changed = 0
         """Bits of the RCs at which something is new since the last pass began."""
-        self._reported = reported
         self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
         """Who is next, beside the ready ones. By way of an RC come its watchers, one after the other."""
         self._reports_left: dict[int, int] = {}
@@ -455,7 +435,7 @@ class Pass:
         index = self.index
         for rc in self.state.rcs_in(watched & index.watched):
             known = rc.bit in self._reports_left
-            self._reports_left[rc.bit] = self._reported
+            self._reports_left[rc.bit] = MAX_REPORTED
             if not known:
                 self._call_next_watcher(rc, rank)
         if index.parked:

@@ -140,36 +140,6 @@ class QueueIndex:
                 self.watched &= ~rc.bit
 
 
-class ExpiryQueue:
-    """The ends of minimum runtimes, soonest first. Those of holds that ended otherwise are skipped."""
-
-    def __init__(self, running: Mapping[ArcId, Arc]) -> None:
-        self._running = running
-        self._heap: list[tuple[Ns, ArcId, int]] = []
-
-    def note(self, arc: Arc, hold: Hold) -> None:
-        """`arc` holds, or holds under another name or grant than before."""
-        heapq.heappush(self._heap, (hold.end, arc.id, hold.grant.seq))
-
-    def over(self, now: Ns) -> Iterator[Arc]:
-        """Those whose minimum runtime is over by `now`, each once; what is done to one may end others."""
-        while self._heap and self._heap[0][0] <= now:
-            _, arc_id, _ = heapq.heappop(self._heap)
-            arc = self._running.get(arc_id)
-            if arc is not None and arc.hold is not None and arc.hold.end <= now:
-                yield arc
-
-    def next(self) -> Ns | None:
-        """When the next one is."""
-        while self._heap:
-            at, arc_id, _ = self._heap[0]
-            arc = self._running.get(arc_id)
-            if arc is not None and arc.hold is not None and arc.hold.end == at:
-                return at
-            heapq.heappop(self._heap)
-        return None
-
-
 class SchedulerState:
     """The RCs, the ARCs and the holds between them. Every change goes through its methods."""
 
@@ -178,6 +148,8 @@ class SchedulerState:
         self.now: Ns = 0
         """The instant of the latest batch of events."""
         self.votes = Votes()
+        self._ends: list[tuple[Ns, ArcId]] = []
+        """A heap of the ends of minimum runtimes. Those of holds that ended otherwise are skipped."""
         self.rcs: dict[RcName, Rc] = {}
         self.queued: dict[ArcId, Arc] = {}
         self.running: dict[ArcId, Arc] = {}
@@ -250,10 +222,6 @@ class SchedulerState:
         arc.bound, arc.mask = {}, arc.named_mask
         arc.needs = {need: params for need, params in arc.request.needs.items() if not is_pattern(need)}
         arc.rcs = tuple(self.rcs_in(arc.mask))
-
-    def all_rcs(self) -> int:
-        """Bits of all RCs that were ever named."""
-        return (1 << len(self._by_bit)) - 1
 
     def mask(self, names: Iterable[RcName]) -> int:
         mask, rcs = 0, self.rcs
@@ -334,6 +302,8 @@ class SchedulerState:
         self._rename(arc, to, renamed)
         arc.entry = self._next_entry()
         self._add_running(arc)
+        if arc.hold.end > self.now:
+            heapq.heappush(self._ends, (arc.hold.end, arc.id))
         self._clients.setdefault(to, {})[arc.id] = arc
 
     def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
@@ -348,6 +318,7 @@ class SchedulerState:
         arc.move_to(ArcState.RUNNING)
         arc.hold, arc.reason, arc.since, arc.entry = hold, None, self.now, self._next_entry()
         self._add_running(arc)
+        heapq.heappush(self._ends, (hold.end, arc.id))
         self.index.touched |= arc.mask
         self.busy |= arc.mask & ~self.sharable
 
@@ -364,6 +335,23 @@ class SchedulerState:
         self.busy &= ~arc.mask
         self.index.freed |= arc.mask
         return hold
+
+    def over(self) -> Iterator[Arc]:
+        """Those whose minimum runtime is over by now, each once; what is done to one may end others."""
+        while self._ends and self._ends[0][0] <= self.now:
+            arc = self.running.get(heapq.heappop(self._ends)[1])
+            if arc is not None and arc.hold is not None and arc.hold.end <= self.now:
+                yield arc
+
+    def next_end(self) -> Ns | None:
+        """When the next minimum runtime is over."""
+        while self._ends:
+            at, arc_id = self._ends[0]
+            arc = self.running.get(arc_id)
+            if arc is not None and arc.hold is not None and arc.hold.end == at:
+                return at
+            heapq.heappop(self._ends)
+        return None
 
     def min_runtime_over(self, arc: Arc) -> None:
         """A kept hold has had its minimum runtime: from now on its equals may preempt it."""
@@ -436,8 +424,7 @@ class Strategy(Protocol):
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
         """One pass: reads the state, and acts."""
-        ...
 
     def news(self) -> str:
         """What is worth a line in a log since it was last asked for; mostly empty."""
-        ...
+        return ""

@@ -6,7 +6,6 @@ every superset, and one answer settles many questions. Answers stand until the R
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -130,7 +129,8 @@ class Votes:
 
     def __init__(self) -> None:
         self._ballots: dict[RcName, RcVotes] = {}
-        self._out: dict[int, tuple[RcName, HolderSet]] = {}
+        self.out: dict[int, tuple[RcName, HolderSet]] = {}
+        """The proposals that are out, by their numbers."""
         self._next = 1
         self.silent: set[RcName] = set()
         """RCs whose last vote is overdue: nobody waits for them until they answer."""
@@ -170,15 +170,15 @@ class Votes:
         numbers = ballot.out.setdefault(holders, [])
         numbers.append(number)
         if len(numbers) > QUESTIONS_PER_SET:
-            del self._out[numbers.pop(0)]
-        self._out[number] = (rc, holders)
+            del self.out[numbers.pop(0)]
+        self.out[number] = (rc, holders)
         return number
 
     def answer(self, proposal: int, *, accept: bool, reason: str) -> bool:
         """Takes an answer, a late one too. False: nobody asked, or its question has become void."""
-        if proposal not in self._out:
+        if proposal not in self.out:
             return False
-        rc, holders = self._out[proposal]
+        rc, holders = self.out[proposal]
         ballot = self._ballots[rc]
         self._close(ballot, holders)
         ballot.silent = False
@@ -193,9 +193,9 @@ class Votes:
 
     def overdue(self, proposal: int, now: Ns) -> bool:
         """Marks the RC silent. The proposal stays open: an answer counts until the query for it ends."""
-        if proposal not in self._out:
+        if proposal not in self.out:
             return False
-        rc, holders = self._out[proposal]
+        rc, holders = self.out[proposal]
         ballot = self._ballots[rc]
         if proposal != ballot.out[holders][-1]:
             return False
@@ -233,12 +233,7 @@ class Votes:
         ballot = self._ballots.get(rc)
         if ballot is not None:
             for number in ballot.rename(arc, renamed):
-                self._out[number] = (rc, _renamed(self._out[number][1], arc, renamed))
-
-    def out(self) -> Iterator[tuple[int, RcName, HolderSet]]:
-        """The proposals that are out."""
-        for number, (rc, holders) in self._out.items():
-            yield number, rc, holders
+                self.out[number] = (rc, _renamed(self.out[number][1], arc, renamed))
 
     def _ballot(self, rc: RcName) -> RcVotes:
         ballot = self._ballots.get(rc)
@@ -249,4 +244,4 @@ class Votes:
     def _close(self, ballot: RcVotes, holders: HolderSet) -> None:
         ballot.overdue.discard(holders)
         for number in ballot.out.pop(holders, ()):
-            del self._out[number]
+            del self.out[number]
