@@ -75,7 +75,7 @@ class Lifecycle:
         if record.state == "given_up":
             self._finish(record, "ended", "stopped")
         elif record.state not in ("ended", "stopping"):
-            record.enter("stopping")
+            record.state = "stopping"
             record.reason = "asked to stop"
             self._end_incarnation(record)
 
@@ -83,7 +83,7 @@ class Lifecycle:
 
     def place_again(self, record: ComponentRecord, cause: str = "") -> None:
         """Has it placed at the end of this instant."""
-        record.enter("waiting")
+        record.state = "waiting"
         record.restart_cause, record.whereabouts_unknown = cause, False
         self.state.wake(record, None)
         self.state.to_place[record.component] = None
@@ -135,7 +135,7 @@ class Lifecycle:
 
     def _start_on(self, record: ComponentRecord, chosen: RankedHost) -> None:
         state, cause = self.state, record.restart_cause
-        record.enter("starting")
+        record.state = "starting"
         record.incarnation = state.next_incarnation(record.component)
         record.host, record.superseded, record.running_since = chosen.host, False, None
         record.token, record.confirmed, record.probed, record.unanswered = False, False, False, 0
@@ -144,12 +144,12 @@ class Lifecycle:
         state.start(record)
 
     def _back_off(self, record: ComponentRecord, reason: str, pause: Ns) -> None:
-        record.enter("backing_off")
+        record.state = "backing_off"
         record.reason = reason
         self.state.wake(record, self.state.now + pause)
 
     def _finish(self, record: ComponentRecord, over: ComponentState, reason: str) -> None:
-        record.enter(over)
+        record.state = over
         record.reason, record.drain_reason, record.restart_cause = reason, "", ""
         record.whereabouts_unknown = False
         self.state.retire(record)
@@ -201,7 +201,7 @@ class Lifecycle:
     def runs(self, record: ComponentRecord, *, anew: bool = False) -> None:
         """It is known to run where it is; `anew`: as another incarnation than before."""
         if record.state != "running" or anew:
-            record.enter("running")
+            record.state = "running"
             record.running_since, record.whereabouts_unknown = self.state.now, False
             record.failed_rounds, record.reason = 0, record.host_reason
             record.tried.clear()

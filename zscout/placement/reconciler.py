@@ -180,7 +180,7 @@ class Reconciler:
                 else:
                     self.lifecycle.runs(record)
             elif record.state in ("waiting", "backing_off"):
-                record.enter("starting")
+                record.state = "starting"
                 self.state.start(record)
 
     def _listed_as_ended(

@@ -54,16 +54,6 @@ MAX_ENDED_INCARNATIONS: Final = 16
 HOSTS_NAMED: Final = 3
 """In the reason why there is no eligible host."""
 
-TRANSITIONS: Final[Mapping[ComponentState, frozenset[ComponentState]]] = {
-    "waiting": frozenset({"starting", "running", "backing_off", "stopping", "ended", "given_up"}),
-    "starting": frozenset({"waiting", "running", "backing_off", "stopping", "ended", "given_up"}),
-    "running": frozenset({"waiting", "moving", "backing_off", "stopping", "ended", "given_up"}),
-    "moving": frozenset({"running"}),
-    "backing_off": frozenset({"waiting", "starting", "running", "stopping", "ended", "given_up"}),
-    "stopping": frozenset({"waiting", "ended"}),
-    "ended": frozenset({"waiting"}),
-    "given_up": frozenset({"waiting", "ended"}),
-}
 OVER: Final[frozenset[ComponentState]] = frozenset({"ended", "given_up"})
 
 GONE: Final = Exclusion("gone", "its node is not there")
@@ -110,7 +100,6 @@ class ComponentRecord:
     component: ComponentId
     spec: ComponentSpec
     state: ComponentState = "waiting"
-    """Changed by `enter` alone."""
     incarnation: Incarnation = 0
     superseded: bool = False
     """The incarnation belongs to what was placed before under this name, and must not live."""
@@ -153,12 +142,6 @@ class ComponentRecord:
     ended_incarnations: deque[Incarnation] = field(
         default_factory=lambda: deque(maxlen=MAX_ENDED_INCARNATIONS)
     )
-
-    def enter(self, state: ComponentState) -> None:
-        """Raises ValueError for a transition that the table does not have."""
-        if state not in TRANSITIONS[self.state] and state != self.state:
-            raise ValueError(f"{self.component}: from {self.state} to {state}")
-        self.state = state
 
     def status(self) -> Placement:
         return Placement(

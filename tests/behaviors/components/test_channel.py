@@ -107,7 +107,7 @@ def test_a_stream_is_read_alike() -> None:
 
 def test_nothing_too_long_is_sent() -> None:
     with pytest.raises(BadFrame, match="too many"):
-        channel.pack(channel.CheckpointTaken(1, b"x" * channel.MAX_FRAME))
+        channel.pack(channel.OrderAnswer(1, b"x" * channel.MAX_FRAME))
 
 
 def test_a_move_as_large_as_the_mesh_takes_fits() -> None:

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Final, Literal, TypeAlias
 import msgspec
 
 from zscout.config.fleet import Fleet
-from zscout.messages import MAX_MOVE, HowEnded, OpenRequest
+from zscout.messages import MAX_MOVE, HowEnded, OpenRequest, Problem
 
 MAX_FRAME: Final = MAX_MOVE + 65_536
 """Bytes."""
@@ -44,14 +44,14 @@ class StopOrder(msgspec.Struct, frozen=True, tag="stop"):
 
 
 class CheckpointOrder(msgspec.Struct, frozen=True, tag="checkpoint"):
-    """Answered with CheckpointTaken."""
+    """Answered with the state."""
 
     number: int
     patience: float
 
 
 class MoveOrder(msgspec.Struct, frozen=True, tag="move"):
-    """Answered with MovedAway, and then it ends."""
+    """Answered once it goes on elsewhere; then it ends here."""
 
     number: int
     to: str
@@ -60,7 +60,7 @@ class MoveOrder(msgspec.Struct, frozen=True, tag="move"):
 
 
 class RestoreOrder(msgspec.Struct, frozen=True, tag="restore"):
-    """Answered with OrderDone."""
+    """Take this in; answered."""
 
     number: int
     state: bytes
@@ -81,28 +81,14 @@ class PhaseReport(msgspec.Struct, frozen=True, tag="stands"):
     movable: bool
 
 
-class CheckpointTaken(msgspec.Struct, frozen=True, tag="taken"):
-    number: int
-    state: bytes
-
-
-class MovedAway(msgspec.Struct, frozen=True, tag="gone"):
-    """It goes on elsewhere; `dead` seconds lay between."""
+class OrderAnswer(msgspec.Struct, frozen=True, tag="answer"):
+    """To the order of this number: the state of a component, or how long (s) a move took it out of work.
+    `problem`: it was not carried out, and the component goes on."""
 
     number: int
-    dead: float
-
-
-class OrderDone(msgspec.Struct, frozen=True, tag="done"):
-    number: int
-
-
-class OrderDeclined(msgspec.Struct, frozen=True, tag="declined"):
-    """An order that was not carried out; the component goes on."""
-
-    number: int
-    code: str
-    message: str
+    state: bytes = b""
+    dead: float = 0.0
+    problem: Problem | None = None
 
 
 class EndReport(msgspec.Struct, frozen=True, tag="ends"):
@@ -112,7 +98,6 @@ class EndReport(msgspec.Struct, frozen=True, tag="ends"):
     reason: str = ""
 
 
-OrderAnswer: TypeAlias = CheckpointTaken | MovedAway | OrderDone | OrderDeclined
 ComponentReport: TypeAlias = PhaseReport | OrderAnswer | EndReport
 
 

@@ -15,6 +15,7 @@ from zscout.behaviors.components.channel import (
     ComponentReport,
     EndReport,
     Order,
+    OrderAnswer,
     PhaseReport,
 )
 from zscout.behaviors.components.component import (
@@ -28,7 +29,7 @@ from zscout.behaviors.components.processes import limit_allocations
 from zscout.keyexpr import BadName, Role, Token, incarnation_of, matcher, new_instance
 from zscout.mesh import Declaration, MeshError
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import MAX_ERROR
+from zscout.messages import MAX_ERROR, Problem
 
 STAND_BY: Final = 30.0
 """Seconds that one stands by without being restored or activated, and then again until it is activated."""
@@ -213,7 +214,7 @@ class ComponentLifecycle:
         try:
             await carried_out
         except NotMoved as refused:
-            await self._tell(channel.OrderDeclined(number, refused.code, str(refused)))
+            await self._tell(OrderAnswer(number, problem=Problem(refused.code, str(refused))))
 
     def _movable(self, *, standby: bool = False) -> tuple[Component, Client]:
         """Raises NotMoved where it does not run, or stand by, or can't be moved at all."""
@@ -234,7 +235,7 @@ class ComponentLifecycle:
                 state = state_of(component)
             finally:
                 self._gate.release()
-        await self._tell(channel.CheckpointTaken(order.number, state))
+        await self._tell(OrderAnswer(order.number, state))
 
     async def _move_away(self, order: channel.MoveOrder) -> None:
         component, client = self._movable()
@@ -252,7 +253,7 @@ class ComponentLifecycle:
                 traceback.print_exc()
                 raise NotMoved("move_failed", _words(error)) from None
             self._away = EndReport("moved")
-            await self._tell(channel.MovedAway(order.number, dead))
+            await self._tell(OrderAnswer(order.number, dead=dead))
             self._left.set()
 
     async def _take_in(self, order: channel.RestoreOrder) -> None:
@@ -273,7 +274,7 @@ class ComponentLifecycle:
         except (BadName, ValueError) as error:
             raise NotMoved("bad_request", _words(error, named=False)) from None
         self._restored.set()
-        await self._tell(channel.OrderDone(order.number))
+        await self._tell(OrderAnswer(order.number))
 
     def _on_component(self, token: Token, alive: bool) -> None:
         if not alive or token.name != self._job.component:

@@ -18,13 +18,10 @@ import msgspec
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import (
     BadFrame,
-    CheckpointTaken,
     ComponentJob,
     ComponentReport,
     EndReport,
-    MovedAway,
     OrderAnswer,
-    OrderDeclined,
     PhaseReport,
 )
 from zscout.behaviors.components.processes import VARIABLE, kill_family
@@ -147,9 +144,7 @@ class ComponentProcess:
 
     async def checkpoint(self) -> bytes:
         self._check_runs()
-        answer = await self._ask(channel.CheckpointOrder(self._next(), PATIENCE), PATIENCE + SLACK)
-        assert isinstance(answer, CheckpointTaken)  # noqa: S101 - of an order that is answered so
-        return answer.state
+        return (await self._ask(channel.CheckpointOrder(self._next(), PATIENCE), PATIENCE + SLACK)).state
 
     async def move(self, order: MoveComponent) -> Moved:
         """Asked again for the same move it answers with the outcome of that one."""
@@ -165,10 +160,8 @@ class ComponentProcess:
 
     async def _move(self, order: MoveComponent) -> Moved:
         # Without an end: once it is committed it may last until the other node is known to be gone.
-        answer = await self._ask(
-            channel.MoveOrder(self._next(), order.to, order.to_incarnation, order.patience), None
-        )
-        assert isinstance(answer, MovedAway)  # noqa: S101
+        move = channel.MoveOrder(self._next(), order.to, order.to_incarnation, order.patience)
+        answer = await self._ask(move, None)
         if self.phase == "running":
             self.phase = "stopping"
         self.moved = Moved(order.component, order.to, order.to_incarnation, answer.dead)
@@ -199,8 +192,8 @@ class ComponentProcess:
             raise Refused("not_safe", f"it did not answer within {timeout:g} s") from None
         finally:
             self._waiting.pop(order.number, None)
-        if isinstance(answer, OrderDeclined):
-            raise Refused(answer.code, answer.message)
+        if answer.problem is not None:
+            raise Refused(answer.problem.code, answer.problem.message)
         return answer
 
     def _send(self, order: msgspec.Struct) -> None:
@@ -318,7 +311,7 @@ class ComponentProcess:
                     return
                 self._on_message(telling)
         except BadFrame as error:
-            self._kill(EndReport("failed", f"it was killed: what it said to its node is no message: {error}"))
+            self._kill(EndReport("failed", f"it was killed: what it sent to its node is no message: {error}"))
 
     def _on_message(self, telling: ComponentReport) -> None:
         match telling:
