@@ -124,11 +124,11 @@ def check_rc(rc: RcConfig, at: Where) -> None:
         case RadioRc():
             _check_source(rc.port, at / "port", A_PORT)
         case RobotRc():
-            _check_kind(rc.radio, "radio", at / "radio")
+            check_rc_name(rc.radio, at / "radio", "radio")
             channels: dict[int, str] = {}
             for video, channel in rc.channels.items():
                 here = at / "channels" / video
-                _check_kind(video, "video", here)
+                check_rc_name(video, here, "video")
                 if channel in channels:
                     raise here.bad(f"is {channel}, as {channels[channel]} is", "give each its own channel")
                 channels[channel] = video
@@ -146,14 +146,8 @@ def _check_sources(rc: FramegrabberRc, at: Where) -> None:
     elif not rc.sources:
         raise (at / "sources").bad("is empty", 'add one, as in "video/ch1" = "/dev/video0"')
     for video, source in (rc.sources or {}).items():
-        _check_kind(video, "video", at / "sources" / video)
+        check_rc_name(video, at / "sources" / video, "video")
         _check_source(source, at / "sources" / video, f'"{video}" = "/dev/video0"')
-
-
-def _check_kind(name: str, kind: str, at: Where) -> None:
-    check_rc_name(name, at)
-    if not name.startswith(f"{kind}/"):
-        raise at.bad(f"{quoted(name)} is no {kind}", f'name one, as in "{kind}/..."')
 
 
 def _check_source(text: str, at: Where, example: str) -> None:

@@ -152,6 +152,11 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
         raise where.bad("is nested too deep", "no key goes deeper than a few tables") from None
     except ValueError:  # Python's limit of digits, the only one that tomllib does not turn into its own error
         raise where.bad("a whole number has thousands of digits", "shorten it") from None
+    return convert(data, type, where)
+
+
+def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msgspec's word
+    """What TOML or JSON gave, as a struct. Raises BadInput."""
     try:
         return msgspec.convert(_checked(inspect.type_info(type), data, where), type)
     except msgspec.ValidationError as error:  # what only msgspec knows of, as other bounds than `key` gives
@@ -165,12 +170,15 @@ def check_name(value: str, where: Where) -> str:
     return value
 
 
-def check_rc_name(value: str, where: Where) -> str:
-    """Returns the name of an RC if it is `kind/name`, both names by themselves. Raises BadInput."""
+def check_rc_name(value: str, where: Where, of: str = "") -> str:
+    """Returns the name of an RC if it is `kind/name`, both names by themselves, and of kind `of` if that is
+    given. Raises BadInput."""
     kind, _, name = value.partition("/")
     if not (NAME.fullmatch(kind) and NAME.fullmatch(name)):
         remedy = f'write kind/name, as in "robot/scout33", each of {_NAME_RULE}'
         raise where.bad(f"{quoted(value)} is not the name of an RC", remedy)
+    if of not in ("", kind):
+        raise where.bad(f"{quoted(value)} is no {of}", f'name one, as in "{of}/..."')
     return value
 
 
@@ -244,12 +252,12 @@ def _decimal(text: str) -> Decimal:
 
 _LEAVES: Final[Mapping[type[inspect.Type], tuple[tuple[type, ...], str]]] = {
     inspect.IntType: ((int,), "a whole number"),
-    inspect.FloatType: ((int, Decimal), "a number"),
+    inspect.FloatType: ((int, float, Decimal), "a number"),
     inspect.DecimalType: ((int, Decimal), "a number"),
     inspect.StrType: ((str,), "a text in quotes"),
     inspect.BoolType: ((bool,), "true or false"),
 }
-"""What TOML gives for a type, and how people call that."""
+"""What TOML, or JSON, gives for a type, and how people call that."""
 
 
 def _checked(kind: inspect.Type, value: object, where: Where) -> object:
@@ -356,7 +364,7 @@ def _check_leaf(kind: inspect.Type, value: object, where: Where) -> None:
     if low is not None and high is not None:
         wanted += f" from {low} to {high}"
     _expect(types, value, where, wanted)
-    if not isinstance(value, int | Decimal) or isinstance(value, bool):
+    if not isinstance(value, int | float | Decimal) or isinstance(value, bool):
         return
     number = Decimal(value)
     if not number.is_finite():
@@ -376,7 +384,9 @@ def _shown(value: object) -> str:
             return "true" if value else "false"
         case str():
             return f"the text {quoted(value)}"
-        case int() | Decimal():
+        case None:
+            return "null"
+        case int() | float() | Decimal():
             return _short(str(value))
         case dict():
             return "a table"

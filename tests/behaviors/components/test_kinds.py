@@ -52,13 +52,13 @@ def test_what_is_no_component_is_refused_in_one_line(where: str) -> None:
 
 
 BAD = [
-    (Spin, {"cpu": 2}, "cpu is 2; write a number from 0 to 1"),
-    (Spin, {"cpu": True}, "cpu is True"),
-    (Spin, {"cpu": float("nan")}, "cpu is nan"),
-    (Spin, {"cores": 2}, "no parameter 'cores'; there are cpu, memory"),
-    (Counter, {"rc": 5}, "kind/name"),
+    (Spin, {"cpu": 2}, "cpu: is 2; write a number from 0 to 1"),
+    (Spin, {"cpu": True}, "cpu: is true"),
+    (Spin, {"cpu": float("nan")}, "cpu: is not a finite number"),
+    (Spin, {"cores": 2}, "cores: unknown key; known here: cpu, memory"),
+    (Counter, {"rc": 5}, "rc: is 5; write a text"),
     (Counter, {"rc": "robot"}, "kind/name"),
-    (Counter, {"period": 0}, "period is 0"),
+    (Counter, {"period": 0}, "period: is 0"),
 ]
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from tests.config.kit import NAME_RULE, RC_RULE
 from zscout.behaviors.components import kinds
 from zscout.behaviors.components.component import is_movable
 from zscout.behaviors.components.sensor_net import PlaceRobotComponent, PlaceSensorNetComponent, StatusPrinter
@@ -15,66 +16,88 @@ from zscout.messages import BehaviorSaid
 
 ONE: dict[str, Any] = {"robot": "robot/scout33"}
 TWO: dict[str, Any] = {"robots": ["robot/scout33", "robot/scout35"]}
-ROBOT_LIST = 'write a list of 1 to 64, as in ["robot/scout33"]'
-A_ROBOT = "write a robot, as in robot/scout33"
 
 SHARED: list[tuple[dict[str, Any], str]] = [
-    ({"radio": "robot/scout33"}, "radio is 'robot/scout33'; write radio/NAME or a pattern, as in radio/*"),
-    ({"radio": "rf0"}, "radio is 'rf0'; write radio/NAME or a pattern, as in radio/*"),
-    ({"video": None}, "video is None; write video/NAME or a pattern, as in video/*"),
-    ({"video": "video/**"}, "video: need 'video/**' is not valid: "),
-    ({"framegrabber": ["framegrabber/fgrab1"]}, "framegrabber is ['framegrabber/fgrab1']; write "),
-    ({"framegrabber": "framegrabber/a/b"}, "framegrabber: RC name 'a/b' is not valid: "),
-    ({"framegrabber": "framegrabber/"}, "framegrabber: RC name '' is not valid: "),
-    ({"command_rate": 0}, "command_rate is 0; write a number from 0.5 to 50"),
-    ({"command_rate": 50.1}, "command_rate is 50.1; write a number from 0.5 to 50"),
-    ({"command_rate": "5"}, "command_rate is '5'; write a number from 0.5 to 50"),
-    ({"speed": 0}, "speed is 0; write a number from 0.01 to 100"),
-    ({"speed": float("nan")}, "speed is nan; write a number from 0.01 to 100"),
-    ({"speed": True}, "speed is True; write a number from 0.01 to 100"),
-    ({"hide_slot": -1}, "hide_slot is -1; write a number from 1 to 3600"),
-    ({"watch_slot": float("inf")}, "watch_slot is inf; write a number from 1 to 3600"),
-    ({"hide_priority": 1.5}, "hide_priority is 1.5; write a whole number from -1000 to 1000"),
-    ({"watch_priority": 1001}, "watch_priority is 1001; write a whole number from -1000 to 1000"),
-    ({"watch_priority": False}, "watch_priority is False; write a whole number from -1000 to 1000"),
-    ({"watch_priorty": 1}, "there is no parameter 'watch_priorty'; there are robot"),
+    (
+        {"radio": "robot/scout33"},
+        'radio: "robot/scout33" is no radio; name one, or a pattern, as in "radio/*"',
+    ),
+    ({"radio": "rf0"}, 'radio: "rf0" is no radio; name one, or a pattern, as in "radio/*"'),
+    ({"video": None}, "video: is null; write a text in quotes"),
+    ({"video": "video/**"}, 'video: "video/**" is no video; name one, or a pattern, as in "video/*"'),
+    ({"framegrabber": ["framegrabber/fgrab1"]}, "framegrabber: is a list; write a text in quotes"),
+    (
+        {"framegrabber": "framegrabber/a/b"},
+        'framegrabber: "framegrabber/a/b" is no framegrabber; name one, or a pattern, as in "framegrabber/*"',
+    ),
+    (
+        {"framegrabber": "framegrabber/"},
+        'framegrabber: "framegrabber/" is no framegrabber; name one, or a pattern, as in "framegrabber/*"',
+    ),
+    ({"command_rate": 0}, "command_rate: is 0; write a number from 0.5 to 50"),
+    ({"command_rate": 50.1}, "command_rate: is 50.1; write a number from 0.5 to 50"),
+    ({"command_rate": "5"}, 'command_rate: is the text "5"; write a number from 0.5 to 50'),
+    ({"speed": 0}, "speed: is 0; write a number from 0.01 to 100"),
+    ({"speed": float("nan")}, "speed: is not a finite number; write a number from 0.01 to 100"),
+    ({"speed": True}, "speed: is true; write a number from 0.01 to 100"),
+    ({"hide_slot": -1}, "hide_slot: is -1; write a number from 1 to 3600"),
+    ({"watch_slot": float("inf")}, "watch_slot: is not a finite number; write a number from 1 to 3600"),
+    ({"hide_priority": 1.5}, "hide_priority: is 1.5; write a whole number from -1000 to 1000"),
+    ({"watch_priority": 1001}, "watch_priority: is 1001; write a whole number from -1000 to 1000"),
+    ({"watch_priority": False}, "watch_priority: is false; write a whole number from -1000 to 1000"),
+    (
+        {"watch_priorty": 1},
+        "watch_priorty: unknown key; did you mean watch_priority, watch_slot or hide_priority?",
+    ),
 ]
-"""Wrong for both, with how the words begin."""
+"""Wrong for both, with the words after `params`."""
 
 OF_ONE: list[tuple[dict[str, Any], str]] = [
-    ({}, "robot is missing; write one, as in robot/scout33"),
-    ({"robot": None}, f"robot is None; {A_ROBOT}"),
-    ({"robot": "scout33"}, f"robot is 'scout33'; {A_ROBOT}"),
-    ({"robot": "radio/rf0"}, f"robot is 'radio/rf0'; {A_ROBOT}"),
-    ({"robot": "robot/*"}, "robot: RC name '*' is not valid: "),
-    ({"robot": ["robot/scout33"]}, f"robot is ['robot/scout33']; {A_ROBOT}"),
-    (ONE | {"above": 3}, "above is 3; write the path of a behavior, 100 letters at most"),
-    (ONE | {"above": "x" * 101}, "above is 'xxx"),
-    (TWO, "there is no parameter 'robots'; there are robot, above, "),
+    ({}, "robot: is missing; add one, as in robot/scout33"),
+    ({"robot": None}, "robot: is null; write a text in quotes"),
+    ({"robot": "scout33"}, f'robot: "scout33" is not the name of an RC; {RC_RULE}'),
+    ({"robot": "radio/rf0"}, 'robot: "radio/rf0" is no robot; name one, as in "robot/..."'),
+    ({"robot": "robot/*"}, f'robot: "robot/*" is not the name of an RC; {RC_RULE}'),
+    ({"robot": ["robot/scout33"]}, "robot: is a list; write a text in quotes"),
+    (ONE | {"above": 3}, "above: is 3; write a text in quotes"),
+    (ONE | {"above": "x" * 101}, "Expected `str` of length <= 100 - at `$.above`; mend it"),
+    (TWO, "robots: unknown key; did you mean robot?"),
 ]
 
 OF_NET: list[tuple[dict[str, Any], str]] = [
-    ({}, f"robots is missing; {ROBOT_LIST}"),
-    ({"robots": None}, f"robots is None; {ROBOT_LIST}"),
-    ({"robots": []}, f"robots is []; {ROBOT_LIST}"),
-    ({"robots": "robot/scout33"}, f"robots is 'robot/scout33'; {ROBOT_LIST}"),
-    ({"robots": {"robot/scout33": 1}}, f"robots is {{'robot/scout33': 1}}; {ROBOT_LIST}"),
-    ({"robots": [f"robot/scout{number}" for number in range(65)]}, "robots is ['robot/scout0', "),
-    ({"robots": ["robot/scout33", 35]}, f"robots[1] is 35; {A_ROBOT}"),
-    ({"robots": ["framegrabber/fgrab1"]}, f"robots[0] is 'framegrabber/fgrab1'; {A_ROBOT}"),
-    ({"robots": ["robot/*"]}, "robots[0]: RC name '*' is not valid: "),
+    ({}, 'robots: is missing; add a list, as in ["robot/scout33"]'),
+    ({"robots": None}, "robots: is null; write a list"),
+    ({"robots": []}, 'robots: is empty; name one, as in ["robot/scout33"]'),
+    ({"robots": "robot/scout33"}, 'robots: is the text "robot/scout33"; write a list'),
+    ({"robots": {"robot/scout33": 1}}, "robots: is a table; write a list"),
+    (
+        {"robots": [f"robot/scout{number}" for number in range(65)]},
+        "robots: has 65 entries; at most 64 are allowed",
+    ),
+    ({"robots": ["robot/scout33", 35]}, "robots[1]: is 35; write a text in quotes"),
+    (
+        {"robots": ["framegrabber/fgrab1"]},
+        'robots[0]: "framegrabber/fgrab1" is no robot; name one, as in "robot/..."',
+    ),
+    ({"robots": ["robot/*"]}, f'robots[0]: "robot/*" is not the name of an RC; {RC_RULE}'),
     (
         {"robots": ["robot/scout33", "robot/scout35", "robot/scout33"]},
-        "robots: robot/scout33 is named twice; name each robot once",
+        'robots[2]: "robot/scout33" stands at robots[0] already; rename or remove one of the two',
     ),
-    (TWO | {"wanted": 0}, "wanted is 0; write a whole number from 1 to 2"),
-    (TWO | {"wanted": 3}, "wanted is 3; write a whole number from 1 to 2"),
-    (TWO | {"wanted": 1.0}, "wanted is 1.0; write a whole number from 1 to 2"),
-    (TWO | {"wanted": True}, "wanted is True; write a whole number from 1 to 2"),
-    (TWO | {"name": "../net"}, "name '../net' is not valid: "),
-    (TWO | {"name": ""}, "name '' is not valid: "),
-    (TWO | {"name": ["net"]}, "name \"['net']\" is not valid: "),
-    (TWO | {"above": "net"}, "there is no parameter 'above'; there are robots, wanted, name, "),
+    (TWO | {"wanted": 0}, "wanted: is 0; write a whole number from 1 to 2"),
+    (TWO | {"wanted": 3}, "wanted: is 3; write a whole number from 1 to 2"),
+    (TWO | {"wanted": 1.0}, "wanted: is 1.0; write a whole number"),
+    (TWO | {"wanted": True}, "wanted: is true; write a whole number"),
+    (TWO | {"name": "../net"}, f'name: "../net" is not a name; {NAME_RULE}'),
+    (TWO | {"name": ""}, f'name: "" is not a name; {NAME_RULE}'),
+    (TWO | {"name": ["net"]}, "name: is a list; write a text in quotes"),
+    (
+        TWO | {"above": "net"},
+        (
+            "above: unknown key; known here: command_rate, framegrabber, hide_priority, hide_slot, "
+            "name, radio, robots, speed, video, wanted, watch_priority, watch_slot"
+        ),
+    ),
 ]
 
 WRONG = [
@@ -94,7 +117,7 @@ def test_what_is_wrong_is_told_in_one_line(
     with pytest.raises(ValueError) as told:  # noqa: PT011 - the words are what is tested
         kind(params)
     line = str(told.value)
-    assert line.startswith(words)
+    assert line == f"params: {words}"
     assert "\n" not in line
     assert len(line) < 300
 

@@ -4,34 +4,77 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+from msgspec import Meta, Struct, structs
 
 from zscout.behaviors.components.component import Component, ComponentContext
-from zscout.behaviors.components.shipped import check_known, figure
+from zscout.behaviors.components.shipped import PARAMS, read_params
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.net import SensorNet
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot, Slots
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
 from zscout.behaviors.tree import Behavior, BehaviorContext, StatusPublisher
-from zscout.keyexpr import BadName, check_name, check_need, check_rc
+from zscout.config.strict import BadInput, check_name, check_rc_name, check_unique, key, quoted
+from zscout.keyexpr import BadName, check_need
 from zscout.mesh.supervision import supervised
 from zscout.messages import BehaviorSaid, ComponentSpec
 
 MAX_ROBOTS: Final = 64
-MAX_SPEED: Final = 100.0
-MAX_RATE: Final = 50.0
-MAX_SLOT: Final = 3_600.0
 MAX_PATH: Final = 100
-_NEEDS: Final = ("radio", "video", "framegrabber")
-_SHARED: Final[tuple[str, ...]] = (
-    *_NEEDS,
-    "command_rate",
-    "hide_priority",
-    "watch_priority",
-    "hide_slot",
-    "watch_slot",
-    "speed",
-)
+
+Priority = Annotated[int, key("Of an ARC.", -1000, 1000)]
+Slot = Annotated[float, key("Seconds that a hold is kept before another of its rank may have it.", 1, 3600)]
+
+
+class SharedParams(Struct, kw_only=True):
+    """Parameters of both kinds. `radio`, `video`, `framegrabber`: RCs or patterns, any of the kind at first.
+    `speed`: how many seconds of the robots' world pass in one of ours."""
+
+    radio: str = "radio/*"
+    video: str = "video/*"
+    framegrabber: str = "framegrabber/*"
+    command_rate: Annotated[float, key("Commands in a second.", 0.5, 50)] = 5.0
+    hide_priority: Priority = 2
+    watch_priority: Priority = 1
+    hide_slot: Slot = 30.0
+    watch_slot: Slot = 20.0
+    speed: Annotated[float, key("Seconds in one of ours.", 0.01, 100)] = 1.0
+
+    def needs(self, robot: str) -> RobotNeeds:
+        """Raises BadInput."""
+        check_rc_name(robot, PARAMS / "robot", "robot")
+        for kind, need in (("radio", self.radio), ("video", self.video), ("framegrabber", self.framegrabber)):
+            try:
+                fits = check_need(need).startswith(f"{kind}/")
+            except BadName:
+                fits = False
+            if not fits:
+                remedy = f'name one, or a pattern, as in "{kind}/*"'
+                raise (PARAMS / kind).bad(f"{quoted(need)} is no {kind}", remedy)
+        return RobotNeeds(robot, self.radio, self.video, self.framegrabber, self.command_rate)
+
+    def slots(self) -> Slots:
+        return Slots(self.hide_priority, self.watch_priority, self.hide_slot, self.watch_slot)
+
+
+class RobotParams(SharedParams):
+    """Parameters of `place_robot`. `above`: the path of the behavior that it belongs to."""
+
+    robot: Annotated[str, key("To be placed.", remedy="add one, as in robot/scout33")]
+    above: Annotated[str, Meta(max_length=MAX_PATH)] = ""
+
+
+class NetParams(SharedParams):
+    """Parameters of `place_sensor_net`. `wanted`: how many robots are to be placed (all), the others stand in
+    for those that are lost; `name`: of its behavior and before the names of its components, so that a second
+    net needs another one."""
+
+    robots: Annotated[
+        tuple[str, ...], key("To be placed.", most=MAX_ROBOTS, remedy='add a list, as in ["robot/scout33"]')
+    ]
+    wanted: int | None = None
+    name: str = "place_sensor_net"
 
 
 class TreeComponent(Component):
@@ -85,46 +128,43 @@ class StatusPrinter:
 
 
 class PlaceRobotComponent(TreeComponent):
-    """Hides one robot in the dark and has it watch for motion.
-
-    Parameters: `robot`, as robot/scout33; `radio`, `video`, `framegrabber`, RCs or patterns (any of the
-    kind); `command_rate`, commands in a second (5); `hide_priority` (2) and `watch_priority` (1) of its ARCs,
-    `hide_slot` (30) and `watch_slot` (20), seconds that it keeps what it holds before another of its rank may
-    have it; `speed`, how many seconds of the robots' world pass in one of ours (1); `above`, the path of the
-    behavior that it belongs to."""
+    """Hides one robot in the dark and has it watch for motion."""
 
     def __init__(self, params: dict[str, Any]) -> None:
-        check_known(params, "robot", "above", *_SHARED)
-        robot = _robot(params)
-        self.speed = figure(params, "speed", 1.0, low=0.01, high=MAX_SPEED)
-        self.root = PlaceRobot(robot.partition("/")[2], _needs(params, robot), _slots(params))
-        above = params.get("above", "")
-        if not isinstance(above, str) or len(above) > MAX_PATH:
-            raise ValueError(
-                f"above is {above!r:.60}; write the path of a behavior, {MAX_PATH} letters at most"
-            )
-        self.root.above = above
+        wanted = read_params(params, RobotParams)
+        try:
+            needs = wanted.needs(wanted.robot)
+        except BadInput as error:
+            raise ValueError(str(error)) from None
+        self.speed = wanted.speed
+        self.root = PlaceRobot(wanted.robot.partition("/")[2], needs, wanted.slots())
+        self.root.above = wanted.above
 
 
 class PlaceSensorNetComponent(TreeComponent):
-    """Has robots hide and watch, each by a component `place_robot` of its own.
-
-    Parameters: `robots`, a list of them; `wanted`, how many are to be placed (all), the others stand in for
-    those that are lost; `name`, of its behavior and before the names of its components (place_sensor_net): a
-    second net needs another one; and those of `place_robot`, but for `robot` and `above`."""
+    """Has robots hide and watch, each by a component `place_robot` of its own."""
 
     def __init__(self, params: dict[str, Any]) -> None:
-        check_known(params, "robots", "wanted", "name", *_SHARED)
-        robots = _robots(params)
-        wanted = _whole(params, "wanted", len(robots), low=1, high=len(robots))
-        self.speed = figure(params, "speed", 1.0, low=0.01, high=MAX_SPEED)
-        # Wrong ones are told here and now, not by each robot's component.
-        _needs(params, robots[0])
-        _slots(params)
-        self._shared: dict[str, Any] = {name: params[name] for name in _SHARED if name in params}
-        name = params.get("name", "place_sensor_net")
-        check_name(name if isinstance(name, str) else repr(name), "name")
-        self.root = PlaceSensorNet(name, SensorNet(robots, wanted), self._spec_for)
+        net = read_params(params, NetParams)
+        wanted = len(net.robots) if net.wanted is None else net.wanted
+        try:
+            for number, robot in enumerate(net.robots):
+                check_rc_name(robot, (PARAMS / "robots").item(number), "robot")
+            check_unique(net.robots, PARAMS / "robots")
+            if not net.robots:
+                raise (PARAMS / "robots").bad("is empty", 'name one, as in ["robot/scout33"]')
+            if not 1 <= wanted <= len(net.robots):
+                remedy = f"write a whole number from 1 to {len(net.robots)}"
+                raise (PARAMS / "wanted").bad(f"is {wanted}", remedy)
+            check_name(net.name, PARAMS / "name")
+            # Wrong ones are reported here and now, not by each robot's component.
+            net.needs(net.robots[0])
+        except BadInput as error:
+            raise ValueError(str(error)) from None
+        self.speed = net.speed
+        shared = [field.name for field in structs.fields(SharedParams)]
+        self._shared: dict[str, Any] = {name: params[name] for name in shared if name in params}
+        self.root = PlaceSensorNet(net.name, SensorNet(list(net.robots), wanted), self._spec_for)
 
     def _spec_for(self, robot: str, path: str) -> ComponentSpec:
         return ComponentSpec(
@@ -132,66 +172,3 @@ class PlaceSensorNetComponent(TreeComponent):
             params={**self._shared, "robot": robot, "above": path},
             restart="always",
         )
-
-
-def _needs(params: dict[str, Any], robot: str) -> RobotNeeds:
-    return RobotNeeds(
-        robot,
-        **{name: _need(params, name) for name in _NEEDS},
-        command_rate=figure(params, "command_rate", 5.0, low=0.5, high=MAX_RATE),
-    )
-
-
-def _slots(params: dict[str, Any]) -> Slots:
-    return Slots(
-        hide_priority=_whole(params, "hide_priority", 2, low=-1000, high=1000),
-        watch_priority=_whole(params, "watch_priority", 1, low=-1000, high=1000),
-        hide=figure(params, "hide_slot", 30.0, low=1.0, high=MAX_SLOT),
-        watch=figure(params, "watch_slot", 20.0, low=1.0, high=MAX_SLOT),
-    )
-
-
-def _whole(params: dict[str, Any], name: str, default: int, *, low: int, high: int) -> int:
-    value = params.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise ValueError(f"{name} is {value!r:.60}; write a whole number from {low} to {high}")
-    return value
-
-
-def _robots(params: dict[str, Any]) -> list[str]:
-    robots = params.get("robots")
-    if not isinstance(robots, list) or not 1 <= len(robots) <= MAX_ROBOTS:
-        found = f"is {robots!r:.60}" if "robots" in params else "is missing"
-        raise ValueError(f'robots {found}; write a list of 1 to {MAX_ROBOTS}, as in ["robot/scout33"]')
-    for number, robot in enumerate(robots):
-        _check_robot(robot, f"robots[{number}]")
-        if robot in robots[:number]:
-            raise ValueError(f"robots: {robot} is named twice; name each robot once")
-    return robots
-
-
-def _robot(params: dict[str, Any]) -> str:
-    if "robot" not in params:
-        raise ValueError("robot is missing; write one, as in robot/scout33")
-    robot = params["robot"]
-    _check_robot(robot, "robot")
-    return str(robot)
-
-
-def _check_robot(robot: Any, what: str) -> None:
-    if not isinstance(robot, str) or not robot.startswith("robot/"):
-        raise ValueError(f"{what} is {robot!r:.60}; write a robot, as in robot/scout33")
-    try:
-        check_rc(robot)
-    except BadName as error:
-        raise ValueError(f"{what}: {error}") from None
-
-
-def _need(params: dict[str, Any], kind: str) -> str:
-    need = params.get(kind, f"{kind}/*")
-    if not isinstance(need, str) or not need.startswith(f"{kind}/"):
-        raise ValueError(f"{kind} is {need!r:.60}; write {kind}/NAME or a pattern, as in {kind}/*")
-    try:
-        return check_need(need)
-    except BadName as error:
-        raise ValueError(f"{kind}: {error}") from None

@@ -5,53 +5,49 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeVar
+
+from msgspec import Struct
 
 from zscout.behaviors.client.arc import Held, Revoked, holds
 from zscout.behaviors.client.client import CommandRefused
 from zscout.behaviors.components.component import Component, ComponentContext
-from zscout.keyexpr import BadName, check_need
+from zscout.config.strict import BadInput, Where, convert, key
+from zscout.keyexpr import check_need
 
+T = TypeVar("T", bound=Struct)
+
+PARAMS: Final = Where("params")
 SLICE: Final = 0.02
 """Seconds of a turn of `spin`: in between the event loop has its own."""
 MEGABYTE: Final = 1_000_000
-MAX_MEMORY: Final = 1_000_000
 PAGE: Final = 4_096
 PAUSE: Final = 0.1
 
 
-def figure(params: dict[str, Any], name: str, default: float, *, low: float, high: float) -> float:
-    """A number among parameters. Raises ValueError."""
-    value = params.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise ValueError(f"{name} is {value!r:.60}; write a number from {low:g} to {high:g}")
-    return float(value)
+def read_params(params: dict[str, Any], kind: type[T]) -> T:
+    """Raises ValueError."""
+    try:
+        return convert(params, kind, PARAMS)
+    except BadInput as error:
+        raise ValueError(str(error)) from None
 
 
-def check_known(params: dict[str, Any], *names: str) -> None:
-    """Raises ValueError for a parameter of another name."""
-    for name in params:
-        if name not in names:
-            raise ValueError(f"there is no parameter {name!r:.60}; there are {', '.join(names)}")
+class CounterParams(Struct):
+    """Parameters of `counter`."""
+
+    period: Annotated[float, key("Seconds from one count to the next.", 0.001, 3600)] = 1.0
+    rc: Annotated[str | None, key("An RC that it holds, and that echoes each count.")] = None
+    priority: Annotated[float, key("Of its ARC.", -1000, 1000)] = 0.0
+    min_runtime: Annotated[float, key("Of its ARC, in seconds.", 0.001, 1e9)] = 3600.0
 
 
 class Counter(Component):
-    """Counts, and prints each count.
-
-    Parameters: `period`, seconds from one to the next (1); `rc`, an RC that it holds, and that echoes each
-    count; `priority` of that (0); `min_runtime` of it in seconds (3600)."""
+    """Counts, and prints each count."""
 
     def __init__(self, params: dict[str, Any]) -> None:
-        check_known(params, "period", "rc", "priority", "min_runtime")
-        self.period = figure(params, "period", 1.0, low=0.001, high=3600)
-        self.priority = int(figure(params, "priority", 0, low=-1000, high=1000))
-        self.min_runtime = figure(params, "min_runtime", 3600, low=0.001, high=1e9)
-        self.rc = params.get("rc")
-        try:
-            if self.rc is not None:
-                check_need(self.rc if isinstance(self.rc, str) else repr(self.rc))
-        except BadName as error:
-            raise ValueError(str(error)) from None
+        self.params = read_params(params, CounterParams)
+        self.rc = None if self.params.rc is None else check_need(self.params.rc)
         self.count = 0
 
     async def run(self, context: ComponentContext) -> None:
@@ -63,8 +59,8 @@ class Counter(Component):
                     context.client,
                     context.component,
                     {self.rc: {}},
-                    priority=self.priority,
-                    min_runtime=self.min_runtime,
+                    priority=int(self.params.priority),
+                    min_runtime=self.params.min_runtime,
                 ):
                     async with attempt as held:
                         while True:
@@ -80,7 +76,7 @@ class Counter(Component):
         self.count = number
         print(self.count)  # noqa: T201 - its output
         await context.safe_point()
-        await asyncio.sleep(self.period)
+        await asyncio.sleep(self.params.period)
 
     def checkpoint(self) -> bytes:
         return json.dumps({"count": self.count}).encode()
@@ -89,15 +85,19 @@ class Counter(Component):
         self.count = int(json.loads(state)["count"])
 
 
-class Spin(Component):
-    """Computes, and prints how far it is once a second.
+class SpinParams(Struct):
+    """Parameters of `spin`."""
 
-    Parameters: `cpu`, the share of one core that it wants (0.5); `memory` in MB that it fills (0)."""
+    cpu: Annotated[float, key("The share of one core that it wants.", 0, 1)] = 0.5
+    memory: Annotated[float, key("In MB, that it fills.", 0, 1_000_000)] = 0.0
+
+
+class Spin(Component):
+    """Computes, and prints how far it is once a second."""
 
     def __init__(self, params: dict[str, Any]) -> None:
-        check_known(params, "cpu", "memory")
-        self.cpu = figure(params, "cpu", 0.5, low=0, high=1)
-        self.memory = bytearray(int(figure(params, "memory", 0, low=0, high=MAX_MEMORY) * MEGABYTE))
+        wanted = read_params(params, SpinParams)
+        self.cpu, self.memory = wanted.cpu, bytearray(int(wanted.memory * MEGABYTE))
         # Memory is only used once it is written to.
         self.memory[::PAGE] = b"\1" * len(self.memory[::PAGE])
         self.loops = 0
