@@ -35,12 +35,13 @@ from zscout.config.strict import BadInput
 from zscout.keyexpr import Role, Token
 from zscout.messages import Notice, RcState
 from zscout.services.recorder.colours import OPERATOR
-from zscout.services.recorder.files import new_recording, prune
 from zscout.services.recorder.process import (
     RecorderJob,
     Recording,
     beside,
     encode_job,
+    new_recording,
+    prune,
 )
 
 pytestmark = pytest.mark.live

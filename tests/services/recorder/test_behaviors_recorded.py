@@ -25,8 +25,7 @@ from zscout.messages import (
 from zscout.services.recorder import robot_tracker
 from zscout.services.recorder import robots as robot_panes
 from zscout.services.recorder.colours import DOING, OTHER
-from zscout.services.recorder.rate_limit import MAX_WAITING, RATE, RateLimiter
-from zscout.services.recorder.robot_tracker import RobotTracker
+from zscout.services.recorder.robot_tracker import MAX_WAITING, RATE, RateLimiter, RobotTracker
 from zscout.services.recorder.timeline import Timeline
 
 

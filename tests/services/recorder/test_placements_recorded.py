@@ -24,7 +24,8 @@ from zscout.mesh import IncomingQuery, Supervisor, ZenohMesh
 from zscout.messages import ListPlacements, Placement, Placements, PlacerOperation
 from zscout.services.recorder import hosts as module
 from zscout.services.recorder.hosts import Running, Use
-from zscout.services.recorder.placement_tracker import PlacementFollower, PlacementTracker
+from zscout.services.recorder.placement_tracker import PlacementTracker
+from zscout.services.recorder.recorder import PlacementFollower
 from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import Term
 

@@ -33,10 +33,8 @@ from zscout.messages import (
     Placed,
     PlanAsk,
 )
-from zscout.services.recorder.process import RecorderJob, encode_job
-from zscout.services.recorder.recorder import Recorder
-from zscout.services.recorder.robot_follower import RobotFollower
-from zscout.services.recorder.run import _read_job
+from zscout.services.recorder.process import RecorderJob, decode_job, encode_job
+from zscout.services.recorder.recorder import Recorder, RobotFollower
 from zscout.services.recorder.timeline import Timeline
 
 
@@ -61,7 +59,7 @@ def test_how_many_pictures_a_recorder_takes_is_set_in_the_node_file(tmp_path: Pa
         30,
     ]
     asked = RecorderJob(RecorderConfig(tmp_path, "127.0.0.1", 0, 0.5), default_fleet(), "here")
-    assert _read_job(encode_job(asked)).recorder.frames == 0.5
+    assert decode_job(encode_job(asked)).recorder.frames == 0.5
     for bad, words in (("31", "write a number from 0 to 30"), ("-1", "write"), ('"2"', "write a number")):
         with pytest.raises(BadInput, match=rf"node.toml: recorder.frames: .*{words}"):
             frames(f"frames = {bad}")

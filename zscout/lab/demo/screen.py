@@ -82,7 +82,7 @@ def picture(draw: Callable[[], Group]) -> Live:
 @contextmanager
 def _recording(out: Path | None) -> Iterator[Path]:
     """The recording's file, made beforehand: a bad place is known at once. It goes if it stays empty."""
-    from zscout.services.recorder.files import new_recording, prune
+    from zscout.services.recorder.process import new_recording, prune
 
     path = out or new_recording(FOLDER, "demo")
     if out is None:

@@ -1,4 +1,8 @@
-"""Runs the recorder as a process of its own: Rerun is large, and a node should stay small."""
+"""What surrounds a recorder: its process, its job, and the folder of its recordings.
+
+It is a process of its own, as Rerun is large and a node should stay small. Recordings are files named by
+fleet and local time, of which the newest are kept.
+"""
 
 from __future__ import annotations
 
@@ -7,27 +11,34 @@ import logging
 import re
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
 
 import msgspec
 
 from zscout.config.fleet import Fleet, MeshConfig
 from zscout.config.node import RecorderConfig
+from zscout.config.strict import BadInput
 from zscout.mesh import Supervisor
 
 log = logging.getLogger(__name__)
 
-RESTARTS = 5
+RESTARTS: Final = 5
 """Failures in a row, after which the recorder is given up."""
-PAUSE = 1.0
-LONG_ENOUGH = 60.0
+PAUSE: Final = 1.0
+LONG_ENOUGH: Final = 60.0
 """A recorder that ran for this many seconds is no failure in a row any more."""
-GRACE = 15.0
+GRACE: Final = 15.0
 """Seconds for the recorder to finish its file."""
-BAD_SETTINGS = 2
+BAD_SETTINGS: Final = 2
 """Its exit code where trying again would not help."""
+KEEP: Final = 50
+"""Recordings of one fleet in one folder; older ones are removed."""
+MAX_A_SECOND: Final = 100
 
-_ENDPOINT = re.compile(r"([a-z]+)/(\[[^\]]*\]|[^:]*):(\d+)(.*)")
-_EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - read, not bound
+_ENDPOINT: Final = re.compile(r"([a-z]+)/(\[[^\]]*\]|[^:]*):(\d+)(.*)")
+_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - read, not bound
 
 
 class RecorderJob(msgspec.Struct, frozen=True):
@@ -46,13 +57,27 @@ class Recording(msgspec.Struct, frozen=True):
     """Where a viewer finds it live."""
 
 
+def encode_job(job: RecorderJob) -> bytes:
+    """The job as a recorder reads it."""
+    return msgspec.json.encode(job, enc_hook=str) + b"\n"
+
+
+def decode_job(line: bytes) -> RecorderJob:
+    """Raises BadInput."""
+
+    def path(kind: type, value: Any) -> Any:
+        return kind(value)
+
+    try:
+        return msgspec.json.decode(line, type=RecorderJob, dec_hook=path)
+    except (msgspec.MsgspecError, UnicodeDecodeError, TypeError) as error:
+        raise BadInput(f"standard input: no job for a recorder ({error}); let zscout-node start it") from None
+
+
 def beside(mesh: MeshConfig) -> MeshConfig:
     """How a second process joins where a node does: on ports of its own, and linked to the node's."""
     listen, connect = [], list(mesh.connect)
-    for endpoint in mesh.listen:
-        found = _ENDPOINT.fullmatch(endpoint)
-        if found is None:
-            continue
+    for found in filter(None, map(_ENDPOINT.fullmatch, mesh.listen)):
         protocol, host, port, more = found.groups()
         listen.append(f"{protocol}/{host}:0{more}")
         if int(port):
@@ -60,9 +85,36 @@ def beside(mesh: MeshConfig) -> MeshConfig:
     return msgspec.structs.replace(mesh, listen=tuple(listen), connect=tuple(dict.fromkeys(connect)))
 
 
-def encode_job(job: RecorderJob) -> bytes:
-    """The job as a recorder reads it."""
-    return msgspec.json.encode(job, enc_hook=str) + b"\n"
+def new_recording(folder: Path, fleet: str) -> Path:
+    """Makes an empty `<fleet>-<date>-<time>.rrd` in `folder`, and the folder too. Raises BadInput."""
+    stem = f"{fleet}-{time.strftime('%Y%m%d-%H%M%S')}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in range(1, MAX_A_SECOND):
+            path = folder / (f"{stem}.rrd" if number == 1 else f"{stem}-{number}.rrd")
+            with suppress(FileExistsError):
+                path.touch(exist_ok=False)
+                return path
+    except OSError as error:
+        why = "it is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise BadInput(f"recordings can't be written to {folder} ({why}); give another folder") from None
+    raise BadInput(f"{folder} has {MAX_A_SECOND} recordings of this second; remove some")
+
+
+def prune(folder: Path, fleet: str, keep: int = KEEP) -> list[Path]:
+    """Removes all but the newest `keep` recordings of a fleet; returns those removed.
+
+    Nothing is touched that is not named as `new_recording` names files."""
+    ours = re.compile(rf"{re.escape(fleet)}-\d{{8}}-\d{{6}}(-\d+)?\.rrd")
+    removed: list[Path] = []
+    try:
+        found = [path for path in folder.iterdir() if ours.fullmatch(path.name) and path.is_file()]
+        for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True)[keep:]:
+            path.unlink()
+            removed.append(path)
+    except OSError as error:
+        log.warning("old recordings in %s can't be removed: %s", folder, error.strerror)
+    return removed
 
 
 class RecorderProcess:
@@ -116,8 +168,7 @@ class RecorderProcess:
         """One life of the recorder; returns its exit code."""
         child = self._child = await asyncio.create_subprocess_exec(
             sys.executable,
-            "-m",
-            "zscout.services.recorder",
+            *("-m", "zscout.services.recorder"),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             start_new_session=True,

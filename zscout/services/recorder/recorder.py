@@ -12,16 +12,33 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import BadName, Role, Token, new_instance
+from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Declaration, Mesh, Supervisor
-from zscout.messages import Grants, LoadReport, Notice, RcmState, RcState, StateAsk
+from zscout.messages import (
+    MAX_PLAN,
+    BehaviorSaid,
+    BuildingPlan,
+    BuildingPoses,
+    Grants,
+    ListPlacements,
+    LoadReport,
+    Notice,
+    Placements,
+    PlanAsk,
+    RcmState,
+    RcState,
+    StateAsk,
+)
 from zscout.services.recorder.hosts import Use
-from zscout.services.recorder.placement_tracker import PlacementFollower
+from zscout.services.recorder.placement_tracker import MAX_FOLLOWED, PlacementTracker
 from zscout.services.recorder.request_tracker import RequestTracker
-from zscout.services.recorder.robot_follower import RobotFollower
+from zscout.services.recorder.robot_tracker import RobotTracker
+from zscout.services.recorder.robots import MAX_CAMERAS
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import SECOND
 
@@ -30,12 +47,25 @@ log = logging.getLogger(__name__)
 READ_TIMEOUT: Final = 2.0
 PAUSE: Final = 0.1
 """Seconds before a leader that did not answer is asked again."""
+AGAIN: Final = 2.0
+"""Seconds until a placer that did not answer is asked again."""
+TRIES: Final = 5
+"""Past it, it is asked when an RCM comes or something was missed."""
 DRAIN: Final = 0.5
 """Seconds for what was published before the end and is still on its way."""
 CHECK_EVERY: Final = 1.0
 """Seconds between two checks whether anything was dropped here."""
 DEPTH: Final = 8_192
+ROBOT_DEPTH: Final = 1_024
 """Publications of one kind that may wait here."""
+CAMERAS: Final = "framegrabber/"
+"""RCs of this kind have pictures."""
+NO_PICTURE: Final = 3.0
+"""Seconds without a picture after which that is shown."""
+TICK: Final = 0.25
+MAX_REPORT: Final = 8_192
+MAX_POSES: Final = 65_536
+"""Bytes."""
 
 
 class RecorderFailed(RuntimeError):
@@ -87,7 +117,9 @@ class Recorder:
             await self._over.wait()
             if self._supervisor.error is not None:
                 raise RecorderFailed from self._supervisor.error
-            await self._drain()
+            # `stop` may be quicker than what was published before. An answer of the RCM comes behind all that
+            # it has published, on the same link; where nobody leads there is nothing to wait for.
+            await mesh.ask(keys.rcm_state, StateAsk(), RcmState, timeout=DRAIN, enough=lambda _: True)
         finally:
             await self._supervisor.close()
             for declared in [*robots, *reversed(self._declared)]:
@@ -97,12 +129,6 @@ class Recorder:
         await stop.wait()
         self._over.set()
 
-    async def _drain(self) -> None:
-        """`stop` may be quicker than what was published before. An answer of the RCM comes behind all that it
-        has published, on the same link; where nobody leads there is nothing to wait for."""
-        key = self.mesh.keys.rcm_state
-        await self.mesh.ask(key, StateAsk(), RcmState, timeout=DRAIN, enough=lambda _: True)
-
     def _now(self) -> float:
         return (self.mesh.now() - self._zero) / SECOND
 
@@ -111,11 +137,7 @@ class Recorder:
             self._wanted.set()
 
     def _on_notice(self, key: str, notice: Notice) -> None:
-        try:
-            client = str(self.mesh.keys.sender_of(key))
-        except BadName:
-            return
-        if client == notice.client:
+        if str(self.mesh.keys.sender_of(key)) == notice.client:
             self._requests.notice(self._now(), notice)
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
@@ -128,13 +150,11 @@ class Recorder:
         self._robots.tracker.state(at, state)
 
     def _on_load(self, key: str, report: LoadReport) -> None:
-        host = self.mesh.keys.host_of(key)
+        host, at = self.mesh.keys.host_of(key), self._now()
         if host == report.host:
-            at = self._now()
             self.timeline.hosts.load(at, host, report.load_average[0], report.cpu / 100)
-            self.timeline.hosts.uses(
-                at, host, [Use(one.component, one.cpu, one.memory) for one in report.components]
-            )
+            uses = [Use(one.component, one.cpu, one.memory) for one in report.components]
+            self.timeline.hosts.uses(at, host, uses)
 
     def _on_token(self, token: Token, alive: bool) -> None:
         instances = self._tokens.setdefault((token.host, token.role, token.name), set())
@@ -147,7 +167,7 @@ class Recorder:
             if alive:
                 self._wanted.set()
                 self._placements.read_again()
-        if bool(instances) == before and token.role != Role.RCM:
+        elif bool(instances) == before:
             return
         self._robots.token(token, alive)
         at = self._now()
@@ -205,3 +225,127 @@ def _event_of(token: Token, alive: bool) -> tuple[str, str] | None:
             return f"client {token.host}/{token.name} {'joined' if alive else 'left'}", "INFO"
         case _:
             return None
+
+
+class PlacementFollower:
+    """Subscribes to the placer of a mesh, and asks it for what was published before. `now` is the timeline's
+    time."""
+
+    def __init__(
+        self, mesh: Mesh, timeline: Timeline, now: Callable[[], float], supervisor: Supervisor
+    ) -> None:
+        self.mesh, self._now, self._supervisor = mesh, now, supervisor
+        self.tracker = PlacementTracker(timeline)
+        self._fresher: set[str] | None = None
+        """Components published since a query that is not answered yet."""
+        self._wanted = asyncio.Event()
+        self._wanted.set()
+
+    def subscribe(self) -> Declaration:
+        handler = self._supervisor.guard(self._on_placements)
+        return self.mesh.subscribe(self.mesh.keys.placements, Placements, handler, depth=DEPTH)
+
+    def read_again(self) -> None:
+        """Something may have been missed."""
+        self._wanted.set()
+
+    async def keep_reading(self) -> None:
+        """Asks the placer at the start, and whenever something may have been missed. Does not return."""
+        failed = 0
+        while True:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(AGAIN if 0 < failed < TRIES else None):
+                    await self._wanted.wait()
+                    failed = 0
+            self._wanted.clear()
+            self._fresher = fresher = set[str]()
+            reply = await self.mesh.ask_one(
+                self.mesh.keys.placer, ListPlacements(), Placements, timeout=READ_TIMEOUT
+            )
+            self._fresher = None
+            if reply is None or reply.message is None:
+                failed += 1
+            else:
+                failed = 0
+                self.tracker.listed(self._now(), reply.message, fresher)
+
+    def _on_placements(self, _key: str, news: Placements) -> None:
+        if self._fresher is not None and len(self._fresher) < MAX_FOLLOWED:
+            self._fresher.update(one.component for one in news.components)
+            self._fresher.update(news.forgotten)
+        self.tracker.published(self._now(), news)
+
+
+class RobotFollower:
+    """Subscribes to all that is published of robots: pictures, behaviors, and who is where in a building.
+
+    `now` is the timeline's time; of each camera at most `frames` pictures a second are shown, and with 0 none
+    are subscribed to: then the framegrabber sends none."""
+
+    def __init__(
+        self, mesh: Mesh, timeline: Timeline, now: Callable[[], float], frames: float, supervisor: Supervisor
+    ) -> None:
+        self.mesh, self.frames, self._now = mesh, frames, now
+        self._supervisor = supervisor
+        self.tracker = RobotTracker(timeline)
+        self._cameras: dict[str, asyncio.Task[None]] = {}
+        self._asking: asyncio.Task[None] | None = None
+
+    def subscribe(self) -> list[Declaration]:
+        keys, subscribe, guard = self.mesh.keys, self.mesh.subscribe, self._supervisor.guard
+        behavior, poses = guard(self._on_behavior), guard(self._on_poses)
+        return [
+            subscribe(keys.behavior_any, BehaviorSaid, behavior, depth=ROBOT_DEPTH, limit=MAX_REPORT),
+            subscribe(keys.building_poses_any, BuildingPoses, poses, depth=ROBOT_DEPTH, limit=MAX_POSES),
+        ]
+
+    async def tick(self) -> None:
+        """Does what time brings, until it is cancelled."""
+        while True:
+            await asyncio.sleep(TICK)
+            self.tracker.tick(self._now())
+
+    def token(self, token: Token, alive: bool) -> None:
+        """Something came to the mesh, or is gone from it, under all its instances."""
+        if token.role == Role.CLIENT and not alive:
+            self.tracker.left(self._now(), Sender(token.host, token.name))
+        if token.role != Role.RC or not token.name.startswith(CAMERAS) or not self.frames:
+            return
+        if not alive:
+            task = self._cameras.pop(token.name, None)
+            if task is not None:
+                task.cancel()
+                self.tracker.no_frame(self._now(), token.name)
+        elif token.name not in self._cameras and len(self._cameras) < MAX_CAMERAS:
+            self._cameras[token.name] = self._supervisor.spawn(self._look(token.name))
+
+    async def _look(self, camera: str) -> None:
+        """Shows a camera's pictures: the newest there is, whenever the next one is due."""
+        with self.mesh.frames(self.mesh.keys.frame(camera)) as watch:
+            while True:
+                frame = await watch.next(NO_PICTURE)
+                if frame is None:
+                    self.tracker.no_frame(self._now(), camera)
+                    continue
+                self.tracker.frame(self._now(), camera, frame.head, frame.jpeg)
+                await asyncio.sleep(1 / self.frames)
+
+    def _on_behavior(self, key: str, report: BehaviorSaid) -> None:
+        self.tracker.behavior(self._now(), self.mesh.keys.sender_of(key), report)
+
+    def _on_poses(self, key: str, poses: BuildingPoses) -> None:
+        at = self._now()
+        self.tracker.poses(at, self.mesh.keys.sender_of(key), poses)
+        if self._asking is None or self._asking.done():
+            sender = self.tracker.wants_plan(at)
+            if sender is not None:
+                self._asking = self._supervisor.spawn(self._ask(sender))
+
+    async def _ask(self, sender: Sender) -> None:
+        key = self.mesh.keys.building_plan(sender)
+        replies = await self.mesh.ask(
+            key, PlanAsk(), BuildingPlan, timeout=READ_TIMEOUT, enough=lambda _: True, limit=MAX_PLAN
+        )
+        for reply in replies:
+            if reply.message is not None:
+                self.tracker.plan(self._now(), sender, reply.message)

@@ -3,11 +3,12 @@ behavior does, who is where. Pure but for the timeline, whose times are passed i
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Final, NamedTuple
 
+from zscout.drivers.airtime import Bucket
 from zscout.keyexpr import Sender
 from zscout.messages import (
     BehaviorSaid,
@@ -23,12 +24,16 @@ from zscout.messages import (
 from zscout.services.recorder.colours import DOING, OPERATOR, PALE
 from zscout.services.recorder.drawing import clean_text
 from zscout.services.recorder.floor_plan import PersonMark, RobotMark
-from zscout.services.recorder.rate_limit import RateLimiter
 from zscout.services.recorder.timeline import Timeline
-from zscout.types import Grant
+from zscout.types import SECOND, Grant
 
-log = logging.getLogger(__name__)
-
+RATE: Final = 20
+"""Reports of one sender recorded in a second, and at once."""
+MAX_WAITING: Final = 256
+"""Paths of one sender whose newest report waits for its turn."""
+MAX_SENDERS: Final = 1_000
+DROPS_EVERY: Final = 10.0
+"""Seconds between two figures of what was dropped of one sender."""
 MAX_FOLLOWED: Final = 2_000
 """Behaviors, and RCs, that are followed at one time."""
 MAX_BOXES: Final = 32
@@ -36,7 +41,7 @@ MAX_BOXES: Final = 32
 POSE_SPACING: Final = 0.09
 """Seconds between two records of where all are."""
 SILENCE: Final = 10.0
-"""Seconds without a message from a building after which nobody knows who is where, and another may be
+"""Seconds without a message from a building after which it is not known who is where, and another may be
 shown."""
 PLAN_AGAIN: Final = 5.0
 """Seconds until a plan that did not come is asked for again."""
@@ -45,8 +50,66 @@ HEALTH_SPACING: Final = 1.0
 MAX_NAMED: Final = 24
 """Characters of a name on floor and pictures."""
 
-Place = tuple[Sender, str]
+BehaviorKey = tuple[Sender, str]
 """A behavior: its client, and its path."""
+
+
+@dataclass(slots=True)
+class _Sender:
+    bucket: Bucket
+    waiting: dict[str, BehaviorSaid] = field(default_factory=dict)
+    """The newest report of each path that came too fast, oldest first."""
+    dropped: int = 0
+    counted_at: float = -DROPS_EVERY
+
+    def take(self, at: float) -> bool:
+        """Whether the rate allows one more report now."""
+        now = round(at * SECOND)
+        if self.bucket.ready(1) > now:
+            return False
+        self.bucket.take(1, now)
+        return True
+
+
+class RateLimiter:
+    """Passes on the reports of each sender, at most `RATE` a second. What comes faster waits, and of each
+    path only the newest is kept: however much was dropped, what is passed on last is how it is."""
+
+    def __init__(self) -> None:
+        self._senders: dict[Sender, _Sender] = {}
+
+    def offer(self, at: float, sender: Sender, report: BehaviorSaid) -> BehaviorSaid | None:
+        """The report itself if it is to be recorded now."""
+        state = self._senders.pop(sender, None)
+        if state is None:
+            if len(self._senders) >= MAX_SENDERS:
+                del self._senders[next(iter(self._senders))]
+            state = _Sender(Bucket(Fraction(RATE), Fraction(RATE), round(at * SECOND)))
+        self._senders[sender] = state
+        if not state.waiting and state.take(at):
+            return report
+        state.dropped += state.waiting.pop(report.path, None) is not None
+        if len(state.waiting) < MAX_WAITING:
+            state.waiting[report.path] = report
+        else:
+            state.dropped += 1
+        return None
+
+    def due(self, at: float) -> Iterator[tuple[Sender, BehaviorSaid]]:
+        """What has waited and is to be recorded now."""
+        for sender, state in self._senders.items():
+            while state.waiting and state.take(at):
+                yield sender, state.waiting.pop(next(iter(state.waiting)))
+
+    def dropped(self, at: float) -> Iterator[tuple[Sender, int]]:
+        """Senders of which reports were dropped, and how many since the last figure."""
+        for sender, state in self._senders.items():
+            if state.dropped and at - state.counted_at >= DROPS_EVERY:
+                state.counted_at, count, state.dropped = at, state.dropped, 0
+                yield sender, count
+
+    def forget(self, sender: Sender) -> None:
+        self._senders.pop(sender, None)
 
 
 class RobotHold(NamedTuple):
@@ -54,6 +117,9 @@ class RobotHold(NamedTuple):
 
     robots: tuple[str, ...] = ()
     operator: bool = False
+
+
+NO_HOLD: Final = RobotHold()
 
 
 @dataclass(slots=True)
@@ -79,9 +145,12 @@ class _Health:
 
 @dataclass(slots=True)
 class _Camera:
-    robots: tuple[str, ...] = ()
-    operator: bool = False
-    boxes: dict[Place, list[Box]] = field(default_factory=dict)
+    hold: RobotHold = NO_HOLD
+    boxes: dict[BehaviorKey, list[Box]] = field(default_factory=dict)
+
+    @property
+    def names(self) -> str:
+        return ", ".join(_name(robot) for robot in self.hold.robots)
 
 
 class RobotTracker:
@@ -90,7 +159,7 @@ class RobotTracker:
     def __init__(self, timeline: Timeline) -> None:
         self.timeline, self.panes = timeline, timeline.robots
         self._limiter = RateLimiter()
-        self._reports: dict[Place, BehaviorSaid] = {}
+        self._reports: dict[BehaviorKey, BehaviorSaid] = {}
         """What each behavior does, the one that reported longest ago first."""
         self._holds: dict[str, Mapping[Grant, RobotHold]] = {}
         """Of robots and framegrabbers."""
@@ -108,11 +177,10 @@ class RobotTracker:
         else:
             self._holds.pop(rc, None)
 
-    def dropped(self, rc: str, grants: Iterable[Grant]) -> None:
+    def dropped(self, rc: str, grants: Collection[Grant]) -> None:
         """These holds of an RC are over."""
-        over = set(grants)
-        left = {grant: hold for grant, hold in self._holds.get(rc, {}).items() if grant not in over}
-        self.held(rc, left)
+        holds = self._holds.get(rc, {})
+        self.held(rc, {grant: hold for grant, hold in holds.items() if grant not in grants})
 
     # Behaviors
 
@@ -126,47 +194,49 @@ class RobotTracker:
         """What time alone brings: call it some times a second."""
         for sender, report in list(self._limiter.due(at)):
             self._take(at, sender, report)
-        for sender, count in list(self._limiter.dropped(at)):
-            self.timeline.event(
-                at, f"behaviors of {sender} say too much: {count} sayings were left out", "WARN"
-            )
+        for sender, count in self._limiter.dropped(at):
+            self._warn(at, f"behaviors of {sender} say too much: {count} sayings were left out")
         for rc, health in self._health.items():
             self._show_health(at, rc, health)
         building = self._building
         if building is not None and building.planned and at - building.seen_at > SILENCE:
             building.planned = False
             self.panes.floor.clear(at)
-            self.timeline.event(
-                at, f"building {building.name} is silent: who is where is not known any more", "WARN"
-            )
+            self._warn(at, f"building {building.name} is silent: who is where is not known any more")
 
     def left(self, at: float, sender: Sender) -> None:
         """A client is gone, and its behaviors with it."""
-        for place, report in list(self._reports.items()):
-            if place[0] == sender:
-                self._take(at, sender, BehaviorSaid(report.path, ""))
+        for path in [path for client, path in self._reports if client == sender]:
+            self._take(at, sender, BehaviorSaid(path, ""))
         self._limiter.forget(sender)
 
+    def _warn(self, at: float, text: str) -> None:
+        self.timeline.event(at, text, "WARN")
+
     def _take(self, at: float, sender: Sender, report: BehaviorSaid) -> None:
-        place = sender, report.path
-        before = self._reports.pop(place, None)
+        key = sender, report.path
+        before = self._reports.pop(key, None)
         if report.doing and len(self._reports) < MAX_FOLLOWED:
-            self._reports[place] = report
+            self._reports[key] = report
         # A behavior that has moved to another client is over in the old one only.
         elsewhere = not report.doing and any(path == report.path for _, path in self._reports)
         if not elsewhere:
             self.panes.behavior(at, report.path, "alert" if report.alert else report.doing, _detail(report))
         if report.alert:
-            self.timeline.event(at, _alert(report), "WARN")
-        for camera in {report.camera, before.camera if before is not None else ""} - {""}:
-            self._mark(at, camera, place, report.boxes if camera == report.camera and report.doing else [])
+            self._warn(at, _alert(report))
+        for camera in {report.camera, before.camera if before is not None else ""} & self._cameras.keys():
+            boxes = self._cameras[camera].boxes
+            if camera == report.camera and report.doing and report.boxes:
+                boxes[key] = report.boxes
+            else:
+                boxes.pop(key, None)
+            drawn = [box for some in boxes.values() for box in some]
+            self.panes.boxes(at, _short(camera), drawn[:MAX_BOXES])
 
     def _doing(self, robot: str) -> BehaviorSaid | None:
         """The newest report about a robot."""
-        about = (
-            report for report in reversed(self._reports.values()) if report.robot in (robot, f"robot/{robot}")
-        )
-        return next(about, None)
+        names = robot, f"robot/{robot}"
+        return next((report for report in reversed(self._reports.values()) if report.robot in names), None)
 
     # Cameras
 
@@ -177,50 +247,38 @@ class RobotTracker:
             if len(self._cameras) >= MAX_FOLLOWED:
                 return
             seen = self._cameras[camera] = _Camera()
-        hold = (
-            self._holds.get(camera, {}).get(head.grant, RobotHold())
-            if head.grant is not None
-            else RobotHold()
-        )
-        if hold.robots != seen.robots and seen.boxes:
-            seen.boxes.clear()
-            self.panes.boxes(at, _short(camera), [])
-        seen.robots, seen.operator = hold
-        words, colour = self._caption(seen)
-        self.panes.picture(at, _short(camera), jpeg, words, colour)
+        holds = self._holds.get(camera, {})
+        hold = holds.get(head.grant, NO_HOLD) if head.grant is not None else NO_HOLD
+        if hold.robots != seen.hold.robots:
+            self._forget_boxes(at, camera, seen)
+        seen.hold = hold
+        self.panes.picture(at, _short(camera), jpeg, *self._caption(seen))
 
     def no_frame(self, at: float, camera: str) -> None:
         """No picture has come for a while."""
         seen = self._cameras.get(camera)
         if seen is None:
             return
+        self._forget_boxes(at, camera, seen)
+        words = "not held"
+        if self._holds.get(camera):
+            words = " · ".join(filter(None, (seen.names, "no picture")))
+        self.panes.old_picture(at, _short(camera), words, PALE)
+
+    def _forget_boxes(self, at: float, camera: str, seen: _Camera) -> None:
         if seen.boxes:
             seen.boxes.clear()
             self.panes.boxes(at, _short(camera), [])
-        held = bool(self._holds.get(camera))
-        names = ", ".join(_name(robot) for robot in seen.robots)
-        words = " · ".join(word for word in (names, "no picture") if word) if held else "not held"
-        self.panes.old_picture(at, _short(camera), words, PALE)
 
     def _caption(self, seen: _Camera) -> tuple[str, int]:
-        names = ", ".join(_name(robot) for robot in seen.robots)
-        if seen.operator:
-            return (f"{names} · operator" if names else "operator"), OPERATOR
-        report = self._doing(seen.robots[0].partition("/")[2]) if len(seen.robots) == 1 else None
+        """Words and colour."""
+        robots, operator = seen.hold
+        if operator:
+            return (f"{seen.names} · operator" if robots else "operator"), OPERATOR
+        report = self._doing(robots[0].partition("/")[2]) if len(robots) == 1 else None
         if report is None:
-            return names, PALE
-        return f"{names} · {report.doing}", DOING.get(report.doing, PALE)
-
-    def _mark(self, at: float, camera: str, place: Place, boxes: list[Box]) -> None:
-        seen = self._cameras.get(camera)
-        if seen is None:
-            return
-        if boxes:
-            seen.boxes[place] = boxes
-        else:
-            seen.boxes.pop(place, None)
-        drawn = [box for some in seen.boxes.values() for box in some]
-        self.panes.boxes(at, _short(camera), drawn[:MAX_BOXES])
+            return seen.names, PALE
+        return f"{seen.names} · {report.doing}", DOING.get(report.doing, PALE)
 
     # Devices
 
@@ -243,7 +301,7 @@ class RobotTracker:
         if health.words == "ok":
             self.timeline.event(at, f"{rc} is well again")
         else:
-            self.timeline.event(at, f"{rc} fails: {health.words}", "WARN")
+            self._warn(at, f"{rc} fails: {health.words}")
 
     # The building
 
@@ -253,9 +311,7 @@ class RobotTracker:
         if building is not None and building.sender != sender and at - building.seen_at <= SILENCE:
             if sender not in self._others and len(self._others) < MAX_FOLLOWED:
                 self._others.add(sender)
-                self.timeline.event(
-                    at, f"a second building, of {sender}, is not shown: that of {building.sender} is", "WARN"
-                )
+                self._warn(at, f"a second building, of {sender}, is not shown: that of {building.sender} is")
             return
         if building is None or building.sender != sender or poses.time < building.time - 1:
             # Its time goes back: it is another building that the same client simulates now.
@@ -267,14 +323,17 @@ class RobotTracker:
         if building.planned:
             robots = [self._robot(placed) for placed in poses.robots]
             people = [PersonMark(clean_text(one.name, MAX_NAMED), one.x, one.y) for one in poses.people]
-            self.panes.floor.show(at, robots, people, _caption_of(building.name, poses))
+            minutes, seconds = divmod(max(0, int(poses.time)), 60)
+            speed = "" if poses.speed == 1 else f" · {poses.speed:g} times as fast"
+            caption = f"{building.name} · {minutes}:{seconds:02}{speed}"
+            self.panes.floor.show(at, robots, people, caption)
 
     def wants_plan(self, at: float) -> Sender | None:
-        """Whom to ask for a building's plan now, if anybody."""
+        """The client to ask for its building's plan now, if any."""
         building = self._building
-        if building is None or building.planned or building.refused or at - building.seen_at > SILENCE:
+        if building is None or building.planned or building.refused:
             return None
-        if at - building.asked < PLAN_AGAIN:
+        if at - building.seen_at > SILENCE or at - building.asked < PLAN_AGAIN:
             return None
         building.asked = at
         return building.sender
@@ -288,7 +347,7 @@ class RobotTracker:
         why = self.panes.plan(at, plan.width, plan.depth, plan.picture)
         building.planned, building.refused = not why, bool(why)
         if why:
-            self.timeline.event(at, f"building {building.name} of {sender} can't be shown: {why}", "WARN")
+            self._warn(at, f"building {building.name} of {sender} can't be shown: {why}")
 
     def _robot(self, placed: Placed) -> RobotMark:
         report = self._doing(placed.name)
@@ -308,21 +367,15 @@ class RobotTracker:
 
 def _detail(report: BehaviorSaid) -> str:
     """What stands behind the word in a lane: of an alert under another word, that too."""
-    words = (report.doing if report.alert and report.doing != "alert" else "", report.detail)
-    return " · ".join(word for word in words if word)
+    words = report.doing if report.alert and report.doing != "alert" else ""
+    return " · ".join(filter(None, (words, report.detail)))
 
 
 def _alert(report: BehaviorSaid) -> str:
     who = _name(report.robot) if report.robot else report.path
     if report.doing == "alert":
-        return f"{who} sees {report.detail}" if report.detail else f"{who} sees something"
+        return f"{who} sees {report.detail or 'something'}"
     return f"{who}: {_detail(report)}"
-
-
-def _caption_of(name: str, poses: BuildingPoses) -> str:
-    minutes, seconds = divmod(max(0, int(poses.time)), 60)
-    speed = "" if poses.speed == 1 else f" · {poses.speed:g} times as fast"
-    return f"{name} · {minutes}:{seconds:02}{speed}"
 
 
 def _short(rc: str) -> str:

@@ -97,7 +97,7 @@ class Timeline(Drawing):
             _check_writable(path)
             sinks.append(rr.FileSink(path))
         try:
-            self.recording.set_sinks(*sinks, default_blueprint=blueprint(live=True))
+            self.recording.set_sinks(*sinks, default_blueprint=blueprint())
             # The server comes up in a thread of its own; only a flush shows its failure.
             self.recording.flush(timeout_sec=FLUSH_SECONDS)
         except (RuntimeError, ValueError) as error:
@@ -175,9 +175,7 @@ class Timeline(Drawing):
             least = LIVE_ROWS if robots.any else 1
             rc_rows, arc_rows, host_rows = max(rc_rows, least), max(arc_rows, least), LIVE_HOST_ROWS
         return blueprint(
-            live,
-            self.end,
-            begin=self.begin,
+            None if live else (self.begin, self.end),
             rc_rows=rc_rows,
             arc_rows=arc_rows,
             host_rows=host_rows if self.hosts.placing else 0,
