@@ -254,7 +254,7 @@ def shown(source: str) -> str:
 
 def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> cv2.VideoCapture:
     # These are read when a backend is first used. FFmpeg would complain about every torn picture on the
-    # node's own stderr (-8: quiet), and hands out half a picture as a whole one unless told to discard it
+    # node's own stderr (-8: quiet), and hands out half a picture as a whole one unless set to discard it
     # (TCP for RTSP is what OpenCV itself asks for). Without OpenCV's lock around it one silent server held up
     # the opening of all other sources; FFmpeg has needed none since 4.0.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

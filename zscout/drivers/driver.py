@@ -1,15 +1,20 @@
-"""What a driver does for its device. `resource_controller.py` has the RC around it."""
+"""What a driver does for its device, and what its RC gives it. `resource_controller.py` has that RC."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Protocol
 
 from zscout.drivers.holds import HoldTable
-from zscout.drivers.rc_directory import RcDirectory
-from zscout.keyexpr import Sender
-from zscout.mesh import Mesh, Refused, Supervisor
+from zscout.keyexpr import Role, Sender, Token
+from zscout.mesh import Declaration, Mesh, Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
+from zscout.types import SECOND, Ns
+
+NODE: Final = "node"
+"""The client name of a node."""
+LATELY: Final[Ns] = 10 * SECOND
+"""A node that ends sends its last command for an RC after the token of that RC has gone."""
 
 
 class RcHandle(Protocol):
@@ -99,3 +104,47 @@ class Driver:
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
         """Whether this command can be carried out while the device still warms up."""
         return False
+
+
+class RcDirectory:
+    """Which host offers which RC, by the liveliness tokens, from `watch` on: its node may act for an RC, and
+    no other."""
+
+    def __init__(self, mesh: Mesh, on_change: Callable[[], None] | None = None) -> None:
+        self._mesh = mesh
+        self._tokens: dict[str, set[Token]] = {}
+        self._recent: dict[tuple[str, str], Ns] = {}
+        """(host, RC): until when its node may still act for it."""
+        self._on_change = on_change
+
+    def watch(self) -> Declaration:
+        return self._mesh.watch(self._mesh.keys.alive_any(Role.RC), self.on_token)
+
+    def on_token(self, token: Token, alive: bool) -> None:
+        """A token has come or gone."""
+        if alive:
+            self._tokens.setdefault(token.name, set()).add(token)
+        else:
+            living = self._tokens.get(token.name, set())
+            living.discard(token)
+            if not living:
+                self._tokens.pop(token.name, None)
+            now = self._mesh.now()
+            self._recent = {key: until for key, until in self._recent.items() if until > now}
+            self._recent[token.host, token.name] = now + LATELY
+        if self._on_change is not None:
+            self._on_change()
+
+    def hosts(self, rc: str) -> set[str]:
+        """The hosts that offer this RC now: one, unless two nodes are at odds."""
+        return {token.host for token in self._tokens.get(rc, ())}
+
+    def is_node_of_gang(self, sender: Sender, holder: Holder, but: str) -> bool:
+        """Whether `sender` is the node of an RC of this holder's gang, `but` aside."""
+        return sender.client == NODE and any(sender.host in self.hosts(rc) for rc in holder.rcs if rc != but)
+
+    def is_node_of(self, sender: Sender, rc: str) -> bool:
+        """Whether `sender` is the node that offers this RC, or did so until a moment ago."""
+        if sender.client != NODE:
+            return False
+        return sender.host in self.hosts(rc) or self._recent.get((sender.host, rc), 0) > self._mesh.now()

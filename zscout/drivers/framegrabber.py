@@ -234,7 +234,7 @@ class FramegrabberDriver(Driver):
         while (capture := self._capture) is not None:
             now, newest = seconds(), (capture, capture.number)
             if newest == seen:
-                # Where this process stood still, its capture did so too: that says nothing of the source.
+                # Where this process stood still, its capture did so too, through no fault of the source.
                 self._silent += min(now - last, 2 * CHECK)
             else:
                 self._silent = 0.0

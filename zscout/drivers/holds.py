@@ -15,7 +15,6 @@ The rules, all of them:
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -101,12 +100,21 @@ class HoldTable:
             return change
         change.reread = missed
         holders = grants.rcs.get(self.rc)
-        if holders is not None:
-            if len(holders) > 1 and not sharable:
-                holders = [max(holders, key=lambda holder: holder.grant)]
+        if holders is None:
+            return change
+        if len(holders) > 1 and not sharable:
+            holders = [max(holders, key=lambda holder: holder.grant)]
+            change.present = True
+        reasons = {revoked.grant: f"{revoked.outcome}: {revoked.reason}" for revoked in grants.revoked}
+        wanted = {holder.grant: holder for holder in holders[:MAX_HOLDERS]}
+        self._awaited.clear()
+        for grant in [grant for grant in self.held if grant not in wanted]:
+            self._stop(grant, reasons.get(grant, "the RCM gave it to another"), change)
+        for grant, holder in wanted.items():
+            if grant in self._ended:
                 change.present = True
-            reasons = {revoked.grant: f"{revoked.outcome}: {revoked.reason}" for revoked in grants.revoked}
-            self._replace(holders[:MAX_HOLDERS], reasons, change, now)
+            elif grant not in self.held:
+                self._begin(holder, change, now)
         return change
 
     def apply_snapshot(self, state: RcmState, now: Ns, *, sharable: bool) -> HoldChange:
@@ -130,7 +138,7 @@ class HoldTable:
         return change
 
     def _take(self, news: Grants | RcmState, change: HoldChange, now: Ns) -> bool:
-        """Whether what an RCM says is obeyed: it is not older than what is known, and no absurd jump."""
+        """Whether this is obeyed: it is not older than what is known, and its term no absurd jump."""
         if (news.term, news.seq) < (self.term, self.seq):
             change.outdated = news.term < self.term
             return False
@@ -206,19 +214,6 @@ class HoldTable:
         ]
 
     # Changes
-
-    def _replace(
-        self, holders: Iterable[Holder], reasons: dict[Grant, str], change: HoldChange, now: Ns
-    ) -> None:
-        wanted = {holder.grant: holder for holder in holders}
-        self._awaited.clear()
-        for grant in [grant for grant in self.held if grant not in wanted]:
-            self._stop(grant, reasons.get(grant, "the RCM gave it to another"), change)
-        for grant, holder in wanted.items():
-            if grant in self._ended:
-                change.present = True
-            elif grant not in self.held:
-                self._begin(holder, change, now)
 
     def _begin(self, holder: Holder, change: HoldChange, now: Ns) -> None:
         self.held[holder.grant] = HoldEntry(holder, now + round(holder.remaining * SECOND))

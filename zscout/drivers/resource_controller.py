@@ -13,9 +13,8 @@ from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeAlias
 
-from zscout.drivers.driver import Driver
+from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
-from zscout.drivers.rc_directory import RcDirectory
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.supervision import StallWatch
@@ -406,10 +405,8 @@ class ResourceController:
         self._apply(self.holds.expire(self.mesh.now(), lease=not self.stall.fresh()))
 
     async def _publish_figures(self) -> None:
-        published = self.driver.figures()
         while True:
+            published = self.driver.figures()
             await asyncio.sleep(FIGURES_PERIOD)
-            figures = self.driver.figures()
-            if figures != published:
-                published = figures
+            if self.driver.figures() != published:
                 self.publish()

@@ -24,8 +24,7 @@ from zscout.drivers.commands import (
     RobotDrive,
     robot_command,
 )
-from zscout.drivers.driver import Driver, RcHandle
-from zscout.drivers.rc_directory import RcDirectory
+from zscout.drivers.driver import Driver, RcDirectory, RcHandle
 from zscout.mesh import Declaration, Refused, Reply
 from zscout.messages import Command, Done, Figures, Holder, RcState
 from zscout.types import SECOND, Grant, Ns
