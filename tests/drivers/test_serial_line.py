@@ -18,7 +18,7 @@ from tests.live.bench import until
 from zscout.drivers.packets import DrivePacket, HaltPacket, encode
 from zscout.drivers.serial_line import DEPTH, SerialLine
 from zscout.mesh import clock
-from zscout.types import SECOND, Ns
+from zscout.types import SECOND
 
 
 class Ear:
@@ -35,8 +35,7 @@ class Ear:
     def line_down(self, why: str) -> None:
         self._tell(why)
 
-    def line_wrote(self, at: Ns) -> None:
-        assert at <= clock.now()
+    def line_wrote(self) -> None:
         self.wrote += 1
         self._news.set()
 
@@ -54,13 +53,16 @@ class Ear:
             raise AssertionError(f"waited in vain; it told {self.told}") from None
 
 
+def opened(port: str, ear: Ear) -> SerialLine:
+    return SerialLine(port, 9600, up=ear.line_up, down=ear.line_down, wrote=ear.line_wrote)
+
+
 def live(story: Callable[[PtyLine, Ear, SerialLine], Any], link: Path, **how: Any) -> None:
     """Runs a story over an open line."""
 
     async def run() -> None:
         pty, ear = PtyLine(link, **how), Ear()
-        line = SerialLine(str(link), 9600, ear)
-        line.start()
+        line = opened(str(link), ear)
         try:
             await ear.until(lambda: ear.told == ["up"])
             await story(pty, ear, line)
@@ -107,13 +109,11 @@ def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
 def test_a_second_program_is_refused_and_has_its_turn_later(tmp_path: Path) -> None:
     async def run() -> None:
         pty, first, second = PtyLine(tmp_path / "tty"), Ear(), Ear()
-        line = SerialLine(str(pty.link), 9600, first)
-        line.start()
+        line = opened(str(pty.link), first)
         await first.until(lambda: first.told == ["up"])
         with pytest.raises(serial.SerialException):
             serial.Serial(str(pty.link), exclusive=True)
-        other = SerialLine(str(pty.link), 9600, second)
-        other.start()
+        other = opened(str(pty.link), second)
         await second.until(lambda: second.told)
         assert second.told == [f"{pty.link} is used by another program"]
         await line.stop()
@@ -161,8 +161,7 @@ def test_ports_that_can_never_be_opened_are_named_in_plain_words(tmp_path: Path)
             ("nonsense://x", "nonsense://x fails: "),
         ):
             ear = Ear()
-            line = SerialLine(port, 9600, ear)
-            line.start()
+            line = opened(port, ear)
             await ear.until(lambda ear=ear: ear.told)  # type: ignore[misc]
             assert words in ear.told[0]
             await line.stop()
@@ -183,8 +182,7 @@ def test_a_radio_on_another_machine(tmp_path: Path) -> None:
         server = await asyncio.start_server(served, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
         ear = Ear()
-        line = SerialLine(f"socket://127.0.0.1:{port}", 9600, ear)
-        line.start()
+        line = opened(f"socket://127.0.0.1:{port}", ear)
         await ear.until(lambda: ear.told == ["up"])
         line.write(encode(HaltPacket(9, 9)))
         assert await asyncio.wait_for(arrived.get(), HANG) == encode(HaltPacket(9, 9))

@@ -25,7 +25,7 @@ from zscout.drivers.transmit_queue import QueueFull, TransmitQueue
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
-from zscout.types import SECOND, Grant, Ns, Place
+from zscout.types import SECOND, Grant, Place
 
 COUNTED: Final = ("packets", "bytes", "repeats", "halts")
 RECENT: Final = 64
@@ -65,8 +65,9 @@ class RadioDriver(Driver):
         self._rc = rc
         # Of its own: halts still go out after the RC has closed that of its other work.
         self._supervisor = Supervisor(f"the line of {rc.name}", rc.supervisor.fail)
-        self._line = SerialLine(self._port, self._baud, self)
-        self._line.start()
+        self._line = SerialLine(
+            self._port, self._baud, up=self._line_up, down=self._line_down, wrote=self._line_wrote
+        )
         try:
             await asyncio.wait_for(self._known.wait(), OPENING)
         except TimeoutError:
@@ -200,21 +201,21 @@ class RadioDriver(Driver):
         held, holds = self._rc.holds.held.get(grant), self._rc.holds
         return held is not None and holds.check(grant, held.holder.client, self._rc.mesh.now()) is None
 
-    def line_up(self) -> None:
+    def _line_up(self) -> None:
         self._up, self._why, self._outstanding = True, "", 0
         self._known.set()
         if self._rc.health != "ok":
             self._rc.recover()
         self._pump()
 
-    def line_down(self, why: str) -> None:
+    def _line_down(self, why: str) -> None:
         self._losses += self._up
         self._up, self._why = False, why
         self._known.set()
         self._quiet.set()
         self._rc.fail(why)
 
-    def line_wrote(self, at: Ns) -> None:
+    def _line_wrote(self) -> None:
         self._outstanding = max(0, self._outstanding - 1)
         self._pump()
 

@@ -1,8 +1,4 @@
-"""A serial line in a thread of its own: pyserial blocks. It opens again what was unplugged, for ever.
-
-All callbacks run in the event loop. At most DEPTH packets are handed to the thread at a time,
-and it is left to the caller to hand over no more than the line carries (`transmit_queue`).
-"""
+"""A serial line in a thread of its own: pyserial blocks. It opens again what was unplugged, for ever."""
 
 from __future__ import annotations
 
@@ -13,10 +9,9 @@ import queue
 import re
 import threading
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from zscout.mesh import clock
-from zscout.types import Ns
 
 DEPTH: Final = 2
 IDLE: Final = 0.2
@@ -29,50 +24,46 @@ CLOSE_TIMEOUT: Final = 3.0
 READ_AT_ONCE: Final = 4_096
 
 _WORDS: Final = {
-    errno.ENOENT: "is not there; is it plugged in?",
-    errno.ENODEV: "is not there; is it plugged in?",
-    errno.ENXIO: "is not there; is it plugged in?",
-    errno.EACCES: "may not be opened by this user; add it to the group of the port, often dialout",
-    errno.EPERM: "may not be opened by this user; add it to the group of the port, often dialout",
-    errno.EBUSY: "is used by another program",
-    errno.EAGAIN: "is used by another program",
+    **dict.fromkeys((errno.ENOENT, errno.ENODEV, errno.ENXIO), "is not there; is it plugged in?"),
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM),
+        "may not be opened by this user; add it to the group of the port, often dialout",
+    ),
+    **dict.fromkeys((errno.EBUSY, errno.EAGAIN), "is used by another program"),
     errno.ENOTTY: "is no serial port",
     errno.ECONNREFUSED: "does not answer: nobody listens there",
+    errno.EIO: "was unplugged",
 }
-
 _NUMBER: Final = re.compile(r"(?:\[Errno |\()(\d+)[],]")
 """Where pyserial hides an error number in its words."""
 
 
-class SerialLineListener(Protocol):
-    """Callbacks of a line, in the event loop."""
-
-    def line_up(self) -> None:
-        """The line is open."""
-
-    def line_down(self, why: str) -> None:
-        """The line can't be used, in words; once for each reason in a row."""
-
-    def line_wrote(self, at: Ns) -> None:
-        """A packet is in the hands of the system since `at`."""
-
-
 class SerialLine:
-    """A line, from `start` to `stop`. `port` is anything that pyserial's `serial_for_url` takes."""
+    """A line, until `stop`. `port` is anything that pyserial's `serial_for_url` takes.
 
-    def __init__(self, port: str, baud: int, listener: SerialLineListener) -> None:
+    Called in the event loop: `up()` when the line is open; `down(why)` when it can't be used, once for each
+    reason in a row; `wrote()` when the system has taken a packet. At most DEPTH packets are handed to the
+    thread at a time; the caller hands over no more than the line carries (`transmit_queue`).
+    """
+
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        *,
+        up: Callable[[], None],
+        down: Callable[[str], None],
+        wrote: Callable[[], None],
+    ) -> None:
         self.port, self.baud = port, baud
         self.received = 0
         """Bytes that came in: the radio goes one way, so they are counted and forgotten."""
-        self.opened = 0
-        self._listener = listener
+        self._up, self._down, self._wrote = up, down, wrote
         self._loop = asyncio.get_running_loop()
         self._queue: queue.Queue[bytes] = queue.Queue(DEPTH)
         self._stopping = threading.Event()
         self._why = ""
         self._thread = threading.Thread(target=self._run, name=f"line {port}", daemon=True)
-
-    def start(self) -> None:
         self._thread.start()
 
     async def stop(self) -> None:
@@ -81,7 +72,7 @@ class SerialLine:
         await asyncio.to_thread(self._thread.join, CLOSE_TIMEOUT)
 
     def write(self, data: bytes) -> bool:
-        """Hands a packet to the thread, and `line_wrote` will be called for it; False: DEPTH wait there."""
+        """Hands a packet to the thread, and `wrote` will be called for it; False: DEPTH wait there."""
         try:
             self._queue.put_nowait(data)
         except queue.Full:
@@ -96,7 +87,7 @@ class SerialLine:
             try:
                 port = self._open()
             except Exception as error:  # noqa: BLE001 - what a URL handler raises is nobody's promise
-                self._down(f"{self.port} {_plain(error)}")
+                self._fail(error)
             else:
                 pause = PAUSES[0]
                 self._serve(port)
@@ -116,16 +107,15 @@ class SerialLine:
         """Writes until the line fails or nobody wants it any more."""
         while not self._queue.empty():  # handed over while it was down: too old
             self._queue.get_nowait()
-        self.opened += 1
         self._why = ""
-        self._call(self._listener.line_up)
+        self._call(self._up)
         looked = clock.now()
         try:
             while not (self._stopping.is_set() and self._queue.empty()):
                 try:
                     data = self._queue.get(timeout=IDLE if not self._stopping.is_set() else 0)
                     port.write(data)
-                    self._call(self._listener.line_wrote, clock.now())
+                    self._call(self._wrote)
                 except queue.Empty:
                     pass
                 if clock.now() - looked >= IDLE * 1e9:
@@ -133,17 +123,18 @@ class SerialLine:
                     if port.in_waiting:
                         self.received += len(port.read(min(port.in_waiting, READ_AT_ONCE)))
         except Exception as error:  # noqa: BLE001 - OSError, termios.error and what else pyserial lets through
-            self._down(f"{self.port} {_plain(error)}")
+            self._fail(error)
             with contextlib.suppress(Exception):
                 port.reset_output_buffer()  # what lies in it would go out late
         finally:
             with contextlib.suppress(Exception):
                 port.close()
 
-    def _down(self, why: str) -> None:
+    def _fail(self, error: Exception) -> None:
+        why = f"{self.port} {_plain(error)}"
         if why != self._why:
             self._why = why
-            self._call(self._listener.line_down, why)
+            self._call(self._down, why)
 
     def _call(self, call: Callable[..., None], *args: Any) -> None:
         try:
@@ -165,6 +156,6 @@ def _plain(error: Exception) -> str:
         return _WORDS[number]
     if "exclusively lock" in text:
         return _WORDS[errno.EBUSY]
-    if "write failed" in text or "device reports readiness" in text or number == errno.EIO:
-        return "was unplugged"
+    if "write failed" in text or "device reports readiness" in text:
+        return _WORDS[errno.EIO]
     return f"fails: {text[:200] or type(error).__name__}"
