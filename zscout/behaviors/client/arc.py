@@ -113,7 +113,9 @@ class Attempt:
     def __init__(self, client: Client, arc: OpenArc | None, ask: dict[str, Any], *, again: bool) -> None:
         self._client, self._ask, self._again = client, ask, again
         self.arc = arc
-        self._entered: _Entered | None = None
+        self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None]] | None = None
+        """The hold, its body, and what cancels the body when the hold is over."""
+        self._interrupted = False
 
     async def granted(self) -> Held:
         """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused."""
@@ -129,24 +131,30 @@ class Attempt:
         return Held(self._client, self.arc, grant)
 
     async def __aenter__(self) -> Held:
-        held = await self.granted()
-        body = asyncio.current_task()
+        held, body = await self.granted(), asyncio.current_task()
         assert body is not None  # noqa: S101 - this is a coroutine
-        self._entered = _Entered(held, body)
-        self._entered.watch = asyncio.create_task(self._entered.interrupt_when_over())
+        self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body))
         return held
+
+    async def _interrupt_when_over(self, held: Held, body: asyncio.Task[Any]) -> None:
+        await held.over()
+        await held.resumed()
+        self._interrupted = True
+        body.cancel()
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> bool:
         assert self._entered is not None  # noqa: S101 - entered before left
-        held, arc = self._entered.held, self._entered.held.arc
-        interrupted = self._entered.leave() and kind is asyncio.CancelledError
+        held, body, watch = self._entered
+        arc = held.arc
+        watch.cancel()
+        # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
+        interrupted = self._interrupted and body.uncancel() == 0 and kind is asyncio.CancelledError
         if held.completed:
             self._client.complete(arc)
             return interrupted
-        failed = kind is not None and not interrupted
-        if held.active or failed:
+        if held.active or (kind is not None and not interrupted):
             if arc.open:
                 await self._client.end(arc)
             return False
@@ -156,28 +164,6 @@ class Attempt:
         if arc.open:
             await self._client.end(arc)
         raise revoked from None
-
-
-class _Entered:
-    """A body that runs, and the watch that cancels it when its hold is over."""
-
-    def __init__(self, held: Held, body: asyncio.Task[Any]) -> None:
-        self.held, self.body = held, body
-        self.watch: asyncio.Task[None] | None = None
-        self._interrupted = False
-
-    async def interrupt_when_over(self) -> None:
-        await self.held.over()
-        await self.held.resumed()
-        self._interrupted = True
-        self.body.cancel()
-
-    def leave(self) -> bool:
-        """Ends the watch. True if it was the watch that cancelled the body, and nobody else besides."""
-        if self.watch is not None:
-            self.watch.cancel()
-        # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
-        return self._interrupted and self.body.uncancel() == 0
 
 
 def hold(

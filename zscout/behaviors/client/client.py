@@ -175,7 +175,7 @@ class Client:
             name=name,
             needs=wanted,
             priority=priority,
-            min_runtime=min_runtime if isinstance(min_runtime, Decimal) else Decimal(str(min_runtime)),
+            min_runtime=Decimal(str(min_runtime)),
             keep=keep,
             estimate=estimate,
             since=self.mesh.now(),
@@ -335,14 +335,7 @@ class Client:
         self, name: str, needs: Needs, *, priority: int, min_runtime: Decimal, keep: bool = False
     ) -> Foresight | None:
         """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
-        asked = Foresee(
-            id=new_instance(),
-            arc=name,
-            needs=amounts(needs),
-            priority=priority,
-            min_runtime=min_runtime,
-            keep=keep,
-        )
+        asked = Foresee(new_instance(), name, amounts(needs), priority, min_runtime, keep)
         reply = await self.mesh.ask_one(self._rcm.key, asked, Foresight, timeout=QUERY_TIMEOUT)
         if reply is not None and reply.problem is not None:
             raise RequestRefused(reply.problem)

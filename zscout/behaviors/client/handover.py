@@ -43,9 +43,7 @@ class Handover:
     # The new client
 
     def expect(self, requests: Sequence[OpenRequest]) -> None:
-        """These will be handed to this client; they replace what was expected and has not come.
-
-        Raises BadName, and ValueError for what is too much or open here already."""
+        """As `Client.expect`."""
         if len(requests) > MAX_OTHERS + 1:
             raise ValueError(f"{len(requests)} ARCs are too many to take over; at most {MAX_OTHERS + 1} are")
         now = self.mesh.now()
@@ -135,8 +133,7 @@ class Handover:
             self.store.forget(arc)
 
     async def hand_over_all(self, to: Sender) -> None:
-        """Hands over all that is queued or running, in one step. Raises RequestRefused: nothing has moved,
-        or, with code `unknown`, nobody could tell."""
+        """As `Client.hand_over_all`."""
         if self.store.resumed.is_set():
             raise RuntimeError("pause() the client before it hands over all: it would ask for it again")
         arcs = sorted(self.store.standing, key=lambda arc: arc.grant is None)
@@ -181,7 +178,7 @@ class Handover:
                 pause = min(longest, pause * 2)
 
     def take_back(self) -> None:
-        """Asks anew for all that was handed over, at its old place: its new client is gone."""
+        """As `Client.take_back`."""
         for arc in list(self.store.moved.values()):
             self.store.reclaim(arc)
         self.store.reclaimed, self.store.undecided = self.store.undecided, set()

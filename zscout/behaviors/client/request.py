@@ -12,14 +12,7 @@ import msgspec
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, is_pattern, matcher, new_instance
 from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release
-from zscout.types import (
-    NO_TERM,
-    SECOND,
-    Grant,
-    Ns,
-    Place,
-    Term,
-)
+from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
 
 Needs = Mapping[str, Mapping[str, Any]]
 
@@ -193,50 +186,35 @@ class OpenArc:
         return 0.0 if since is None or self.grant is not None else max(0, now - since) / SECOND
 
     def ask(self, now: Ns) -> Ask:
-        return Ask(
-            id=self.id,
-            arc=self.name,
-            needs=self.needs,
-            priority=self.priority,
-            min_runtime=self.min_runtime,
-            keep=self.keep,
-            place=self.place,
-            waited=self._waited(now),
-            estimate=self.estimate,
-        )
+        return Ask(**self._as_asked(now), estimate=self.estimate)
 
     def open_request(self, now: Ns) -> OpenRequest:
         """As it is reported to an RCM that takes the lead."""
-        return OpenRequest(
-            id=self.id,
-            arc=self.name,
-            needs=self.needs,
-            priority=self.priority,
-            min_runtime=self.min_runtime,
-            keep=self.keep,
-            place=self.place,
-            waited=self._waited(now),
-            grant=self.grant,
-        )
+        return OpenRequest(**self._as_asked(now), grant=self.grant)
+
+    def _as_asked(self, now: Ns) -> dict[str, Any]:
+        return {
+            "id": self.id,
+            "arc": self.name,
+            "needs": self.needs,
+            "priority": self.priority,
+            "min_runtime": self.min_runtime,
+            "keep": self.keep,
+            "place": self.place,
+            "waited": self._waited(now),
+        }
 
 
 def _is_rc(name: str) -> bool:
     try:
-        check_rc(name)
+        return bool(check_rc(name))
     except BadName:
         return False
-    return True
 
 
 def amounts(needs: Needs) -> dict[str, Amounts]:
     """Needs as people write them (ints, floats, Decimals), as they are sent. 0.1 means one tenth."""
-    return {
-        rc: {
-            name: value if isinstance(value, Decimal) else Decimal(str(value))
-            for name, value in params.items()
-        }
-        for rc, params in needs.items()
-    }
+    return {rc: {name: Decimal(str(value)) for name, value in params.items()} for rc, params in needs.items()}
 
 
 class RequestStore:
