@@ -110,7 +110,7 @@ def broken_handler(candidate: Candidate, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def broken_heartbeat(candidate: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
     assert candidate.rcm is not None
-    monkeypatch.setattr(candidate.rcm.publisher, "_put", lambda *_: 1 / 0)
+    monkeypatch.setattr(candidate.rcm, "_put", lambda *_: 1 / 0)
 
 
 @pytest.mark.parametrize("broken", [broken_loop, broken_core, broken_handler, broken_heartbeat])

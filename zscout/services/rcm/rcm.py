@@ -13,16 +13,21 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
+from typing import Any
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
-from zscout.mesh import Declaration, IncomingQuery, Mesh
+from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
+    Ballot,
     Grants,
     Holder,
     HoldView,
     Operation,
+    Proposal,
+    ProposedHolder,
     RcmState,
     RcState,
     RcView,
@@ -48,6 +53,8 @@ from zscout.scheduling.model import (
     RcReported,
     Requested,
     Tick,
+    Vote,
+    VoteOverdue,
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
@@ -55,13 +62,16 @@ from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.services.rcm.registry import RequestRegistry, reason_info, request_id
 from zscout.services.rcm.request_handler import RequestHandler
-from zscout.services.rcm.voting import Voting
 from zscout.types import SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
 MAX_LISTED = 1_000
 """Queued ARCs in one answer."""
+LATE_VOTE = 2.0
+"""Seconds within which a late vote still counts."""
+MAX_REASON = 500
+"""Characters of a veto's reason."""
 
 
 class Rcm:
@@ -85,8 +95,16 @@ class Rcm:
         self.requests = RequestHandler(
             mesh, fleet, self.core, self.registry, self.membership, supervisor, receive
         )
-        self.publisher = GrantsPublisher(mesh, fleet, self.core, self.registry)
-        self.voting = Voting(mesh, fleet, self.core, supervisor, receive)
+        self._heartbeat = fleet.timing.heartbeat
+        self._grants = mesh.publisher(mesh.keys.grants, Grants)
+        self.seq = 0
+        """The last number that was published."""
+        self._published: Ns = 0
+        """When that was."""
+        self._named: dict[RcName, int] = {}
+        """The number of the last publication that named an RC."""
+        self._vote_timeout = fleet.timing.vote_timeout / SECOND
+        self._voted = supervisor.guard(self._on_ballot)
         self._declared: list[Declaration] = []
         self._wake: asyncio.TimerHandle | None = None
         self._wake_at: Ns | None = None
@@ -112,7 +130,7 @@ class Rcm:
             *self.membership.watch(),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
         ]
-        self.supervisor.spawn(self.publisher.beat())
+        self.supervisor.spawn(self._beat())
 
     def stop(self) -> None:
         """Stops leading. Nothing is revoked: what stands, stands for the next RCM."""
@@ -122,7 +140,7 @@ class Rcm:
         self.supervisor.cancel()
         self.registry.close()
         self.requests.close()
-        self.publisher.close()
+        self._grants.close()
 
     # In
 
@@ -140,12 +158,12 @@ class Rcm:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
         if not self.supervisor.active:
             return
-        current = state.term == self.term and self.publisher.is_current(rc, state.seq)
+        current = state.term == self.term and state.seq >= self._named.get(rc, 0)
         ended, superfluous = discrepancies(state, self.core.holders(rc), self.mesh.now(), current=current)
         if ended:
             self._receive(RcReported(rc, ended))
         if superfluous:
-            self.publisher.publish([], [rc])
+            self._publish([], [rc])
 
     # Events, and out
 
@@ -157,13 +175,13 @@ class Rcm:
                     if client not in self.membership.clients:
                         self.membership.expect(client)
         effects = self.core.handle(self.mesh.now(), *events)
-        self.publisher.publish(effects, named)
+        self._publish(effects, named)
         self.registry.report(effects, self.requests.waiting, self.requests.given_up)
         self.requests.answer(effects)
         for effect in effects:
             match effect:
                 case Propose():
-                    self.voting.propose(effect)
+                    self._propose(effect)
                 case WakeAt(at):
                     self._set_wake(at)
                 case _:
@@ -190,6 +208,70 @@ class Rcm:
         elif at is not None:
             self._receive(Tick())
 
+    # Out: grants
+
+    def _publish(self, effects: Iterable[Effect], rcs: Collection[RcName] | None = None) -> None:
+        """Publishes all holders of the RCs that were granted or revoked, if any were; with `rcs` in any case,
+        and those of `rcs` as well."""
+        changed = [effect for effect in effects if isinstance(effect, (Granted, HoldEnded))]
+        if not changed and rcs is None:
+            return
+        revoked = [
+            _revocation(effect, self.registry.name(effect.arc))
+            for effect in changed
+            if isinstance(effect, HoldEnded)
+        ]
+        now = self.mesh.now()
+        number = self.core.seq if self.core.seq > self.seq else self.core.number()
+        names = sorted({*(rcs or ()), *(rc for effect in changed for rc in effect.rcs)})
+        self._named |= dict.fromkeys(names, number)
+        holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
+        self._put(number, holders, revoked)
+
+    async def _beat(self) -> None:
+        """Repeats the last number whenever nothing was published for a while."""
+        while True:
+            due = self._published + self._heartbeat - self.mesh.now()
+            if due > 0:
+                await asyncio.sleep(due / SECOND)
+            else:
+                self._put(self.seq, {}, [])
+
+    def _put(self, number: int, rcs: dict[RcName, list[Holder]], revoked: list[Revocation]) -> None:
+        self._grants.put(Grants(self.term, number, self.seq, self._heartbeat / SECOND, rcs, revoked))
+        self.seq, self._published = number, self.mesh.now()
+
+    # Out: proposals, and ballots in
+
+    def _propose(self, effect: Propose) -> None:
+        arcs = ((self.core.arc(arc), params) for arc, params in effect.holders.items())
+        holders = [
+            ProposedHolder(request_id(arc.id), arc.name, arc.request.client, decimals(params))
+            for arc, params in arcs
+            if arc is not None
+        ]
+        proposal = Proposal(proposal=effect.proposal, term=self.term, holders=holders)
+        # Overdue once; an answer that comes before the query ends still counts.
+        overdue = self.supervisor.call_later(self._vote_timeout, self._receive, VoteOverdue(effect.proposal))
+        voted = partial(self._voted, effect.rc, effect.proposal, overdue)
+        late = max(LATE_VOTE, 2 * self._vote_timeout)
+        try:
+            self.mesh.ask_then(self.mesh.keys.vote(effect.rc), proposal, Ballot, voted, timeout=late)
+        except MeshError as error:
+            log.warning("%s", error)
+
+    def _on_ballot(
+        self, rc: RcName, proposal: int, overdue: asyncio.TimerHandle, reply: Reply[Ballot] | None
+    ) -> None:
+        overdue.cancel()
+        ballot = reply.message if reply is not None else None
+        if ballot is not None and ballot.proposal == proposal:
+            self._receive(Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON]))
+            return
+        if reply is not None and reply.problem is not None:
+            log.warning("%s did not vote: %s", rc, reply.problem.message)
+        self._receive(VoteOverdue(proposal))
+
     # How things stand
 
     def _on_state_asked(self, query: IncomingQuery[StateAsk]) -> None:
@@ -197,13 +279,13 @@ class Rcm:
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
         if asked.holds_only:
-            query.answer(RcmState(self.term, self.publisher.seq, self.mesh.me.host, holds))
+            query.answer(RcmState(self.term, self.seq, self.mesh.me.host, holds))
             return
         starts = self.registry.starts() if asked.forecast else {}
         query.answer(
             RcmState(
                 term=self.term,
-                seq=self.publisher.seq,
+                seq=self.seq,
                 host=self.mesh.me.host,
                 holds=holds,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
@@ -217,86 +299,36 @@ class Rcm:
         )
 
 
-class GrantsPublisher:
-    """Publishes one reign's grants and revocations, and its heartbeat."""
-
-    def __init__(self, mesh: Mesh, fleet: Fleet, core: Core, registry: RequestRegistry) -> None:
-        self.mesh, self.core = mesh, core
-        self._registry = registry
-        self._heartbeat = fleet.timing.heartbeat
-        self._publisher = mesh.publisher(mesh.keys.grants, Grants)
-        self.seq = 0
-        """The last number that was published."""
-        self._at: Ns = 0
-        self._named: dict[RcName, int] = {}
-        """The number of the last publication that named an RC."""
-
-    def publish(self, effects: Iterable[Effect], rcs: Collection[RcName] | None = None) -> None:
-        """Publishes all holders of the RCs that were granted or revoked, if any were; with `rcs` in any case,
-        and those of `rcs` as well."""
-        changed = [effect for effect in effects if isinstance(effect, (Granted, HoldEnded))]
-        if not changed and rcs is None:
-            return
-        revoked = [
-            _revocation(effect, self._registry.name(effect.arc))
-            for effect in changed
-            if isinstance(effect, HoldEnded)
-        ]
-        now = self.mesh.now()
-        number = self.core.seq if self.core.seq > self.seq else self.core.number()
-        names = sorted({*(rcs or ()), *(rc for effect in changed for rc in effect.rcs)})
-        self._named |= dict.fromkeys(names, number)
-        holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
-        self._put(number, holders, revoked)
-
-    def is_current(self, rc: RcName, seq: int) -> bool:
-        """Whether `seq` is not older than the last publication that named an RC."""
-        return seq >= self._named.get(rc, 0)
-
-    async def beat(self) -> None:
-        """Repeats the last number whenever nothing was published for a while."""
-        while True:
-            due = self._at + self._heartbeat - self.mesh.now()
-            if due > 0:
-                await asyncio.sleep(due / SECOND)
-            else:
-                self._put(self.seq, {}, [])
-
-    def close(self) -> None:
-        self._publisher.close()
-
-    def _put(self, number: int, rcs: dict[RcName, list[Holder]], revoked: list[Revocation]) -> None:
-        every = self._heartbeat / SECOND
-        term, previous = self.core.term, self.seq
-        self._publisher.put(
-            Grants(term=term, seq=number, prev=previous, every=every, rcs=rcs, revoked=revoked)
-        )
-        self.seq, self._at = number, self.mesh.now()
-
-
 # The core's values as messages
 
 
-def _holder(arc: ArcStatus, hold: Hold, rc: str, now: Ns) -> Holder:
-    return Holder(
-        id=request_id(arc.id),
-        arc=arc.name,
-        client=arc.request.client,
-        grant=hold.grant,
-        place=arc.place,
-        rcs=sorted(arc.needs),
-        min_runtime=decimal_seconds(arc.request.min_runtime),
-        remaining=(hold.end - now) / SECOND,
-        priority=arc.request.priority,
-        keep=arc.request.keep,
-        params=decimals(arc.needs[rc]),
-        bound=dict(arc.bound),
-    )
+def _of(arc: ArcStatus) -> dict[str, Any]:
+    """What all messages have of an ARC."""
+    return {
+        "id": request_id(arc.id),
+        "arc": arc.name,
+        "client": arc.request.client,
+        "priority": arc.request.priority,
+        "place": arc.place,
+        "min_runtime": decimal_seconds(arc.request.min_runtime),
+    }
 
 
 def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[Holder]:
     """All holders of an RC."""
-    return [_holder(arc, arc.hold, rc, now) for arc in arcs if arc.hold is not None]
+    return [
+        Holder(
+            **_of(arc),
+            grant=arc.hold.grant,
+            rcs=sorted(arc.needs),
+            remaining=(arc.hold.end - now) / SECOND,
+            keep=arc.request.keep,
+            params=decimals(arc.needs[rc]),
+            bound=dict(arc.bound),
+        )
+        for arc in arcs
+        if arc.hold is not None
+    ]
 
 
 def _revocation(effect: HoldEnded, name: str) -> Revocation:
@@ -315,14 +347,9 @@ def _revocation(effect: HoldEnded, name: str) -> Revocation:
 
 def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> HoldView:
     return HoldView(
-        id=request_id(arc.id),
-        arc=arc.name,
-        client=arc.request.client,
-        priority=arc.request.priority,
+        **_of(arc),
         grant=hold.grant,
-        place=arc.place,
         needs={rc: decimals(params) for rc, params in sorted(arc.needs.items())},
-        min_runtime=decimal_seconds(arc.request.min_runtime),
         held=(now - hold.start) / SECOND,
         remaining=(hold.end - now) / SECOND,
         keep=arc.request.keep,
@@ -330,15 +357,10 @@ def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> HoldView:
     )
 
 
-def _wait_view(arc: ArcStatus, now: Ns, start: Ns | None = None) -> WaitView:
+def _wait_view(arc: ArcStatus, now: Ns, start: Ns | None) -> WaitView:
     return WaitView(
-        id=request_id(arc.id),
-        arc=arc.name,
-        client=arc.request.client,
-        priority=arc.request.priority,
-        place=arc.place,
+        **_of(arc),
         needs={need: decimals(params) for need, params in sorted(arc.request.needs.items())},
-        min_runtime=decimal_seconds(arc.request.min_runtime),
         waited=(now - arc.since) / SECOND,
         reason=str(arc.reason or ""),
         preemptions=arc.preemptions,
