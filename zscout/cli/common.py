@@ -231,6 +231,18 @@ def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: st
     return Failed(f"no {what} {quoted(name)} is known{hint}")
 
 
+class Parsed(click.ParamType[T]):
+    """What `parse` makes of a text, given the option's name as well. It raises BadInput."""
+
+    def __init__(self, name: str, parse: Callable[[str, str], T]) -> None:
+        self.name, self._parse = name, parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> T:
+        if not isinstance(value, str):
+            return value  # type: ignore[no-any-return]
+        return self._parse(value, param.opts[0] if param is not None else self.name)
+
+
 def json_option(help: str = "Print JSON.") -> Callable[[F], F]:  # noqa: A002 - click's word
     """The `--json` option; the parameter is `as_json`."""
     return click.option("--json", "as_json", is_flag=True, help=help)

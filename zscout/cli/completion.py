@@ -68,10 +68,12 @@ def hosts(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[s
 
 
 def rcs(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """RCs of the kind that the parameter is called by."""
     from zscout.keyexpr import Role
 
     async def find(mesh: Mesh) -> Iterable[str]:
-        return {token.name for token in await mesh.living(mesh.keys.alive_any(Role.RC), timeout=LOOK)}
+        found = await mesh.living(mesh.keys.alive_any(Role.RC), timeout=LOOK)
+        return {token.name for token in found if token.name.startswith(f"{param.name}/")}
 
     return _offered(ctx, param, incomplete, find)
 

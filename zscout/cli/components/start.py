@@ -53,38 +53,28 @@ _SIZE: Final = re.compile(r"([0-9]{1,19}(?:\.[0-9]{1,6})?)([KMGT]?)i?B?", re.IGN
 _POWERS: Final = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
 
 
-class Size(click.ParamType[int]):
-    """Bytes from `500M`, `1.5G` or `1048576`: K, M, G, T are powers of 1024."""
-
-    name = "size"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        return value if isinstance(value, int) else parse_size(str(value), param.opts[0] if param else "size")
-
-
-class Cores(click.ParamType[float]):
-    """Cores of a processor, from `0.5` or `2`."""
-
-    name = "cores"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        what = param.opts[0] if param else "cores"
-        try:
-            cores = float(value)
-        except ValueError:
-            cores = math.nan
-        if not 0 < cores <= MAX_CORES:
-            raise BadInput(f"{what}: {quoted(str(value))} is no number of cores; write one, as in 0.5 or 2")
-        return cores
+def parse_cores(text: str, what: str) -> float:
+    """Cores of a processor, from `0.5` or `2`. Raises BadInput."""
+    try:
+        cores = float(text)
+    except ValueError:
+        cores = math.nan
+    if not 0 < cores <= MAX_CORES:
+        raise BadInput(f"{what}: {quoted(text)} is no number of cores; write one, as in 0.5 or 2")
+    return cores
 
 
 def parse_size(text: str, what: str) -> int:
-    """Bytes, as `Size` has them. Raises BadInput."""
+    """Bytes from `500M`, `1.5G` or `1048576`: K, M, G, T are powers of 1024. Raises BadInput."""
     found = _SIZE.fullmatch(text)
     size = int(Decimal(found[1]) * (1 << _POWERS[found[2].upper()])) if found else 0
     if not 0 < size <= MAX_BYTES:
         raise BadInput(f"{what}: {quoted(text)} is no size; write bytes, or with a unit: 500M, 1.5G")
     return size
+
+
+SIZE: Final = common.Parsed("size", parse_size)
+CORES: Final = common.Parsed("cores", parse_cores)
 
 
 def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
@@ -135,7 +125,7 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
     help="Run nowhere but there; given several times, on one of them.",
 )
 @click.option("--label", "labels", multiple=True, metavar="LABEL", help="What its host must have.")
-@click.option("--memory", type=Size(), default=0, help="What its host must have available, as in 500M.")
+@click.option("--memory", type=SIZE, default=0, help="What its host must have available, as in 500M.")
 @click.option("--metric", type=click.Choice(METRICS), default="composite", help="What hosts are judged by.")
 @click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How one is chosen of them.")
 @click.option(
@@ -145,8 +135,8 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
     show_default=True,
     help="Whether it is started again when it has ended.",
 )
-@click.option("--memory-limit", type=Size(), default=0, help="What it may use at most, as in 500M.")
-@click.option("--cpu-limit", type=Cores(), help="Cores that it may use at most, as in 0.5.")
+@click.option("--memory-limit", type=SIZE, default=0, help="What it may use at most, as in 500M.")
+@click.option("--cpu-limit", type=CORES, help="Cores that it may use at most, as in 0.5.")
 @click.option("--no-wait", is_flag=True, help="Don't wait until it runs.")
 @timeout_option("Wait at most so long until it runs, then exit with 1.")
 @common.json_option("Print one JSON object.")

@@ -10,7 +10,7 @@ import click
 
 from zscout.cli import common
 from zscout.cli.lab.options import DefaultGroup
-from zscout.cli.lab.simulate import Building
+from zscout.cli.lab.simulate import BUILDING, buildings
 from zscout.config.strict import BadInput
 from zscout.types import POLICIES, Policy
 
@@ -44,7 +44,8 @@ def recording_option(command: F) -> F:
 @demo.command()
 @click.option(
     "--building",
-    type=Building(),
+    type=BUILDING,
+    shell_complete=buildings,
     metavar="BUILDING",
     default="living_room",
     help="As in zscout simulate: a name, a TOML file, or random:SEED.",

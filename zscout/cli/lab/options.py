@@ -9,10 +9,12 @@ from typing import Any, Final, TypeVar
 
 import click
 
+from zscout.cli.common import Parsed
 from zscout.config.strict import BadInput, quoted
 
 MAX_SEED: Final = 1_000_000
 MAX_PROCESSES: Final = 256
+MAX_LISTED: Final = 64
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -29,9 +31,16 @@ class DefaultGroup(click.Group):
         return super().parse_args(ctx, args if named else [self.default, *args])
 
 
-def seeds_option(default: str, help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
-    """`--seeds N|A-B`; `parse_seeds` reads it."""
-    return click.option("--seeds", metavar="N|A-B", default=default, help=help)
+def seeds_option(default: str, help: str, most: int | None = None) -> Callable[[F], F]:  # noqa: A002 - click's word
+    """`--seeds N|A-B`, no more than `most`."""
+    seeds = Parsed("text", lambda text, _option: parse_seeds(text, most))
+    return click.option("--seeds", metavar="N|A-B", type=seeds, default=default, help=help)
+
+
+def numbers_option(option: str, low: int, high: int, help: str) -> Callable[[F], F]:  # noqa: A002
+    """`1-4,8`: numbers within `low` to `high`."""
+    numbers = Parsed("text", lambda text, option: parse_numbers(text, option, low, high))
+    return click.option(option, metavar="LIST", type=numbers, help=help)
 
 
 def rrd_option(*names: str, what: str = " with plots") -> Callable[[F], F]:
@@ -72,6 +81,25 @@ def parse_seeds(text: str, most: int | None = None) -> range:
     if most is not None and len(seeds) > most:
         raise BadInput(f"--seeds: {len(seeds)} are more than {most}; ask for fewer")
     return seeds
+
+
+def parse_numbers(text: str, option: str, low: int, high: int) -> list[int]:
+    """`1-4,8` is 1, 2, 3, 4 and 8. Raises BadInput."""
+    listed: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        ends = [first, last] if dash else [first, first]
+        if not all(end.isascii() and end.isdigit() and len(end) <= 7 for end in ends):
+            raise BadInput(f"{option} {quoted(text)}: write numbers and ranges of them, as in 1-4,8")
+        begin, end = int(ends[0]), int(ends[1])
+        if not low <= begin <= end <= high:
+            raise BadInput(
+                f"{option} {quoted(text)}: {quoted(part)} is not within {low} to {high}, or backwards"
+            )
+        if len(listed) + end - begin >= MAX_LISTED:
+            raise BadInput(f"{option} {quoted(text)}: these are more than {MAX_LISTED} numbers; give fewer")
+        listed += range(begin, end + 1)
+    return list(dict.fromkeys(listed))
 
 
 def check_rrd(rrd: Path | None, *, writable: bool = True) -> None:

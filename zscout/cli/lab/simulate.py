@@ -9,40 +9,38 @@ from typing import Any, Final
 import click
 from click.shell_completion import CompletionItem
 
-from zscout import terminal
 from zscout.cli import common
 from zscout.config.strict import BadInput, quoted
 from zscout.lab.building.plan_file import (
     MAX_SEED,
     RANDOM,
     known_buildings,
-    load_plan,
     plan_named,
     shipped_plans,
 )
 
+BUILDING: Final = common.Parsed("building", lambda text, _: text)
 MAX_FRAMEGRABBERS: Final = 16
 MAX_SECONDS: Final = 1e9
 _ADDRESS: Final = re.compile(r"(?:(?P<host>\[[0-9a-fA-F:.]+\]|[^:\[\]]+):)?(?P<port>[0-9]{1,5})")
 
 
-class Building(click.ParamType[str]):
-    """What serves as a building, completed by the names of those that are shipped and by files."""
+def buildings(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """What serves as a building at Tab: names of those that are shipped, and files."""
+    names = [name for name in (*shipped_plans(), f"{RANDOM}:1") if name.startswith(incomplete)]
+    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
-    name = "building"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        return str(value)
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
-        names = [name for name in (*shipped_plans(), f"{RANDOM}:1") if name.startswith(incomplete)]
-        return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+def parse_address(text: str, option: str) -> tuple[str, int]:
+    """Host and port of `HOST:PORT` or `PORT`. Raises BadInput."""
+    found = _ADDRESS.fullmatch(text)
+    if found is None or int(found["port"]) > 65_535:
+        raise BadInput(f"{option} {quoted(text)}: write HOST:PORT, as in 127.0.0.1:8080")
+    return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
 
 
 @click.command()
-@click.argument("building", type=Building(), required=False)
+@click.argument("building", type=BUILDING, required=False, shell_complete=buildings)
 @click.option("--list", "listing", is_flag=True, help="List the buildings that are shipped, and end.")
 @click.option(
     "--seed",
@@ -66,6 +64,7 @@ class Building(click.ParamType[str]):
 @click.option(
     "--http",
     metavar="HOST:PORT",
+    type=common.Parsed("text", parse_address),
     default="127.0.0.1:0",
     help="Where cameras are served; port 0 is any free one.",
 )
@@ -110,9 +109,7 @@ class Building(click.ParamType[str]):
     help="End after so many seconds of the building. Default: at Ctrl-C.",
 )
 @common.json_option("Print how to reach everything as one JSON object.")
-def simulate(
-    building: str | None, listing: bool, as_json: bool, http: str, mesh: bool, **options: Any
-) -> None:
+def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **options: Any) -> None:
     """Serves a simulated building: a radio on a serial port, cameras as MJPEG over HTTP, in real time.
 
     BUILDING is the name of one that is shipped (--list), a TOML file, or random:SEED for one that is drawn.
@@ -126,59 +123,14 @@ def simulate(
       zscout simulate random:7 --speed 2 --http 127.0.0.1:8080 --loss 0.05
     """
     if listing:
-        _list(as_json=as_json)
+        from zscout.lab.building.simulate import print_shipped
+
+        print_shipped(as_json=as_json)
         return
     if building is None:
         raise BadInput(f"which building? name one of {known_buildings()}, or a file")
     plan = plan_named(building)
     from zscout.lab.building.simulate import simulate as serve
 
-    mesh_of, fleet_file = common.the_fleet() if mesh else None, common.fleet_file()
-    common.run(
-        serve(
-            plan,
-            mesh_of=mesh_of,
-            fleet_file=fleet_file,
-            http=_address(http),
-            as_json=as_json,
-            **options,
-        )
-    )
-
-
-def _list(*, as_json: bool) -> None:
-    rows = [(name, load_plan(path)) for name, path in shipped_plans().items()]
-    if as_json:
-        terminal.print_json(
-            [
-                {
-                    "building": name,
-                    "width": plan.width,
-                    "depth": plan.depth,
-                    "robots": [robot.name for robot in plan.robots],
-                }
-                for name, plan in rows
-            ]
-        )
-        return
-    terminal.print_table(
-        ("building", "metres", "furniture", "people", "robots"),
-        [
-            (
-                name,
-                f"{plan.width:g} x {plan.depth:g}",
-                str(len(plan.furniture)),
-                str(len(plan.people)),
-                ", ".join(robot.name for robot in plan.robots),
-            )
-            for name, plan in rows
-        ],
-    )
-
-
-def _address(text: str) -> tuple[str, int]:
-    """Host and port of `HOST:PORT` or `PORT`. Raises BadInput."""
-    found = _ADDRESS.fullmatch(text)
-    if found is None or int(found["port"]) > 65_535:
-        raise BadInput(f"--http {quoted(text)}: write HOST:PORT, as in 127.0.0.1:8080")
-    return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
+    fleet = common.the_fleet() if mesh else None
+    common.run(serve(plan, mesh_of=fleet, fleet_file=common.fleet_file(), as_json=as_json, **options))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 
@@ -14,11 +16,11 @@ from zscout.cli.lab.options import (
     DefaultGroup,
     check_rrd,
     jobs_option,
-    parse_seeds,
+    numbers_option,
     rrd_option,
     seeds_option,
 )
-from zscout.config.strict import BadInput, quoted
+from zscout.config.strict import BadInput
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.trial import STRATEGIES, SchedulingJob, run_timed
 
@@ -28,7 +30,6 @@ MAX_SEEDS: Final = 1_000
 """More take hours."""
 MAX_NETS: Final = 5_000
 """At ten seconds each they take half a day."""
-MAX_LISTED: Final = 64
 MAX_CREW: Final = 16
 MAX_BAUD: Final = 1_000_000
 MIN_BAUD: Final = 110
@@ -71,7 +72,7 @@ def study() -> None:
 def schedule(
     families: tuple[str, ...],
     strategies: tuple[str, ...],
-    seeds: str,
+    seeds: range,
     processes: int | None,
     as_json: bool,
     rrd: Path | None,
@@ -91,8 +92,7 @@ def schedule(
     """
     chosen = list(dict.fromkeys(families)) or list(FAMILIES)
     compared = list(dict.fromkeys(strategies)) or list(STRATEGIES)
-    numbers = parse_seeds(seeds)
-    trials = len(chosen) * len(compared) * len(numbers)
+    trials = len(chosen) * len(compared) * len(seeds)
     if trials > MAX_SCHEDULES:
         raise BadInput(
             f"--seeds: {trials} trials are more than {MAX_SCHEDULES}; ask for fewer seeds or families"
@@ -103,11 +103,11 @@ def schedule(
     from zscout.lab.study.scheduling.summary import Study
     from zscout.lab.study.scheduling.tables import print_report
 
-    result = Study(chosen, compared, numbers)
+    result = Study(chosen, compared, seeds)
     planned = [
-        SchedulingJob(family, seed, strategy, drawn=rrd is not None and seed == numbers[0])
+        SchedulingJob(family, seed, strategy, drawn=rrd is not None and seed == seeds[0])
         for family in chosen
-        for seed in numbers
+        for seed in seeds
         for strategy in compared
     ]
     common.run(run_trials(run_timed, planned, processes, result.add))
@@ -116,18 +116,14 @@ def schedule(
         from zscout.lab.plots.scheduling import record
 
         record(rrd, report, result.curves)
-    if as_json:
-        terminal.print_json(dataclasses.asdict(report))
-        return
-    print_report(report)
-    print_recording(rrd)
+    _show(dataclasses.asdict(report), rrd, partial(print_report, report), as_json=as_json)
 
 
 @study.command()
-@seeds_option("5", "Runs of each kind: so many, or those of seeds A to B.")
+@seeds_option("5", "Runs of each kind: so many, or those of seeds A to B.", MAX_SEEDS)
 @common.json_option("Print one JSON object instead of tables.")
 @rrd_option(what=" of the load curves")
-def placement(seeds: str, as_json: bool, rrd: Path | None) -> None:
+def placement(seeds: range, as_json: bool, rrd: Path | None) -> None:
     """Compares how the load balancer's policies and metrics place components, on simulated hosts.
 
     Three Place Sensor Nets on three workstations, started at once and a minute apart (Figure 3 of the paper),
@@ -141,31 +137,26 @@ def placement(seeds: str, as_json: bool, rrd: Path | None) -> None:
       zscout study placement --seeds 50 --json
       zscout study placement --rrd placement.rrd && zscout view placement.rrd
     """
-    numbers = parse_seeds(seeds, MAX_SEEDS)
     check_rrd(rrd)
     from zscout.lab.study.placement.study import parts
     from zscout.lab.study.placement.study import study as compare
     from zscout.lab.study.placement.tables import print_report
 
-    with terminal.progress(len(numbers) * parts()) as advance:
-        report, outcomes = compare(numbers, advance)
+    with terminal.progress(len(seeds) * parts()) as advance:
+        report, outcomes = compare(seeds, advance)
     if rrd is not None:
         from zscout.lab.plots.placement import record
 
         record(rrd, report, outcomes)
-    if as_json:
-        terminal.print_json(dataclasses.asdict(report))
-        return
-    print_report(report)
-    print_recording(rrd)
+    _show(dataclasses.asdict(report), rrd, partial(print_report, report), as_json=as_json)
 
 
 @study.command()
-@seeds_option("2", "Runs of each kind in each building: so many, or those of seeds A to B.")
-@click.option("--robots", metavar="LIST", help="How many robots, as in 1-4,8. Default: 1,2,4,6,8.")
-@click.option("--channels", metavar="LIST", help="How many video channels and framegrabbers. Default: 1-4.")
-@click.option("--baud", metavar="LIST", help="Rates of the radio. Default: 300,600,1200,2400,9600.")
-@click.option("--slot", metavar="LIST", help="Seconds of a robot's turn to hide in. Default: 30,60,90.")
+@seeds_option("2", "Runs of each kind in each building: so many, or those of seeds A to B.", MAX_SEEDS)
+@numbers_option("--robots", 1, MAX_CREW, "How many robots, as in 1-4,8. Default: 1,2,4,6,8.")
+@numbers_option("--channels", 1, MAX_CREW, "How many video channels and framegrabbers. Default: 1-4.")
+@numbers_option("--baud", MIN_BAUD, MAX_BAUD, "Rates of the radio. Default: 300,600,1200,2400,9600.")
+@numbers_option("--slot", 1, MAX_SLOT, "Seconds of a robot's turn to hide in. Default: 30,60,90.")
 @click.option(
     "--building",
     "buildings",
@@ -192,11 +183,11 @@ def placement(seeds: str, as_json: bool, rrd: Path | None) -> None:
     help="Write the plots as SVG files into this folder besides.",
 )
 def robots(
-    seeds: str,
-    robots: str | None,
-    channels: str | None,
-    baud: str | None,
-    slot: str | None,
+    seeds: range,
+    robots: list[int] | None,
+    channels: list[int] | None,
+    baud: list[int] | None,
+    slot: list[int] | None,
     buildings: tuple[str, ...],
     seconds: float,
     starts: int | None,
@@ -220,11 +211,7 @@ def robots(
       zscout study robots --starts 40
       zscout study robots --rrd robots.rrd && zscout view robots.rrd
     """
-    crews = _numbers("--robots", robots, 1, MAX_CREW)
-    channel_counts = _numbers("--channels", channels, 1, MAX_CREW)
-    bauds = _numbers("--baud", baud, MIN_BAUD, MAX_BAUD)
-    slots = _numbers("--slot", slot, 1, MAX_SLOT)
-    numbers = range(starts) if starts is not None else parse_seeds(seeds, MAX_SEEDS)
+    numbers = range(starts) if starts is not None else seeds
     check_rrd(rrd)
     from zscout.lab.study import robots as nets
     from zscout.lab.study.process_pool import run_trials
@@ -235,7 +222,9 @@ def robots(
         # Those that are drawn have robots.
         if name != nets.DRAWN and not nets.plan_of(name, 0).robots and starts is not None:
             raise BadInput(f"--building {name}: there is no robot in it to start; add a [[robot]]")
-    plan = nets.StudyPlan.of(crews, channel_counts, bauds, slots) if starts is None else nets.StudyPlan()
+    plan = nets.StudyPlan()
+    if starts is None:
+        plan = nets.StudyPlan.of(robots or [], channels or [], baud or [], slot or [])
     planned = plan.jobs(names, numbers, seconds)
     if len(planned) > MAX_NETS:
         raise BadInput(f"--seeds: {len(planned)} runs are more than {MAX_NETS}; ask for fewer of something")
@@ -250,36 +239,15 @@ def robots(
         from zscout.lab.plots.robots_svg import write
 
         write(svg, found.grid, found.radio)
+    shown = {**dataclasses.asdict(found), "runs": [dataclasses.asdict(trial) for trial in trials]}
+    _show(shown, rrd, partial(print_report, found, names, len(numbers), seconds), as_json=as_json)
+
+
+def _show(report: Any, rrd: Path | None, print_report: Callable[[], None], *, as_json: bool) -> None:
+    """One JSON object of it; else its tables, and how to look at the recording."""
     if as_json:
-        shown = dataclasses.asdict(found)
-        terminal.print_json({**shown, "runs": [dataclasses.asdict(trial) for trial in trials]})
+        terminal.print_json(report)
         return
-    print_report(found, names, len(numbers), seconds)
-    print_recording(rrd)
-
-
-def _numbers(option: str, text: str | None, low: int, high: int) -> list[int]:
-    """`1-4,8` is 1, 2, 3, 4 and 8; nothing is nothing. Raises BadInput."""
-    if text is None:
-        return []
-    listed: list[int] = []
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        ends = [first, last] if dash else [first, first]
-        if not all(end.isascii() and end.isdigit() and len(end) <= 7 for end in ends):
-            raise BadInput(f"{option} {quoted(text)}: write numbers and ranges of them, as in 1-4,8")
-        begin, end = int(ends[0]), int(ends[1])
-        if not low <= begin <= end <= high:
-            raise BadInput(
-                f"{option} {quoted(text)}: {quoted(part)} is not within {low} to {high}, or backwards"
-            )
-        if len(listed) + end - begin >= MAX_LISTED:
-            raise BadInput(f"{option} {quoted(text)}: these are more than {MAX_LISTED} numbers; give fewer")
-        listed += range(begin, end + 1)
-    return list(dict.fromkeys(listed))
-
-
-def print_recording(rrd: Path | None) -> None:
-    """Where the recording is, and how to look at it."""
+    print_report()
     if rrd is not None:
         terminal.print_line(f"\nRecording: {rrd} (zscout view {rrd})")

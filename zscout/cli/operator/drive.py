@@ -6,15 +6,16 @@ import asyncio
 import importlib
 import os
 import sys
+from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
 from zscout import terminal
-from zscout.cli import common
-from zscout.cli.requests.options import RcName
+from zscout.cli import common, completion
+from zscout.cli.requests.options import parse_rc
 from zscout.config.strict import BadInput, quoted
 from zscout.types import SECOND
 
@@ -26,14 +27,24 @@ if TYPE_CHECKING:
 REFRESH: Final = 0.2
 """Seconds between two drawings of the live line."""
 MAX_RATE: Final = 50.0
+F = TypeVar("F", bound=Callable[..., Any])
+
 HELP: Final = "arrows or wasd drive · space stops · + - speed · g gives back · q ends"
 
 
+def _rc_option(kind: str) -> Callable[[F], F]:
+    """`--radio RC` and the like; any one of this kind unless it is named."""
+    rc = common.Parsed("rc", lambda text, _: parse_rc(text, kind, pattern=True))
+    return click.option(f"--{kind}", default=f"{kind}/*", type=rc, shell_complete=completion.rcs)
+
+
 @click.command()
-@click.argument("robot", type=RcName("robot"))
-@click.option("--radio", default="radio/*", type=RcName("radio", pattern=True))
-@click.option("--video", default="video/*", type=RcName("video", pattern=True))
-@click.option("--framegrabber", default="framegrabber/*", type=RcName("framegrabber", pattern=True))
+@click.argument(
+    "robot", type=common.Parsed("rc", lambda text, _: parse_rc(text, "robot")), shell_complete=completion.rcs
+)
+@_rc_option("radio")
+@_rc_option("video")
+@_rc_option("framegrabber")
 @click.option(
     "--rate",
     type=click.FloatRange(0.5, MAX_RATE),

@@ -29,29 +29,19 @@ DRAWN: Final = 0.1
 """Seconds from one live line to the next."""
 
 
-class SourceName(click.ParamType[str]):
-    """A file, URL or device, completed as a file, and by the cameras that are there."""
-
-    name = "source"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        return str(value)
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
-        cameras = sorted(str(path) for path in Path("/dev").glob("video*"))
-        offered = [
-            CompletionItem(camera) for camera in cameras if incomplete and camera.startswith(incomplete)
-        ]
-        return offered or [CompletionItem(incomplete, type="file")]
+def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """What serves as a source at Tab: files, and the cameras that are there."""
+    cameras = sorted(str(path) for path in Path("/dev").glob("video*"))
+    offered = [CompletionItem(camera) for camera in cameras if incomplete and camera.startswith(incomplete)]
+    return offered or [CompletionItem(incomplete, type="file")]
 
 
 @click.command()
 @click.option(
     "--source",
     metavar="FILE|URL|DEVICE",
-    type=SourceName(),
+    type=common.Parsed("source", lambda text, _: text),
+    shell_complete=sources,
     required=True,
     help="A video file, an http:// or rtsp:// address, /dev/videoN or its number.",
 )

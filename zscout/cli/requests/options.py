@@ -6,14 +6,14 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
-from click.shell_completion import CompletionItem
 
 from zscout import messages
-from zscout.cli.common import json_option
+from zscout.cli.common import Parsed, json_option
 from zscout.cli.requests.run_command import check_command
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
@@ -33,29 +33,27 @@ _UNITS: Final = {
 }
 
 
-class Duration(click.ParamType[Decimal]):
-    """A duration in seconds from `5`, `1.5`, `300ms`, `2m` or `1h`."""
-
-    name = "duration"
-
-    def __init__(self, *, zero: bool = False) -> None:
-        self._zero = zero
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Decimal:
-        if isinstance(value, Decimal):
-            return value
-        what = param.opts[0] if param is not None else "duration"
-        return parse_duration(str(value), what, zero=self._zero)
+def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
+    """Seconds from `5`, `1.5`, `300ms`, `2m` or `1h`. Raises BadInput."""
+    remedy = "write a number of seconds, or with a unit: 1.5, 300ms, 2m, 1h"
+    number = text.rstrip("hms")
+    unit = text[len(number) :]
+    if _NUMBER.fullmatch(number) is None or unit not in _UNITS:
+        raise BadInput(f"{what}: {quoted(text)} is not a duration; {remedy}")
+    seconds = Decimal(number) * _UNITS[unit]
+    if zero and seconds == 0:
+        return seconds
+    try:
+        messages.duration(seconds, what)
+    except ValueError as error:
+        raise BadInput(f"{error}; {remedy}") from None
+    return seconds
 
 
 def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
     """`--timeout`, in seconds."""
-    return click.option(
-        "--timeout",
-        type=Duration(),
-        callback=lambda _context, _option, value: None if value is None else float(value),
-        help=help,
-    )
+    seconds = Parsed("duration", lambda text, option: float(parse_duration(text, option)))
+    return click.option("--timeout", type=seconds, help=help)
 
 
 class Need(click.ParamType[tuple[str, dict[str, Decimal]]]):
@@ -76,50 +74,16 @@ class Need(click.ParamType[tuple[str, dict[str, Decimal]]]):
             raise
 
 
-class RcName(click.ParamType[str]):
-    """An RC of one kind: `robot/scout33`, or `scout33` alone; with `pattern` also `robot/*`. Tab offers those
-    on the mesh."""
-
-    name = "rc"
-
-    def __init__(self, kind: str, *, pattern: bool = False) -> None:
-        self._kind, self._pattern = kind, pattern
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        text = str(value)
-        rc = text if "/" in text else f"{self._kind}/{text}"
-        if rc.partition("/")[0] != self._kind or (is_pattern(rc) and not self._pattern):
-            raise BadInput(f"{quoted(text)} is no {self._kind}; name one, as in {self._kind}/NAME")
-        try:
-            check_need(rc)
-        except BadName as error:
-            raise BadInput(str(error)) from None
-        return rc
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
-        from zscout.cli.completion import rcs
-
-        found = rcs(ctx, param, incomplete)
-        return [CompletionItem(rc) for rc in found if rc.startswith(f"{self._kind}/")]
-
-
-def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
-    """Seconds from `5`, `1.5`, `300ms`, `2m` or `1h`. Raises BadInput."""
-    remedy = "write a number of seconds, or with a unit: 1.5, 300ms, 2m, 1h"
-    number = text.rstrip("hms")
-    unit = text[len(number) :]
-    if _NUMBER.fullmatch(number) is None or unit not in _UNITS:
-        raise BadInput(f"{what}: {quoted(text)} is not a duration; {remedy}")
-    seconds = Decimal(number) * _UNITS[unit]
-    if zero and seconds == 0:
-        return seconds
+def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
+    """An RC of one kind: `robot/scout33` or `scout33`, with `pattern` also `robot/*`. Raises BadInput."""
+    rc = text if "/" in text else f"{kind}/{text}"
+    if rc.partition("/")[0] != kind or (is_pattern(rc) and not pattern):
+        raise BadInput(f"{quoted(text)} is no {kind}; name one, as in {kind}/NAME")
     try:
-        messages.duration(seconds, what)
-    except ValueError as error:
-        raise BadInput(f"{error}; {remedy}") from None
-    return seconds
+        check_need(rc)
+    except BadName as error:
+        raise BadInput(str(error)) from None
+    return rc
 
 
 def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
@@ -224,14 +188,14 @@ def hold_options(command: F) -> F:
         click.option("--again", is_flag=True, help="Wait and run the command again after a preemption."),
         click.option(
             "--grace",
-            type=Duration(zero=True),
+            type=Parsed("duration", partial(parse_duration, zero=True)),
             default="5",
             help="Between SIGTERM and SIGKILL to the command.",
         ),
         timeout_option("Wait at most so long for a grant, then exit with 1."),
         click.option(
             "--min-runtime",
-            type=Duration(),
+            type=Parsed("duration", parse_duration),
             default="60",
             help="For how long, from the grant: 5, 1.5, 300ms, 2m, 1h.",
         ),

@@ -18,6 +18,7 @@ from zscout.config.strict import BadInput
 from zscout.keyexpr import new_instance
 from zscout.lab.building.node_file import node_file
 from zscout.lab.building.plan import Plan
+from zscout.lab.building.plan_file import load_plan, shipped_plans
 from zscout.lab.building.serve import Served
 from zscout.mesh import IncomingQuery, Mesh
 from zscout.messages.behaviors import BuildingPoses, PlanAsk
@@ -200,3 +201,34 @@ def _live(served: Served) -> Iterator[None]:
             yield
         finally:
             drawing.cancel()
+
+
+def print_shipped(*, as_json: bool) -> None:
+    """Lists the buildings that are shipped."""
+    rows = [(name, load_plan(path)) for name, path in shipped_plans().items()]
+    if as_json:
+        terminal.print_json(
+            [
+                {
+                    "building": name,
+                    "width": plan.width,
+                    "depth": plan.depth,
+                    "robots": [robot.name for robot in plan.robots],
+                }
+                for name, plan in rows
+            ]
+        )
+        return
+    terminal.print_table(
+        ("building", "metres", "furniture", "people", "robots"),
+        [
+            (
+                name,
+                f"{plan.width:g} x {plan.depth:g}",
+                str(len(plan.furniture)),
+                str(len(plan.people)),
+                ", ".join(robot.name for robot in plan.robots),
+            )
+            for name, plan in rows
+        ],
+    )
