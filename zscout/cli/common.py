@@ -19,7 +19,7 @@ import click
 
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
 from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import Role, Token, new_instance
+from zscout.keyexpr import Role, Token, check_name, new_instance
 from zscout.messages import RcmState
 
 if TYPE_CHECKING:
@@ -241,6 +241,10 @@ class Parsed(click.ParamType[T]):
         if not isinstance(value, str):
             return value  # type: ignore[no-any-return]
         return self._parse(value, param.opts[0] if param is not None else self.name)
+
+
+NAME: Final = Parsed("text", check_name)
+"""A name in the key space."""
 
 
 def json_option(help: str = "Print JSON.") -> Callable[[F], F]:  # noqa: A002 - click's word

@@ -11,7 +11,7 @@ import click
 from zscout import terminal
 from zscout.cli import common, completion
 from zscout.cli.components.placing import (
-    component_named,
+    COMPONENT,
     placement_object,
     placer_of,
     tail_of,
@@ -41,7 +41,7 @@ STYLES: Final = {
 
 
 @click.command()
-@click.argument("name", required=False, shell_complete=completion.components)
+@click.argument("name", type=COMPONENT, required=False, shell_complete=completion.components)
 @click.option("--kinds", is_flag=True, help="List what can be started, and on which hosts.")
 @click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
@@ -63,8 +63,6 @@ def components(name: str | None, kinds: bool, watch: bool, as_json: bool) -> int
         raise BadInput("--kinds lists what can be started; leave NAME and --watch out")
     if kinds:
         return common.run(_kinds(as_json=as_json))
-    if name is not None:
-        component_named(name)
     return common.run(_list(name, watch=watch, as_json=as_json))
 
 
@@ -82,7 +80,7 @@ class Listing:
         """All of them, with what they use. Raises NobodyThere; Failed for a name that nobody knows."""
         await self.placer.refresh()
         if self.name is not None and self.name not in self.placer.placements:
-            raise await unknown_here(self.client, self.name)
+            raise await unknown_here(self.placer, self.name)
         hosts = {one.host for one in self._running()}
 
         def reported() -> bool:

@@ -10,16 +10,16 @@ import click
 from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
-from zscout.cli import common, completion
+from zscout.cli import common
 from zscout.cli.components.placing import (
     OVER,
-    component_named,
+    component_argument,
+    host_option,
     placer_of,
     standing,
     unknown_here,
 )
 from zscout.cli.fleet.fleet_view import FleetView
-from zscout.keyexpr import check_name
 from zscout.messages import Output, Placement, ReadOutput
 
 READ_TIMEOUT: Final = 2.0
@@ -30,17 +30,12 @@ UNKNOWN: Final = 3
 
 
 @click.command()
-@click.argument("name", shell_complete=completion.components)
+@component_argument
 @click.option("-f", "--follow", is_flag=True, help="Go on until it has ended, wherever it moves.")
 @click.option(
     "--lines", type=click.IntRange(0, 100_000), help="Only the last so many lines of what there is."
 )
-@click.option(
-    "--host",
-    metavar="HOST",
-    shell_complete=completion.hosts,
-    help="What it wrote there; else where it ran last.",
-)
+@host_option("--host", "What it wrote there; else where it ran last.")
 def logs(name: str, follow: bool, lines: int | None, host: str | None) -> int:
     """Print the output of a component, of its running or its last incarnation.
 
@@ -54,9 +49,6 @@ def logs(name: str, follow: bool, lines: int | None, host: str | None) -> int:
       zscout logs counter --follow --lines 10
       zscout logs counter --host anvil > before-it-moved.txt
     """
-    component_named(name)
-    if host is not None:
-        check_name(host, "--host")
     return common.run(_logs(name, follow=follow, lines=lines, host=host))
 
 
@@ -208,7 +200,7 @@ class Reader:
             return common.Failed(
                 terminal.clean(f"no host knows any output of {self._name}: it {standing(self._record)}")
             )
-        return await unknown_here(self._client, self._name)
+        return await unknown_here(self._placer, self._name)
 
     def write(self, text: str) -> None:
         """To stdout, as it is; at a terminal without what could draw on it."""

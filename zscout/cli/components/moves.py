@@ -9,11 +9,13 @@ import click
 from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.behaviors.client.request import RequestRefused
-from zscout.cli import common, completion
+from zscout.cli import common
 from zscout.cli.components.placing import (
     OVER,
     Progress,
-    component_named,
+    component_argument,
+    host_argument,
+    host_option,
     out_of_work,
     placement_object,
     placer_of,
@@ -22,15 +24,12 @@ from zscout.cli.components.placing import (
     unknown,
 )
 from zscout.cli.requests.options import timeout_option
-from zscout.keyexpr import check_name
 from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
 
 
 @click.command()
-@click.argument("name", shell_complete=completion.components)
-@click.option(
-    "--to", metavar="HOST", shell_complete=completion.hosts, help="Where to. Default: the best other host."
-)
+@component_argument
+@host_option("--to", "Where to. Default: the best other host.")
 @common.json_option("Print one JSON object.")
 def migrate(name: str, to: str | None, as_json: bool) -> int:
     """Move a running component to another host, with its state and all that it holds.
@@ -43,9 +42,6 @@ def migrate(name: str, to: str | None, as_json: bool) -> int:
       zscout migrate counter
       zscout migrate counter --to bellows --json | jq .dead
     """
-    component_named(name)
-    if to is not None:
-        check_name(to, "--to")
     return common.run(_migrate(name, to, as_json=as_json))
 
 
@@ -100,7 +96,7 @@ async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: s
 
 
 @click.command()
-@click.argument("host", shell_complete=completion.hosts)
+@host_argument
 @timeout_option("Wait at most so long until it is empty, then exit with 1.")
 @common.json_option("Print one JSON object.")
 def drain(host: str, timeout: float | None, as_json: bool) -> int:
@@ -114,12 +110,11 @@ def drain(host: str, timeout: float | None, as_json: bool) -> int:
       zscout drain anvil && ssh anvil sudo reboot
       zscout drain anvil --timeout 2m
     """
-    check_name(host, "host")
     return common.run(_drain(host, timeout, as_json=as_json))
 
 
 @click.command()
-@click.argument("host", shell_complete=completion.hosts)
+@host_argument
 @common.json_option("Print one JSON object.")
 def uncordon(host: str, as_json: bool) -> int:
     """Use a host again that was drained. Nothing moves back by itself.
@@ -128,7 +123,6 @@ def uncordon(host: str, as_json: bool) -> int:
     Example:
       zscout uncordon anvil
     """
-    check_name(host, "host")
     return common.run(_uncordon(host, as_json=as_json))
 
 

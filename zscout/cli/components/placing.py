@@ -6,19 +6,22 @@ import asyncio
 import sys
 from collections.abc import AsyncIterator, Callable, Collection, Iterable
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import click
 from msgspec import structs
 
 from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
-from zscout.cli import common
+from zscout.cli import common, completion
 from zscout.config.strict import BadInput
 from zscout.keyexpr import check_name
 from zscout.messages import ListPlacements, Placement, Placements
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 PATIENCE: Final = 15.0
 """Seconds within which a placer answers, though the lead changes meanwhile."""
@@ -112,9 +115,9 @@ def unknown(name: str, known: Iterable[str]) -> common.Failed:
     return common.unknown("component", name, known, "nor any other; start one: zscout start", "known")
 
 
-async def unknown_here(client: Client, name: str) -> common.Failed:
+async def unknown_here(placer: PlacerClient, name: str) -> common.Failed:
     """The same, after all components have been listed. Raises RequestRefused."""
-    everyone = await placer_of(client).request(ListPlacements(), Placements)
+    everyone = await placer.request(ListPlacements(), Placements)
     return unknown(name, (one.component for one in everyone.components))
 
 
@@ -133,9 +136,21 @@ def placement_object(placement: Placement) -> dict[str, Any]:
     return structs.asdict(placement) | {"spec": structs.asdict(placement.spec)}
 
 
-def component_named(text: str) -> str:
+def component_named(text: str, _option: str = "") -> str:
     """The name of a component as somebody wrote it. Raises BadInput."""
     try:
         return check_name(text, "component")
     except ValueError as error:
         raise BadInput(f"{error}; zscout components lists them") from None
+
+
+COMPONENT: Final = common.Parsed("text", component_named)
+component_argument = click.argument("name", type=COMPONENT, shell_complete=completion.components)
+host_argument = click.argument("host", type=common.NAME, shell_complete=completion.hosts)
+
+
+def host_option(name: str, help: str, **more: Any) -> Callable[[F], F]:  # noqa: A002 - click's word
+    """An option that names a host."""
+    return click.option(
+        name, metavar="HOST", type=common.NAME, shell_complete=completion.hosts, help=help, **more
+    )

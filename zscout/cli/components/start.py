@@ -18,18 +18,18 @@ from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common, completion
 from zscout.cli.components.placing import (
+    COMPONENT,
     OVER,
     Progress,
-    component_named,
+    host_option,
     placement_object,
     placing,
     standing,
     tail_of,
-    unknown,
+    unknown_here,
 )
 from zscout.cli.requests.options import timeout_option
 from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import check_name
 from zscout.messages import (
     MAX_COMPONENT_NAME,
     MAX_LABELS,
@@ -37,10 +37,8 @@ from zscout.messages import (
     MAX_RANKED,
     ComponentSpec,
     EndComponent,
-    ListPlacements,
     PlaceComponent,
     Placement,
-    Placements,
 )
 from zscout.types import METRICS, POLICIES
 
@@ -110,21 +108,16 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
 
 
 @click.command(context_settings={"show_default": False})
-@click.argument("kind", shell_complete=completion.kinds)
-@click.option("--name", metavar="NAME", help="What the component is called. Default: its kind.")
+@click.argument("kind", type=common.NAME, shell_complete=completion.kinds)
+@click.option(
+    "--name", metavar="NAME", type=common.NAME, help="What the component is called. Default: its kind."
+)
 @click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON."
 )
 @click.option("--params", metavar="JSON", help="All parameters, as a JSON object.")
-@click.option(
-    "--host",
-    "hosts",
-    multiple=True,
-    metavar="HOST",
-    shell_complete=completion.hosts,
-    help="Run nowhere but there; given several times, on one of them.",
-)
-@click.option("--label", "labels", multiple=True, metavar="LABEL", help="What its host must have.")
+@host_option("--host", "Run nowhere but there; given several times, on one of them.", multiple=True)
+@click.option("--label", metavar="LABEL", type=common.NAME, multiple=True, help="What its host must have.")
 @click.option("--memory", type=SIZE, default=0, help="What its host must have available, as in 500M.")
 @click.option("--metric", type=click.Choice(METRICS), default="composite", help="What hosts are judged by.")
 @click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How one is chosen of them.")
@@ -161,20 +154,13 @@ def start(
       zscout start spin --params '{"cpu": 0.5}' --label gpu --memory 2G --cpu-limit 1
       zscout start counter --host anvil --restart never --timeout 30
     """
-    called = gather_name(kind, name)
-    spec = gather_spec(kind, **wanted)
-    return common.run(_start(called, spec, wait=not no_wait, timeout=timeout, as_json=as_json))
-
-
-def gather_name(kind: str, name: str | None) -> str:
-    """What the component is called. Raises BadName, BadInput."""
-    check_name(kind, "kind")
-    called = check_name(kind if name is None else name, "--name")
+    called = kind if name is None else name
     if len(called) > MAX_COMPONENT_NAME:
         raise BadInput(
             f"the name {quoted(called)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name"
         )
-    return called
+    spec = gather_spec(kind, **wanted)
+    return common.run(_start(called, spec, wait=not no_wait, timeout=timeout, as_json=as_json))
 
 
 def gather_spec(
@@ -182,19 +168,15 @@ def gather_spec(
     *,
     settings: Sequence[str],
     params: str | None,
-    hosts: Sequence[str],
-    labels: Sequence[str],
+    host: Sequence[str],
+    label: Sequence[str],
     restart: str,
     cpu_limit: float | None,
     **same: Any,
 ) -> ComponentSpec:
-    """What is asked for, checked before anybody is asked. Raises BadName, BadInput."""
-    for host in hosts:
-        check_name(host, "--host")
-    for label in labels:
-        check_name(label, "--label")
+    """What is asked for, checked before anybody is asked. Raises BadInput."""
     # In order, as the placer lists them.
-    hosts, labels = sorted(set(hosts)), sorted(set(labels))
+    hosts, labels = sorted(set(host)), sorted(set(label))
     if len(hosts) > MAX_RANKED:
         raise BadInput(f"{len(hosts)} hosts; name at most {MAX_RANKED}, or give them a label")
     if len(labels) > MAX_LABELS:
@@ -267,7 +249,9 @@ async def _until_settled(placer: PlacerClient, shown: Progress, name: str, spec:
 
 
 @click.command()
-@click.argument("names", nargs=-1, required=True, metavar="NAME...", shell_complete=completion.components)
+@click.argument(
+    "names", type=COMPONENT, nargs=-1, required=True, metavar="NAME...", shell_complete=completion.components
+)
 @timeout_option("Wait at most so long for the end, then exit with 1.")
 @common.json_option("Print one JSON object.")
 def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> int:
@@ -280,8 +264,7 @@ def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> int:
       zscout stop counter
       zscout stop blue green --timeout 10
     """
-    wanted = sorted({component_named(name) for name in names})
-    return common.run(_stop(wanted, timeout, as_json=as_json))
+    return common.run(_stop(sorted(set(names)), timeout, as_json=as_json))
 
 
 async def _stop(names: list[str], timeout: float | None, *, as_json: bool) -> int:
@@ -325,5 +308,4 @@ async def _end(placer: PlacerClient, name: str) -> Placement:
     except RequestRefused as refused:
         if refused.code != "unknown_component":
             raise
-    everyone = await placer.request(ListPlacements(), Placements)
-    raise unknown(name, (one.component for one in everyone.components))
+    raise await unknown_here(placer, name)

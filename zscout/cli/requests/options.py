@@ -180,6 +180,10 @@ class HoldOptions:
     again: bool
     as_json: bool
 
+    def terms(self) -> dict[str, Any]:
+        """How its needs are to be held."""
+        return {"priority": self.priority, "min_runtime": self.min_runtime, "keep": self.keep}
+
 
 def hold_options(command: F) -> F:
     """The options of all commands that hold something."""

@@ -132,14 +132,7 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
     try:
         async with common.beside(report.follow_wait()), asyncio.timeout(wanted.timeout):
             if arc is None:
-                arc = await client.request(
-                    wanted.name,
-                    wanted.needs,
-                    priority=wanted.priority,
-                    min_runtime=wanted.min_runtime,
-                    keep=wanted.keep,
-                    estimate=True,
-                )
+                arc = await client.request(wanted.name, wanted.needs, **wanted.terms(), estimate=True)
             grant = await client.granted(arc)
     except TimeoutError:
         why = arc.reason if arc is not None else ""
@@ -210,18 +203,7 @@ async def _hold(report: Report, held: Held) -> None:
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
     """Runs the command until it ends (its code), or until the hold is over and it has been ended (None)."""
-    env = environment(
-        arc=held.arc.name,
-        arc_id=held.arc.id,
-        rcs=held.rcs,
-        bound=held.bound,
-        grant=held.grant,
-        client=client.mesh.me,
-        remaining=held.remaining,
-        fleet_name=client.fleet.name,
-        fleet_file=common.fleet_file(),
-    )
-    async with RunningCommand(wanted.command, env, grace=float(wanted.grace)) as command:
+    async with RunningCommand(wanted.command, environment(held, client), float(wanted.grace)) as command:
         _, ended = await common.first_of(held.over(), command.wait())
         if ended:
             if held.active:
@@ -263,13 +245,7 @@ async def _foresee(wanted: HoldOptions) -> int:
 
     Raises RequestRefused, NobodyThere."""
     async with common.connected("request") as client:
-        foretold = await client.foresee(
-            wanted.name,
-            wanted.needs,
-            priority=wanted.priority,
-            min_runtime=wanted.min_runtime,
-            keep=wanted.keep,
-        )
+        foretold = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
         if foretold is None:
             raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
     if wanted.as_json:

@@ -22,9 +22,9 @@ from typing import Any, Final, Self
 import msgspec
 
 from zscout.behaviors import launch
-from zscout.cli.common import Failed
-from zscout.keyexpr import Sender
-from zscout.types import Grant
+from zscout.behaviors.client.arc import Held
+from zscout.behaviors.client.client import Client
+from zscout.cli.common import Failed, fleet_file
 
 LAUNCHER: Final = Path(str(launch.__file__))
 NOT_EXECUTABLE, NOT_FOUND = 126, 127
@@ -42,31 +42,20 @@ def check_command(command: Sequence[str]) -> None:
     raise Failed(f"{name}: there is no such command; check the name and $PATH", NOT_FOUND)
 
 
-def environment(
-    *,
-    arc: str,
-    arc_id: str,
-    rcs: Sequence[str],
-    bound: Mapping[str, str],
-    grant: Grant,
-    client: Sender,
-    remaining: float,
-    fleet_name: str,
-    fleet_file: Path | None,
-) -> dict[str, str]:
+def environment(held: Held, client: Client) -> dict[str, str]:
     """This process's environment, and what a command needs to use what it holds."""
     variables = {
-        "ZSCOUT_ARC": arc,
-        "ZSCOUT_ARC_ID": arc_id,
-        "ZSCOUT_RCS": " ".join(rcs),
-        "ZSCOUT_BOUND": msgspec.json.encode(bound).decode(),
-        "ZSCOUT_GRANT": msgspec.json.encode(grant).decode(),
-        "ZSCOUT_CLIENT": str(client),
-        "ZSCOUT_REMAINING": f"{max(0.0, remaining):.3f}",
-        "ZSCOUT_FLEET_NAME": fleet_name,
+        "ZSCOUT_ARC": held.arc.name,
+        "ZSCOUT_ARC_ID": held.arc.id,
+        "ZSCOUT_RCS": " ".join(held.rcs),
+        "ZSCOUT_BOUND": msgspec.json.encode(held.bound).decode(),
+        "ZSCOUT_GRANT": msgspec.json.encode(held.grant).decode(),
+        "ZSCOUT_CLIENT": str(client.mesh.me),
+        "ZSCOUT_REMAINING": f"{max(0.0, held.remaining):.3f}",
+        "ZSCOUT_FLEET_NAME": client.fleet.name,
     }
-    if fleet_file is not None:
-        variables["ZSCOUT_FLEET"] = str(fleet_file.absolute())
+    if (file := fleet_file()) is not None:
+        variables["ZSCOUT_FLEET"] = str(file.absolute())
     return os.environ | variables
 
 
@@ -74,7 +63,7 @@ class RunningCommand:
     """A command from its start to the end of its last process. Use as an async context manager: whatever
     happens in the body, nothing of it is left afterwards."""
 
-    def __init__(self, command: Sequence[str], env: Mapping[str, str], *, grace: float) -> None:
+    def __init__(self, command: Sequence[str], env: Mapping[str, str], grace: float) -> None:
         self._command, self._env, self._grace = list(command), env, grace
         self._loop = asyncio.get_running_loop()
         self._ended: asyncio.Future[int] = self._loop.create_future()
