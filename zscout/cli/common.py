@@ -32,8 +32,6 @@ LOOK_FOR_TAKEOVER: Final = 5.0
 STATE_TRIES: Final = 3
 MAX_NAMED: Final = 8
 """Names that are listed of those known."""
-MAX_NAME: Final = 200
-"""Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
@@ -175,13 +173,6 @@ async def state_of(client: Client, arc: str | None = None, *, forecast: bool = F
     raise NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again, or see its log")
 
 
-def arc_named(text: str) -> str:
-    """What may be an ARC's name, its id or `<host>/<client>/<id>`. Raises BadInput."""
-    if not text or len(text) > MAX_NAME or not text.isprintable():
-        raise BadInput(f"{quoted(text)} names no ARC; zscout status lists them")
-    return text
-
-
 async def within(seconds: float | None, event: asyncio.Event) -> bool:
     """Waits for an event, at most so long; returns whether it has come."""
     with suppress(TimeoutError):
@@ -252,9 +243,10 @@ def json_option(help: str = "Print JSON.") -> Callable[[F], F]:  # noqa: A002 - 
     return click.option("--json", "as_json", is_flag=True, help=help)
 
 
-def amount_text(params: Mapping[str, Decimal]) -> str:
-    """Bandwidth parameters as people write them: `command_rate=5,other=1`."""
-    return ",".join(f"{name}={value.normalize():f}" for name, value in sorted(params.items()))
+def with_amounts(name: str, params: Mapping[str, Decimal]) -> str:
+    """With bandwidth parameters as people write them: `radio/rf0 (command_rate=5,other=1)`."""
+    amounts = ",".join(f"{one}={value.normalize():f}" for one, value in sorted(params.items()))
+    return f"{name} ({amounts})" if amounts else name
 
 
 def check_recording(option: str, path: Path | None) -> None:

@@ -1,4 +1,4 @@
-"""Processes that a command starts beside itself, such as the viewer: they end with it, however it ends."""
+"""Processes that a command starts beside itself, viewer and recorder: they end with it, however it ends."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 import sys
 from collections import deque
 from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -28,6 +28,8 @@ GRACE: Final = 15.0
 MAX_LINE: Final = 65_536
 KEPT: Final = 20
 """Last lines of a child's log that are kept, to say why it failed."""
+WINDOW: Final = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen")
+"""What a viewer with a window of its own is given."""
 _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -42,38 +44,36 @@ class Child:
 
     async def says(self, words: str) -> None:
         """Returns once these words stand in its log. Raises Failed if it ends first, or takes too long."""
-        try:
-            async with asyncio.timeout(START):
-                while not any(words in line for line in self.lines):
-                    if self._log.done():
-                        await self.process.wait()
-                        raise self.failed()
-                    self._news.clear()
-                    await self._news.wait()
-        except TimeoutError:
-            raise common.Failed(
-                f"{self.what} did not start within {START:g} s; is this host overloaded?"
-            ) from None
+        async with self._starting():
+            while not any(words in line for line in self.lines):
+                if self._log.done():
+                    raise await self.failed()
+                self._news.clear()
+                await self._news.wait()
 
     async def recording(self) -> Recording:
         """What a recorder says when it records. Raises BadInput and Failed where it can't."""
-        stdout = self.process.stdout
-        assert stdout is not None  # noqa: S101
+        assert self.process.stdout is not None  # noqa: S101
+        async with self._starting():
+            try:
+                return msgspec.json.decode(await self.process.stdout.readline(), type=Recording)
+            except ValueError:  # it ended before that
+                raise await self.failed() from None
+
+    @asynccontextmanager
+    async def _starting(self) -> AsyncIterator[None]:
         try:
             async with asyncio.timeout(START):
-                return msgspec.json.decode(await stdout.readline(), type=Recording)
+                yield
         except TimeoutError:
             raise common.Failed(
                 f"{self.what} did not start within {START:g} s; is this host overloaded?"
             ) from None
-        except ValueError:  # it ended before that
-            await self.process.wait()
-            await self._log
-            raise self.failed() from None
 
-    def failed(self) -> Exception:
+    async def failed(self) -> Exception:
         """Why it ended, in its own last words."""
-        code = self.process.returncode
+        code = await self.process.wait()
+        await self._log
         words = self.lines[-1] if self.lines else "without a word"
         if self.process.stdout is not None and code == BAD_SETTINGS:
             return BadInput(words.partition(" ERROR ")[2] or words)
@@ -146,26 +146,17 @@ async def child(
         await started.end()
 
 
-async def first_to_end(children: Sequence[Child]) -> None:
-    """Returns when the viewer, the first of them, was closed. Raises Failed when any fails."""
-    waits = {asyncio.create_task(child.process.wait()): child for child in children}
-    try:
-        done, _ = await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in waits:
-            task.cancel()
-    for task in done:
-        child = waits[task]
-        if child is not children[0] or child.process.returncode != 0:
-            raise child.failed()
-
-
-def viewer_binary() -> Path:
-    """The viewer itself: the `rerun` script only wraps it, and killing the script would orphan it."""
+def viewer(*arguments: str, log: str = "error") -> AbstractAsyncContextManager[Child]:
+    """Starts the Rerun viewer; `log` is its level. Raises Failed where it is not installed."""
+    # The viewer itself: the `rerun` script only wraps it, and killing the script would orphan it.
     spec = find_spec("rerun_cli")
     binary = Path(spec.origin).with_name("rerun") if spec is not None and spec.origin is not None else None
     if binary is None or not os.access(binary, os.X_OK):
         raise common.Failed(
             "the Rerun viewer is not installed; install the package rerun-sdk for this platform"
         )
-    return binary
+    return child("the viewer", [str(binary), *arguments], {"RUST_LOG": log})
+
+
+def has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -15,7 +15,7 @@ from zscout.cli import common
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.watching import Overview, display, pause, show_once
 from zscout.keyexpr import Role, Token
-from zscout.messages import HoldView, Notice, RcmState
+from zscout.messages import Notice, RcmState
 from zscout.terminal import Table, many, span
 from zscout.types import SECOND, Ns
 
@@ -120,7 +120,7 @@ class Standing:
             there = "held" if holders else "free"
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
-            names = ", ".join(_with_params(hold, view.rc) for hold in holders)
+            names = ", ".join(common.with_amounts(hold.arc, hold.needs[view.rc]) for hold in holders)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
             styles.append({"absent": "red", "lost": "red", "held": "yellow", "free": "green"}[words])
         return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles)
@@ -238,11 +238,6 @@ def _waiting(state: RcmState) -> Table:
     title = f"Waiting, and {state.more} more" if state.more else "Waiting"
     columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "CLIENT", "WHY")
     return Table(title, columns, rows, spare={"RUNTIME", "PREEMPTED", "CLIENT"})
-
-
-def _with_params(hold: HoldView, rc: str) -> str:
-    amounts = common.amount_text(hold.needs[rc])
-    return f"{hold.arc} ({amounts})" if amounts else hold.arc
 
 
 def _doing(host: Host) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import ipaddress
 import os
 import socket
@@ -17,12 +16,7 @@ import click
 
 from zscout import terminal
 from zscout.cli import common
-from zscout.cli.fleet.children import (
-    Child,
-    child,
-    first_to_end,
-    viewer_binary,
-)
+from zscout.cli.fleet.children import WINDOW, Child, child, has_display, viewer
 from zscout.config.node import RecorderConfig
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import valid_name
@@ -75,7 +69,7 @@ def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path, a
     if file is not None:
         _check(file)
         file = file.absolute()  # it may begin with a dash
-    if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not web and not has_display():
         raise common.Failed(
             "no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser"
         )
@@ -87,24 +81,21 @@ async def _view(
 ) -> None:
     # The page comes last, so what it shows needs its own port first.
     async with _source(file, bind, None if web else port, out) as (recording, recorder):
-        children = [recorder] if recorder is not None else []
         shown = recording.url or recording.file
         if not as_json and recorder is not None:
             terminal.print_line(f"Recording to {recording.file}")
             terminal.print_line(f"Live at {recording.url}")
         address: str | None = None
-        command = [str(viewer_binary())]
-        if not web:
-            command += ["--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen"]
-            command += ["--connect", shown] if file is None else [shown]
-        else:
+        if web:
             page = free_port(bind, port) if port is not None else free_port(bind, WEB_PORT, 0)
             stream = free_port(bind, 0)
-            command += ["--serve-web", "--bind", bind, "--web-viewer-port", str(page), "--port", str(stream)]
-            command += [shown]
-        async with child("the viewer", command, {"RUST_LOG": "info" if web else "error"}) as viewer:
+            ports = ("--web-viewer-port", str(page), "--port", str(stream))
+            started = viewer("--serve-web", "--bind", bind, *ports, shown, log="info")
+        else:
+            started = viewer(*WINDOW, *(["--connect"] if file is None else []), shown)
+        async with started as window:
             if web:
-                await viewer.says(HOSTING)
+                await window.says(HOSTING)
                 source = shown if file is None else f"rerun+http://{_host(bind)}:{stream}/proxy"
                 url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
                 address = f"http://{_host(bind)}:{page}/?url={url}&renderer=webgl&hide_welcome_screen=1"
@@ -113,7 +104,12 @@ async def _view(
             elif web:
                 terminal.print_line(f"Open {address}")
                 terminal.print_line("Ctrl-C ends")
-            await first_to_end([viewer, *children])
+            children = [window] + ([recorder] if recorder is not None else [])
+            ended = await common.first_of(*(one.process.wait() for one in children))
+            for one, over in zip(children, ended, strict=True):
+                # The viewer may be closed.
+                if over and (one is not window or one.process.returncode != 0):
+                    raise await one.failed()
 
 
 @asynccontextmanager
@@ -132,12 +128,8 @@ async def _source(
         recording = await recorder.recording()
         if recording.url is None:
             raise common.Failed("the recorder serves no live stream; report this as a bug")
-        alone = asyncio.create_task(_say_if_alone())
-        try:
+        async with common.beside(_say_if_alone()):
             yield recording, recorder
-        finally:
-            alone.cancel()
-            await asyncio.gather(alone, return_exceptions=True)
 
 
 async def _say_if_alone() -> None:

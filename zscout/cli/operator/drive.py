@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-import os
 import sys
 from collections.abc import Callable
 from contextlib import AsyncExitStack
@@ -144,7 +143,7 @@ async def _stream(
     stack: AsyncExitStack, robot: str, record: Path | None, console: _Console, *, view: bool
 ) -> PictureRecording:
     """The picture's stream, and a window onto it where there is a display."""
-    from zscout.cli.fleet.children import child, viewer_binary
+    from zscout.cli.fleet.children import WINDOW, has_display, viewer
     from zscout.cli.fleet.view import free_port
 
     # Rerun takes seconds to load on a busy machine, and the operator may be in a hurry.
@@ -154,14 +153,11 @@ async def _stream(
     stream = stack.enter_context(
         PictureRecording("drive", robot, port=free_port("127.0.0.1", 0), file=record)
     )
-    window = view and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    window = view and has_display()
     words = f"picture at {stream.url}" if window else f"see the picture with: rerun {stream.url}"
     console.event("picture", words, url=stream.url)
     if window:
-        command = [str(viewer_binary()), "--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen"]
-        await stack.enter_async_context(
-            child("the viewer", [*command, "--connect", stream.url], {"RUST_LOG": "error"})
-        )
+        await stack.enter_async_context(viewer(*WINDOW, "--connect", stream.url))
     return stream
 
 

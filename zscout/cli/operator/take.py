@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import click
@@ -52,72 +52,70 @@ async def _take(wanted: HoldOptions, *, yes: bool) -> int:
         return await carry_out(client, wanted)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class TakeoverCost:
     """What taking costs others: holds that end for certain, that may end, and that do not yield. Of `either`,
     by pattern, one must end before it is met."""
 
-    ends: list[HoldView]
-    may_end: list[HoldView]
-    stays: list[HoldView]
-    either: dict[str, list[HoldView]]
-    absent: list[str]
+    ends: list[HoldView] = field(default_factory=list)
+    may_end: list[HoldView] = field(default_factory=list)
+    stays: list[HoldView] = field(default_factory=list)
+    either: dict[str, list[HoldView]] = field(default_factory=dict)
+    absent: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """In words."""
-        lines = [f"preempts {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends]
-        lines += [f"may preempt {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end]
-        lines += [f"waits for {hold_text(hold)}" for hold in self.stays]
-        lines += [
-            f"waits for {need}: {' or '.join(hold_text(hold) for hold in holds)}"
-            for need, holds in self.either.items()
+        return [
+            *(f"preempts {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends),
+            *(f"may preempt {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end),
+            *(f"waits for {hold_text(hold)}" for hold in self.stays),
+            *(f"waits for {need}: {' or '.join(map(hold_text, some))}" for need, some in self.either.items()),
+            *(f"waits for {rc}, which is not on the mesh" for rc in self.absent),
         ]
-        lines += [f"waits for {rc}, which is not on the mesh" for rc in self.absent]
-        return lines
 
     def as_json(self) -> dict[str, Any]:
         """The same for programs."""
         return {
-            "preempts": [hold_json(hold) for hold in self.ends],
-            "may_preempt": [hold_json(hold) for hold in self.may_end],
-            "waits_for": [hold_json(hold) for hold in self.stays],
-            "waits_for_one_of": {
-                need: [hold_json(hold) for hold in holds] for need, holds in self.either.items()
-            },
+            "preempts": list(map(hold_json, self.ends)),
+            "may_preempt": list(map(hold_json, self.may_end)),
+            "waits_for": list(map(hold_json, self.stays)),
+            "waits_for_one_of": {need: list(map(hold_json, some)) for need, some in self.either.items()},
             "absent": self.absent,
         }
 
 
 def takeover_cost(state: RcmState, wanted: HoldOptions) -> TakeoverCost:
     """What would happen if it were asked for now: as the RCM decides, but for the votes of sharable RCs."""
-    ends: dict[str, HoldView] = {}
-    may_end: dict[str, HoldView] = {}
-    stays: dict[str, HoldView] = {}
-    either: dict[str, list[HoldView]] = {}
-    needs = contention_of(state, wanted.needs)
-    for need in needs:
+    cost = TakeoverCost()
+    for need in contention_of(state, wanted.needs):
+        if not need.present:
+            cost.absent.append(need.need)
         if need.rc is None and need.met:
             continue
         choice = len(need.rcs) > 1
-        keeps: dict[str, HoldView] = {}
+        keeps: list[HoldView] = []
         yields = False
         for rc in need.rcs:
             for hold in rc.holds:
-                key = f"{hold.client}/{hold.id}"
                 overstays = hold.keep and hold.remaining <= 0 and hold.priority == wanted.priority
                 if hold.priority < wanted.priority or overstays:
-                    (may_end if rc.sharable or choice else ends)[key] = hold
+                    _add(cost.may_end if rc.sharable or choice else cost.ends, hold)
                     yields = True
                 elif not rc.sharable:
-                    keeps[key] = hold
+                    _add(keeps, hold)
         # With a choice, the RCM takes from the lowest priority that yields.
         if not choice:
-            stays |= keeps
+            for hold in keeps:
+                _add(cost.stays, hold)
         elif keeps and not yields:
-            either[need.need] = list(keeps.values())
-    may_end = {key: hold for key, hold in may_end.items() if key not in ends}
-    absent = [need.need for need in needs if not need.present]
-    return TakeoverCost(list(ends.values()), list(may_end.values()), list(stays.values()), either, absent)
+            cost.either[need.need] = keeps
+    cost.may_end = [hold for hold in cost.may_end if hold not in cost.ends]
+    return cost
+
+
+def _add(holds: list[HoldView], hold: HoldView) -> None:
+    if hold not in holds:
+        holds.append(hold)
 
 
 async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
@@ -128,34 +126,24 @@ async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
         victims = {(hold.client, hold.id) for hold in (*cost.ends, *cost.may_end)}
         if victims and victims <= agreed:
             return
-        _say(client, wanted, cost)
-        if yes or not victims:
-            return
-        if not (sys.stdin.isatty() and sys.stderr.isatty()):
-            raise Failed("nobody can be asked here whether to preempt others; add --yes")
         if wanted.as_json:
-            # The JSON may go down a pipe; who is asked must see what the question is about.
-            _say_in_words(wanted, cost)
+            preview = {"event": "preview", "arc": wanted.name, "client": str(client.mesh.me)}
+            print_json(preview | cost.as_json(), sys.stderr if wanted.command else sys.stdout)
+        asks = bool(victims) and not yes
+        possible = sys.stdin.isatty() and sys.stderr.isatty()
+        # The JSON may go down a pipe: at a question the words are wanted besides.
+        if not wanted.as_json or (asks and possible):
+            for line in cost.lines():
+                print_line(clean(f"{wanted.name} {line}"), sys.stderr)
+        if not asks:
+            return
+        if not possible:
+            raise Failed("nobody can be asked here whether to preempt others; add --yes")
         sys.stderr.write(f"Take {', '.join(sorted(wanted.needs))}? [y/N] ")
         sys.stderr.flush()
         if (await _answer()).strip().lower() not in ("y", "yes"):
             raise Failed("nothing was taken")
         agreed |= victims
-
-
-def _say(client: Client, wanted: HoldOptions, cost: TakeoverCost) -> None:
-    stream = sys.stderr if wanted.command else sys.stdout
-    if wanted.as_json:
-        print_json(
-            {"event": "preview", "arc": wanted.name, "client": str(client.mesh.me), **cost.as_json()}, stream
-        )
-        return
-    _say_in_words(wanted, cost)
-
-
-def _say_in_words(wanted: HoldOptions, cost: TakeoverCost) -> None:
-    for line in cost.lines():
-        print_line(clean(f"{wanted.name} {line}"), sys.stderr)
 
 
 async def _answer() -> str:

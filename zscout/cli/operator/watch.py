@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 from click.shell_completion import CompletionItem
@@ -73,8 +75,20 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
       zscout watch --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
       zscout watch --source /dev/video0 --limit 600 --record garden.rrd
     """
+    ended_by: list[int] = []
+    begun = False
+
+    def on_signal(number: int, _: FrameType | None) -> None:
+        # It ends at the next picture; before the first one, and the second time, at once.
+        if ended_by or not begun:
+            raise common.Interrupted(number)
+        ended_by.append(number)
+
     with ExitStack() as stack:
-        ending = stack.enter_context(_Ending())
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # What a shell or nohup made this process ignore stays ignored.
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                stack.callback(signal.signal, number, signal.signal(number, on_signal))
         report = stack.enter_context(_WatchReport(as_json=as_json))
         from zscout.cli.operator.watch_source import open_source
 
@@ -82,20 +96,19 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
         stack.callback(opened.close)
         if record is not None:
             report.recording = _recording(stack, opened, record)
-        ending.begun = True
-        _watch(opened, report, ending, limit)
-        stack.pop_all().close()
+        begun = True
+        _watch(opened, report, lambda time: bool(ended_by) or (limit is not None and time > limit))
     report.summary()
-    if ending.signal is not None:
-        raise common.Interrupted(ending.signal)
+    if ended_by:
+        raise common.Interrupted(ended_by[0])
 
 
-def _watch(source: Source, report: _WatchReport, ending: _Ending, limit: float | None) -> None:
+def _watch(source: Source, report: _WatchReport, over: Callable[[float], bool]) -> None:
     from zscout.behaviors.perception.motion import EventTracker, MotionDetector
 
     detector, tracker = MotionDetector(), EventTracker()
     for time, picture in source.shots():
-        if ending.signal is not None or (limit is not None and time > limit):
+        if over(time):
             break
         report.at = time
         if picture is None:
@@ -112,33 +125,6 @@ def _watch(source: Source, report: _WatchReport, ending: _Ending, limit: float |
     last = tracker.close()
     if last is not None:
         report.event(last)
-
-
-class _Ending:
-    """Remembers a signal that ends the watch, until the next picture. A context manager."""
-
-    def __init__(self) -> None:
-        self.signal: int | None = None
-        self.begun = False
-        """Whether pictures come, so that there is something to sum up."""
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> _Ending:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            # What a shell or nohup made this process ignore stays ignored.
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                self._before[number] = signal.signal(number, self._heard)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _heard(self, number: int, _: FrameType | None) -> None:
-        if self.signal is not None or not self.begun:
-            # Before the first picture, and the second time, it does not wait for one.
-            raise common.Interrupted(number)
-        self.signal = number
 
 
 class _WatchReport(LiveLine):
@@ -210,19 +196,8 @@ def _recording(stack: ExitStack, source: Source, file: Path) -> WatchRecording:
 
 
 def _as_json(event: Event) -> str:
-    import json
-
-    return json.dumps(
-        {
-            "start": round(event.start, 3),
-            "end": round(event.end, 3),
-            "boxes": [list(box) for box in event.boxes],
-            "peak": round(event.peak, 3),
-            "area": list(event.area),
-            "frames": event.frames,
-            "going_on": event.going_on,
-        }
-    )
+    times = {name: round(getattr(event, name), 3) for name in ("start", "end", "peak")}
+    return json.dumps(event._asdict() | times)
 
 
 def _words(event: Event) -> str:

@@ -76,14 +76,16 @@ class VideoFile:
                 with path.open("rb") as file:
                     head = file.read(HEAD)
         except (OSError, ValueError) as error:
+            why = (error.strerror if isinstance(error, OSError) else None) or error
             raise BadInput(
-                f"{quoted(self.name)} can't be read ({_reason(error)}); name a video file, a URL or a device"
+                f"{quoted(self.name)} can't be read ({why}); name a video file, a URL or a device"
             ) from None
         if not stat.S_ISREG(mode):
             raise BadInput(f"{quoted(self.name)} is no file; name a video file, a URL or a device")
+        nothing = BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
         # FFmpeg draws a text as a picture, and follows playlists to wherever they point.
         if not head or not head.translate(None, TEXT):
-            raise BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
+            raise nothing
         # FFmpeg would write of every torn picture to stderr itself (-8: quiet).
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         if "OPENCV_LOG_LEVEL" not in os.environ:
@@ -93,7 +95,7 @@ class VideoFile:
         self._first = self._read() if self._video.isOpened() else None
         if self._first is None:
             self._video.release()
-            raise BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
+            raise nothing
         _check(self._first, self.name)
         rate = self._video.get(cv2.CAP_PROP_FPS)
         self._period = 1 / (rate if FILE_RATES[0] <= rate <= FILE_RATES[1] else FILE_RATE)
@@ -156,8 +158,7 @@ class LiveSource:
         while True:
             taken = self._capture.wait(number, LOOK)
             if taken is not None:
-                number = taken.number
-                at = taken.time - self._zero
+                number, at = taken.number, taken.time - self._zero
                 if missing is not None:
                     self._report(f"{self.name} gives pictures again, after {at - missing:.1f} s")
                     missing = None
@@ -173,10 +174,6 @@ class LiveSource:
 
     def close(self) -> None:
         self._capture.stop()
-
-
-def _reason(error: OSError | ValueError) -> str:
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def _check(picture: NDArray[np.uint8], name: str) -> None:

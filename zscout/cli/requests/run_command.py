@@ -17,14 +17,16 @@ import sys
 import termios
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
 
 from zscout.behaviors import launch
-from zscout.behaviors.client.arc import Held
-from zscout.behaviors.client.client import Client
 from zscout.cli.common import Failed, fleet_file
+
+if TYPE_CHECKING:
+    from zscout.behaviors.client.arc import Held
+    from zscout.behaviors.client.client import Client
 
 LAUNCHER: Final = Path(str(launch.__file__))
 NOT_EXECUTABLE, NOT_FOUND = 126, 127
