@@ -63,10 +63,10 @@ class PlaceRobot(Behavior):
         for task in self._tasks.values():
             self.add(task)
         self._clock = CarriedClock()
-        self._holding = False
+        self.holding = False
 
     async def run(self, context: BehaviorContext) -> None:
-        self._now(context)
+        self.now(context)
         async with supervised(self.path) as supervisor:
             supervisor.spawn(self._offer_safe_points(context))
             while True:
@@ -83,83 +83,11 @@ class PlaceRobot(Behavior):
     async def _offer_safe_points(self, context: BehaviorContext) -> None:
         """While the robot is not held nothing changes here, however long that takes: a time to be moved."""
         while True:
-            if not self._holding:
+            if not self.holding:
                 await context.safe_point()
             await asyncio.sleep(IDLE)
 
-    async def hold(self, context: BehaviorContext, task: RobotTask) -> None:
-        """Asks for all that `task` needs and does it under the hold, anew when that was taken away, until it
-        is over or has had its slot. Raises CameraBlind, and what a request raises."""
-        priority, slot = self.slots.of(task.task)
-        state = await context.client.state()
-        rcs = [rc.rc for rc in state.rcs if rc.present] if state is not None else []
-        channels = sorted(rc for rc in rcs if rc.startswith("video/"))
-        video = self.scout.blindness.choose(self._now(context), channels)
-        task.report("wait", "for its turn", robot=self.needs.robot)
-        async for attempt in holds(
-            context.client,
-            f"{self.name}-{task.task}",
-            self.needs.needs(video=video),
-            priority=priority,
-            min_runtime=round(slot / context.speed, 3),
-            keep=True,
-        ):
-            async with attempt as held:
-                channel = held.rc(video or self.needs.video)
-                # It may be about to be moved: nothing changes before that is over.
-                await context.safe_point()
-                await self._use(context, task, held, video)
-            if self.scout.silent and attempt.arc is not None and attempt.arc.open:
-                # It was taken away because the receiver is dead: the same needs would be given the same one.
-                await context.client.end(attempt.arc)
-                self.scout.silent = False
-                raise CameraBlind(f"{channel} shows nothing at all")
-
-    async def _use(self, context: BehaviorContext, task: RobotTask, held: Held, video: str | None) -> None:
-        robot = HeldRobot(held, self.needs, video=video)
-        self._holding = True
-        self.scout.held(self._now(context))
-        mesh = context.client.mesh
-        try:
-            with closing(mesh.frames(mesh.keys.frame(robot.framegrabber))) as watch:
-                await robot.camera(True)
-                while await self._look(context, task, robot, watch):
-                    await context.safe_point()
-                    await robot.camera(True, remind=self.scout.blindness.remind(self._now(context)))
-        finally:
-            self.scout.released(self._now(context))
-            self._holding = False
-            task.report("wait", "the hold is over", robot=self.needs.robot)
-
-    async def _look(
-        self, context: BehaviorContext, task: RobotTask, robot: HeldRobot, watch: FrameWatch
-    ) -> bool:
-        """Waits for a picture, and does what it asks for, or none; whether the task goes on."""
-        frame = await watch.next(LOOK / context.speed)
-        # A frame taken under another grant shows another robot.
-        picture = grey_picture(frame.jpeg) if frame and frame.head.grant == robot.held.grant else None
-        across = down = 1.0
-        if picture is not None and picture.shape != (ROWS, COLUMNS):
-            across, down = picture.shape[1] / COLUMNS, picture.shape[0] / ROWS
-            picture = np.asarray(cv2.resize(picture, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA), np.uint8)
-        step = self.scout.see(self._now(context), picture, robot.video)
-        if step.blind:
-            raise CameraBlind(f"no picture on {robot.video} for {PATIENCE:g} s")
-        await robot.drive(step.left, step.right, step.lasts)
-        task.report(
-            step.doing,
-            step.detail,
-            robot=robot.robot,
-            camera=robot.framegrabber if step.boxes or step.quiet else "",
-            alert=step.alert,
-            boxes=[
-                (round(x * across), round(y * down), round(w * across), round(h * down))
-                for x, y, w, h in step.boxes
-            ],
-        )
-        return not step.over
-
-    def _now(self, context: BehaviorContext) -> float:
+    def now(self, context: BehaviorContext) -> float:
         return self._clock.read(context.client.mesh.now(), context.speed)
 
     def memory(self) -> dict[str, Any]:
@@ -173,9 +101,78 @@ class PlaceRobot(Behavior):
 class RobotTask(Behavior):
     """What is done with a robot under one kind of ARC."""
 
-    def __init__(self, task: Task, of: PlaceRobot) -> None:
+    def __init__(self, task: Task, place: PlaceRobot) -> None:
         super().__init__(task)
-        self.task, self.of = task, of
+        self.task, self.place = task, place
 
     async def run(self, context: BehaviorContext) -> None:
-        await self.of.hold(context, self)
+        """Requests all that the task needs and does it under the hold, anew when that was taken away, until
+        it is over or has had its slot. Raises CameraBlind, and what a request raises."""
+        place, scout = self.place, self.place.scout
+        priority, slot = place.slots.of(self.task)
+        state = await context.client.state()
+        rcs = [rc.rc for rc in state.rcs if rc.present] if state is not None else []
+        channels = (rc for rc in rcs if rc.startswith("video/"))
+        video = scout.blindness.choose(place.now(context), channels)
+        self.report("wait", "for its turn", robot=place.needs.robot)
+        async for attempt in holds(
+            context.client,
+            f"{place.name}-{self.task}",
+            place.needs.needs(video=video),
+            priority=priority,
+            min_runtime=round(slot / context.speed, 3),
+            keep=True,
+        ):
+            async with attempt as held:
+                channel = held.rc(video or place.needs.video)
+                # It may be about to be moved: nothing changes before that is over.
+                await context.safe_point()
+                await self._use(context, held, video)
+            if scout.silent and attempt.arc is not None and attempt.arc.open:
+                # It was taken away because the receiver is dead: the same needs would be given the same one.
+                await context.client.end(attempt.arc)
+                scout.silent = False
+                raise CameraBlind(f"{channel} shows nothing at all")
+
+    async def _use(self, context: BehaviorContext, held: Held, video: str | None) -> None:
+        place, scout = self.place, self.place.scout
+        robot = HeldRobot(held, place.needs, video=video)
+        place.holding = True
+        scout.held(place.now(context))
+        mesh = context.client.mesh
+        try:
+            with closing(mesh.frames(mesh.keys.frame(robot.framegrabber))) as watch:
+                await robot.camera(True)
+                while await self._look(context, robot, watch):
+                    await context.safe_point()
+                    await robot.camera(True, remind=scout.blindness.remind(place.now(context)))
+        finally:
+            scout.released(place.now(context))
+            place.holding = False
+            self.report("wait", "the hold is over", robot=place.needs.robot)
+
+    async def _look(self, context: BehaviorContext, robot: HeldRobot, watch: FrameWatch) -> bool:
+        """Waits for a picture, and does what it asks for, or none; whether the task goes on."""
+        frame = await watch.next(LOOK / context.speed)
+        # A frame taken under another grant shows another robot.
+        picture = grey_picture(frame.jpeg) if frame and frame.head.grant == robot.held.grant else None
+        across = down = 1.0
+        if picture is not None and picture.shape != (ROWS, COLUMNS):
+            across, down = picture.shape[1] / COLUMNS, picture.shape[0] / ROWS
+            picture = np.asarray(cv2.resize(picture, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA), np.uint8)
+        step = self.place.scout.see(self.place.now(context), picture, robot.video)
+        if step.blind:
+            raise CameraBlind(f"no picture on {robot.video} for {PATIENCE:g} s")
+        await robot.drive(step.left, step.right, step.lasts)
+        self.report(
+            step.doing,
+            step.detail,
+            robot=robot.robot,
+            camera=robot.framegrabber if step.boxes or step.quiet else "",
+            alert=step.alert,
+            boxes=[
+                (round(x * across), round(y * down), round(w * across), round(h * down))
+                for x, y, w, h in step.boxes
+            ],
+        )
+        return not step.over

@@ -86,12 +86,6 @@ class Alerts:
         """Nobody watches any more: whatever comes next is another event."""
         self._last = None
 
-    def memory(self) -> dict[str, Any]:
-        return {"count": self.count}
-
-    def recall(self, memory: dict[str, Any]) -> None:
-        self.count = int(memory["count"])
-
 
 class Blindness:
     """Why there is no picture of a robot, over its holds: because of the channel, or of the robot.
@@ -184,9 +178,8 @@ class Scout:
         self._detector = MotionDetector()
         self._task: Task = "hide"
         """Of the present hold."""
-        self._held = False
-        self.silent = False
-        """Whether the last hold ended without any picture: its channel is to be left."""
+        self._held = self.silent = False
+        """Silent: the last hold ended without any picture, so its channel is to be left."""
 
     @property
     def task(self) -> Task:
@@ -238,7 +231,7 @@ class Scout:
         """All but what the detector has learned: that begins anew."""
         return {
             "hider": base64.b64encode(self.hider.checkpoint()).decode(),
-            "alerts": self.alerts.memory(),
+            "alerts": {"count": self.alerts.count},
             "blindness": self.blindness.memory(),
             "task": self._task,
             "held": self._held,
@@ -247,7 +240,7 @@ class Scout:
     def recall(self, memory: dict[str, Any]) -> None:
         """Raises ValueError for what is no such memory."""
         self.hider = Hider.restore(base64.b64decode(memory["hider"]))
-        self.alerts.recall(memory["alerts"])
+        self.alerts.count = int(memory["alerts"]["count"])
         self.blindness.recall(memory["blindness"])
         self._task = "watch" if memory["task"] == "watch" else "hide"
         self._held = bool(memory["held"])
