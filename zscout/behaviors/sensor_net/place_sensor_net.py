@@ -16,7 +16,7 @@ from zscout.behaviors.client.client import RequestRefused
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.sensor_net.net import Effect, SensorNet, StartRobot
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
-from zscout.keyexpr import Role, Token
+from zscout.drivers.driver import RcDirectory
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor, supervised
 from zscout.messages import MAX_COMPONENT_NAME, BehaviorSaid, ComponentSpec, Placement, Placements
@@ -35,7 +35,6 @@ class PlaceSensorNet(Behavior):
         super().__init__(name)
         self.net = net
         self._spec_for = spec_for
-        self._there: dict[str, set[Token]] = {}
         self._components: dict[str, str] = {}
         """Robots by the names of their components, which are unique: they contain the net's own."""
         self._placed: set[str] = set()
@@ -46,12 +45,13 @@ class PlaceSensorNet(Behavior):
 
     async def run(self, context: BehaviorContext) -> None:
         mesh = self._mesh = context.client.mesh
+        directory = RcDirectory(mesh)
         self._now()
         self._components = {
             component_of(context.name or self.name, robot): robot for robot in self.net.members
         }
         declared = [
-            mesh.watch(mesh.keys.alive_any(Role.RC), self._on_token),
+            directory.watch(),
             mesh.subscribe(mesh.keys.behavior_any, BehaviorSaid, self._on_status),
             mesh.subscribe(
                 mesh.keys.placements, Placements, lambda _, news: self._on_placements(news.components)
@@ -60,7 +60,8 @@ class PlaceSensorNet(Behavior):
         try:
             async with supervised(self.path) as self._supervisor:
                 while True:
-                    self._apply(self.net.there(self._now(), self._there))
+                    there = [robot for robot in self.net.members if directory.hosts(robot)]
+                    self._apply(self.net.there(self._now(), there))
                     self._report_progress()
                     await context.safe_point()
                     await asyncio.sleep(PERIOD)
@@ -77,13 +78,6 @@ class PlaceSensorNet(Behavior):
         self.report("place" if net.hidden < net.wanted else "guard", words)
 
     # Events
-
-    def _on_token(self, token: Token, alive: bool) -> None:
-        if token.name in self.net.members:
-            tokens = self._there.setdefault(token.name, set())
-            (tokens.add if alive else tokens.discard)(token)
-            if not tokens:
-                del self._there[token.name]
 
     def _on_status(self, key: str, status: BehaviorSaid) -> None:
         sender = self._mesh.keys.sender_of(key)
