@@ -20,6 +20,11 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["PYTHONPYCACHEPREFIX"] = folder.name
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests with processes on a mesh first: they wait more than they compute, and the others fill the gaps."""
+    items.sort(key=lambda item: item.get_closest_marker("live") is None)
+
+
 def pytest_unconfigure(config: pytest.Config) -> None:
     if BYTECODE in config.stash:
         config.stash[BYTECODE].cleanup()
