@@ -21,7 +21,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests with processes on a mesh first: they wait more than they compute, and the others fill the gaps."""
+    """Tests with processes on a mesh come first: they wait more than they compute; others fill the gaps."""
     items.sort(key=lambda item: item.get_closest_marker("live") is None)
 
 

@@ -26,6 +26,8 @@ ROUNDS = 20
 SPEED = 0.6
 """Of `zscout drive`, unless told otherwise."""
 BEHAVIOR = {"left": LEFT, "right": RIGHT}
+REPEAT = 0.1
+"""Seconds from one repetition of a key that is held down to the next."""
 OPERATOR = {"left": SPEED, "right": SPEED}
 
 
@@ -40,12 +42,21 @@ class Shift:
         await self.building.drives("scout33", since=len(self.building.heard), **BEHAVIOR)
 
     async def taken(self, terminal: Terminal) -> float:
-        """The operator presses a key; returns the seconds until the robot hears the first own command."""
+        """The operator holds a key down; returns the seconds until the robot hears the first own command."""
         since = len(self.building.heard)
         pressed = clock.now()
-        terminal.type(b"w")
-        heard = await self.building.drives("scout33", since=since, **OPERATOR)
+        holding = asyncio.create_task(self._hold_down(terminal))
+        try:
+            heard = await self.building.drives("scout33", since=since, **OPERATOR)
+        finally:
+            holding.cancel()
         return (heard.at - pressed) / SECOND
+
+    async def _hold_down(self, terminal: Terminal) -> None:
+        """What a terminal sends then: one press drives for 0.6 s, and a takeover may take longer."""
+        while True:
+            terminal.type(b"w")
+            await asyncio.sleep(REPEAT)
 
     async def lost(self, terminal: Terminal, how: Callable[[], None]) -> float:
         """The operator has the robot and is lost; returns the building's seconds until it stood, once the
