@@ -7,6 +7,7 @@ does who releases early: it is an estimate, and is shown as one.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 from zscout.scheduling.core import Core
@@ -43,59 +44,50 @@ class Forecast:
 
 def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecast:
     """Plays `core` forward from `now`, with `newcomer` asking at once. `core` is not touched."""
-    return _Player(core, now).play(newcomer)
+    # A strategy may keep unfinished searches: the forecast must not meddle with them.
+    twin = Core(STRATEGIES[core.strategy.name](), core.policy)
+    joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
+    result = Forecast()
+    ends = {held.request.arc: held.end for held in lead.standing}
+    unserved = {one.request.arc for one in lead.waiting}
+    """ARCs that are queued and have not started within what was played."""
 
+    def vote(asked: Propose) -> Vote:
+        return Vote(asked.proposal, core.expects_yes(asked.rc, frozenset(asked.holders)))
 
-class _Player:
-    def __init__(self, core: Core, now: Ns) -> None:
-        self.real, self.now = core, now
-        # A strategy may keep unfinished searches: the forecast must not meddle with them.
-        self.core = Core(STRATEGIES[core.strategy.name](), core.policy)
-        self.result = Forecast()
-        self.ends: dict[ArcId, Ns] = {}
-        self.unserved: set[ArcId] = set()
-        """ARCs that are queued and have not started within what was played."""
-
-    def play(self, newcomer: ArcRequest | None) -> Forecast:
-        joined, lead = self.real.as_events(Term(self.real.term.counter + 1, "forecast"))
-        self.ends = {held.request.arc: held.end for held in lead.standing}
-        self.unserved = {one.request.arc for one in lead.waiting}
-        self._step([*joined, lead])
-        if newcomer is not None:
-            self.unserved.add(newcomer.arc)
-            self._step([Requested(newcomer)], newcomer.arc)
-            arc = self.core.arc(newcomer.arc)
-            self.result.reason = arc.reported if arc is not None else None
-        checks = 0
-        while self.ends and self.unserved:
-            checks += self.core.waiting
-            if checks > MAX_CHECKS:
-                break
-            self.now = max(self.now, min(self.ends.values()))
-            self._step([Tick()])
-        return self.result
-
-    def _step(self, events: list[Event], newcomer: ArcId | None = None) -> None:
+    def step(events: list[Event], preempting: ArcId | None = None) -> None:
         """One instant."""
-        for effects in play_instant(self.core, self.now, events, self._vote):
-            for effect in effects:
-                match effect:
-                    case Granted(arc=arc, start=start):
-                        self.result.starts.setdefault(arc, start)
-                        self.unserved.discard(arc)
-                        running = self.core.arc(arc)
-                        if running is not None and running.hold is not None:
-                            self.ends[arc] = running.hold.end
-                    case HoldEnded(arc=arc, outcome=outcome, by=by, requeued=requeued):
-                        self.ends.pop(arc, None)
-                        if requeued and arc not in self.result.starts:
-                            self.unserved.add(arc)
-                        if newcomer is not None and by == newcomer and outcome is Outcome.PREEMPTED:
-                            self.result.preempts.append(arc)
-                    case _:
-                        pass
-            # A kept hold goes on past its minimum runtime: what counts is when it becomes preemptible.
-            self.ends = {arc: end for arc, end in self.ends.items() if end > self.now}
+        for effect in itertools.chain.from_iterable(play_instant(twin, now, events, vote)):
+            match effect:
+                case Granted(arc=arc, start=start):
+                    result.starts.setdefault(arc, start)
+                    unserved.discard(arc)
+                    running = twin.arc(arc)
+                    if running is not None and running.hold is not None:
+                        ends[arc] = running.hold.end
+                case HoldEnded(arc=arc, outcome=outcome, by=by, requeued=requeued):
+                    ends.pop(arc, None)
+                    if requeued and arc not in result.starts:
+                        unserved.add(arc)
+                    if preempting is not None and by == preempting and outcome is Outcome.PREEMPTED:
+                        result.preempts.append(arc)
+                case _:
+                    pass
+        # A kept hold goes on past its minimum runtime: what counts is when it becomes preemptible.
+        for arc in [arc for arc, end in ends.items() if end <= now]:
+            del ends[arc]
 
-    def _vote(self, asked: Propose) -> Vote:
-        return Vote(asked.proposal, self.real.expects_yes(asked.rc, frozenset(asked.holders)))
+    step([*joined, lead])
+    if newcomer is not None:
+        unserved.add(newcomer.arc)
+        step([Requested(newcomer)], newcomer.arc)
+        asking = twin.arc(newcomer.arc)
+        result.reason = asking.reported if asking is not None else None
+    checks = 0
+    while ends and unserved:
+        checks += twin.waiting
+        if checks > MAX_CHECKS:
+            break
+        now = max(now, min(ends.values()))
+        step([Tick()])
+    return result

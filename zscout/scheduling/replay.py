@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import heapq
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
@@ -72,57 +72,48 @@ def replay(
     """Runs the workload to its end. `watch` sees the core after each batch, for tests and recorders.
 
     What is kept past its minimum runtime ends when nothing else is left to come."""
-    return _Player(workload, watch, Core(strategy, policy)).play()
+    core = Core(strategy, policy)
+    capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
+    runtime = {arrival.request.arc: arrival.request.min_runtime for arrival in workload.arrivals}
+    arrivals = deque(sorted(workload.arrivals, key=lambda arrival: arrival.at))
+    running: dict[ArcId, Granted] = {}
+    holds: list[HoldRecord] = []
 
+    def vote(asked: Propose) -> Vote:
+        reason = excess(capacity[asked.rc], asked.holders.items())
+        return Vote(asked.proposal, accept=not reason, reason=reason)
 
-class _Player:
-    def __init__(self, workload: Workload, watch: Watcher | None, core: Core) -> None:
-        self.workload, self.watch, self.core = workload, watch, core
-        self.capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
-        self.open: dict[ArcId, Granted] = {}
-        self.holds: list[HoldRecord] = []
-
-    def play(self) -> Replay:
-        self._step(0, [RcJoined(rc.name, rc.sharable) for rc in self.workload.rcs])
-        arrivals = [
-            (arrival.at, number, arrival.request) for number, arrival in enumerate(self.workload.arrivals)
-        ]
-        heapq.heapify(arrivals)
-        runtime = {arrival.request.arc: arrival.request.min_runtime for arrival in self.workload.arrivals}
-        now: Ns = 0
-        while arrivals or self.open:
-            # Only an arrival or the end of a minimum runtime (a kept hold may be displaced from then on)
-            # changes anything here; the quantum's ticks would not.
-            ends = [hold.start + runtime[arc] for arc, hold in self.open.items()]
-            coming = [end for end in ends if end > now] + [at for at, _, _ in arrivals[:1]]
-            if not coming:
-                self._step(now, [Released(arc) for arc in sorted(self.open)])
-                continue
-            now = min(coming)
-            events: list[Event] = []
-            while arrivals and arrivals[0][0] == now:
-                events.append(Requested(heapq.heappop(arrivals)[2]))
-            self._step(now, events or [Tick()])
-        asked = {arrival.request.arc for arrival in self.workload.arrivals}
-        served = {hold.arc for hold in self.holds if hold.outcome is Outcome.COMPLETED}
-        holds = sorted(self.holds, key=lambda hold: (hold.start, hold.arc, hold.end))
-        return Replay(tuple(holds), tuple(sorted(asked - served)))
-
-    def _step(self, now: Ns, events: list[Event]) -> None:
+    def step(now: Ns, events: Iterable[Event]) -> None:
         """One instant."""
-        for effects in play_instant(self.core, now, events, self._vote):
-            if self.watch is not None:
-                self.watch(now, self.core, effects)
+        for effects in play_instant(core, now, events, vote):
+            if watch is not None:
+                watch(now, core, effects)
             for effect in effects:
                 match effect:
                     case Granted(arc=arc):
-                        self.open[arc] = effect
+                        running[arc] = effect
                     case HoldEnded(arc=arc, outcome=outcome, rcs=rcs):
-                        start = self.open.pop(arc).start
-                        self.holds.append(HoldRecord(arc, start, now, outcome, rcs))
+                        holds.append(HoldRecord(arc, running.pop(arc).start, now, outcome, rcs))
                     case _:
                         pass
 
-    def _vote(self, asked: Propose) -> Vote:
-        reason = excess(self.capacity[asked.rc], asked.holders.items())
-        return Vote(asked.proposal, accept=not reason, reason=reason)
+    now: Ns = 0
+    step(now, [RcJoined(rc.name, rc.sharable) for rc in workload.rcs])
+    while arrivals or running:
+        # Only an arrival or the end of a minimum runtime (a kept hold may be displaced from then on)
+        # changes anything here; the quantum's ticks would not.
+        ends = [hold.start + runtime[arc] for arc, hold in running.items()]
+        coming = [end for end in ends if end > now]
+        if arrivals:
+            coming.append(arrivals[0].at)
+        if not coming:
+            step(now, [Released(arc) for arc in sorted(running)])
+            continue
+        now = min(coming)
+        events: list[Event] = []
+        while arrivals and arrivals[0].at == now:
+            events.append(Requested(arrivals.popleft().request))
+        step(now, events or [Tick()])
+    served = {hold.arc for hold in holds if hold.outcome is Outcome.COMPLETED}
+    holds.sort(key=lambda hold: (hold.start, hold.arc, hold.end))
+    return Replay(tuple(holds), tuple(sorted(runtime.keys() - served)))
