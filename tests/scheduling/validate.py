@@ -66,22 +66,23 @@ def _check_state(state: SchedulerState) -> None:
 def _check_index(state: SchedulerState, index: QueueIndex) -> None:
     queued = state.queued.values()
     assert index.ranks == sorted(arc.rank for arc in queued), "the ranks are not those of the queue"
-    patient = sorted((arc.since, arc.id) for arc in queued if not index.is_starving(arc))
+    patient = sorted((arc.since, arc.id) for arc in queued if not arc.starving)
     assert index._patient == patient, "the patient are not those of the queue"
     band = state.band
-    starving = sorted((-band(arc.priority), arc.since, arc.id) for arc in queued if index.is_starving(arc))
+    starving = sorted((-band(arc.priority), arc.since, arc.id) for arc in queued if arc.starving)
     assert index.starving == starving, "the starving are not those of the queue"
     for arc in queued:
         places = {
             ArcState.PARKED: arc.id in index.parked,
-            ArcState.WATCHING: arc.id in index.watching,
+            ArcState.WATCHING: arc.watched is not None,
         }
         assert (arc.id in index.ready) == (not any(places.values())), f"{arc.id} is indexed twice, or nowhere"
         for kind, there in places.items():
             assert there == (arc.state is kind), f"{arc.id} is {arc.state} and not indexed so"
         undecided = arc.state in {ArcState.VOTING, ArcState.DEFERRED, ArcState.PARKED}
-        assert (arc.id in index.footprints) == undecided, f"{arc.id} is {arc.state}"
-        rc = index.watching.get(arc.id)
-        assert rc is None or arc.rank in rc.watchers, f"{arc.id} is not among the watchers"
-    assert not (index.watching.keys() | index.footprints.keys()) - state.queued.keys()
-    assert index.hidden.keys() <= index.footprints.keys()
+        assert (arc.footprint is not None) == undecided, f"{arc.id} is {arc.state}"
+        assert arc.watched is None or arc.rank in arc.watched.watchers, f"{arc.id} is not among the watchers"
+    for arc in state.running.values():
+        assert arc.watched is None
+        assert arc.footprint is None
+        assert not arc.starving

@@ -113,7 +113,7 @@ class _Search:
         shared = arc.mask & reserved.bits & self.state.sharable
         if shared & self._shared_taken or reserved.conflict(arc) is not None:
             return True
-        if not self.state.index.is_starving(arc):
+        if not arc.starving:
             self._shared_taken |= shared
         return False
 

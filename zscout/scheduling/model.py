@@ -138,6 +138,14 @@ class Arc:
     """Grows with each entry into the queue or among the running: who came there first."""
     rcs: tuple[Rc, ...] = ()
     """Those of `mask`, in the order of the bits; set when the ARC is first queued."""
+    footprint: int | None = None
+    """While it is VOTING, DEFERRED or PARKED: bits of the RCs that it would take or free."""
+    hidden: int = 0
+    """While VOTING or DEFERRED: bits of the RCs with an obstacle under what was off limits."""
+    watched: Rc | None = None
+    """The RC that it is WATCHING."""
+    starving: bool = False
+    """Whether it has waited for too long (`reservations.py`)."""
     bound: Mapping[Need, RcName] = field(default_factory=dict)
     """The RC that each pattern is bound to (`patterns.py`): while it runs, and for the time of a check. Empty
     if there are none to be bound to."""

@@ -276,7 +276,7 @@ class Pass:
             # One may come by several ways, but then at once: ranks are unique.
             if arc.rank != last:
                 last = arc.rank
-                if arc.id not in self.index.footprints or not self._still_deferred(arc):
+                if arc.footprint is None or not self._still_deferred(arc, arc.footprint):
                     self._check(arc)
             if rc is not None:
                 self._call_next_watcher(rc, last)
@@ -395,10 +395,9 @@ class Pass:
             self.index.defer(arc, state, footprint, check.hidden())
         self._put_off_limits(footprint, arc.rank)
 
-    def _still_deferred(self, arc: Arc) -> bool:
+    def _still_deferred(self, arc: Arc, footprint: int) -> bool:
         """Whether a check that could not be decided can't be again, seen without repeating it."""
-        footprint = self.index.footprints[arc.id]
-        if footprint & self.changed or self.index.hidden[arc.id] & ~self.off_limits:
+        if footprint & self.changed or arc.hidden & ~self.off_limits:
             return False
         if arc.state is not ArcState.VOTING and not footprint & self.off_limits:
             return False
@@ -438,11 +437,10 @@ class Pass:
             self._reports_left[rc.bit] = MAX_REPORTED
             if not known:
                 self._call_next_watcher(rc, rank)
-        if index.parked:
-            for arc in list(index.parked.values()):
-                if index.footprints[arc.id] & touched and (rank is None or arc.rank > rank):
-                    index.make_ready(arc)
-                    heapq.heappush(self._heap, (arc.rank, 0, arc, None))
+        for arc in [arc for arc in index.parked.values() if (arc.footprint or 0) & touched]:
+            if rank is None or arc.rank > rank:
+                index.make_ready(arc)
+                heapq.heappush(self._heap, (arc.rank, 0, arc, None))
 
     def _call_next_watcher(self, rc: Rc, rank: Rank | None) -> None:
         """The next watcher of `rc` below `rank` comes."""

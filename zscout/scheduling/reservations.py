@@ -133,7 +133,7 @@ class Reservations:
         left who could take any; but of several that a sharable RC accepts beside `arc`, each by itself, it
         may not accept all."""
         state = self._state
-        return state.index.is_starving(arc) and bool(arc.mask & state.sharable) and self.due(arc) <= state.now
+        return arc.starving and bool(arc.mask & state.sharable) and self.due(arc) <= state.now
 
     def conflict(self, arc: Arc) -> ReservationConflict | None:
         """What `arc` would be in the way of if it started now."""

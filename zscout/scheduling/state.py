@@ -38,11 +38,6 @@ class QueueIndex:
         self.ready: dict[ArcId, Arc] = {}
         """Those that are READY, VOTING or DEFERRED."""
         self.parked: dict[ArcId, Arc] = {}
-        self.watching: dict[ArcId, Rc] = {}
-        self.footprints: dict[ArcId, int] = {}
-        """Bits of the RCs that those VOTING, DEFERRED or PARKED would take or free."""
-        self.hidden: dict[ArcId, int] = {}
-        """Of those VOTING or DEFERRED: bits of the RCs with an obstacle under what was off limits."""
         self.watched = 0
         """Bits of the RCs that somebody watches."""
         self.freed = 0
@@ -55,7 +50,6 @@ class QueueIndex:
         """Those who are not starving, by the time since when they wait."""
         self.starving: list[tuple[int, Ns, ArcId]] = []
         """Those who have waited for too long: by band of priorities (negated), then by the same."""
-        self._starving: dict[ArcId, tuple[int, Ns, ArcId]] = {}
         self.starving_version = 0
         """Grows when somebody starves, or does so no more."""
 
@@ -69,9 +63,10 @@ class QueueIndex:
     def remove(self, arc: Arc) -> None:
         """It waits no more."""
         del self.ranks[bisect_left(self.ranks, arc.rank)]
-        if (entry := self._starving.pop(arc.id, None)) is not None:
+        if arc.starving:
+            arc.starving = False
             self.starving_version += 1
-            del self.starving[bisect_left(self.starving, entry)]
+            del self.starving[bisect_left(self.starving, self._hunger(arc))]
         else:
             del self._patient[bisect_left(self._patient, (arc.since, arc.id))]
         self._leave(arc)
@@ -80,14 +75,13 @@ class QueueIndex:
         """Who has waited since then or longer is starving from now on (`reservations.py`)."""
         count = bisect_right(self._patient, since, key=itemgetter(0))
         self.starving_version += count
-        for waits_since, arc_id in self._patient[:count]:
-            entry = (-self._band(queued[arc_id].priority), waits_since, arc_id)
-            self._starving[arc_id] = entry
-            insort(self.starving, entry)
+        for _, arc_id in self._patient[:count]:
+            queued[arc_id].starving = True
+            insort(self.starving, self._hunger(queued[arc_id]))
         del self._patient[:count]
 
-    def is_starving(self, arc: Arc) -> bool:
-        return arc.id in self._starving
+    def _hunger(self, arc: Arc) -> tuple[int, Ns, ArcId]:
+        return -self._band(arc.priority), arc.since, arc.id
 
     def ahead(self, arc: Arc) -> int:
         """How many of the queued rank above `arc`."""
@@ -100,10 +94,10 @@ class QueueIndex:
 
     def watch(self, arc: Arc, rc: Rc) -> None:
         """`rc` alone keeps `arc` out."""
-        if self.watching.get(arc.id) is not rc:
+        if arc.watched is not rc:
             self._leave(arc)
             arc.move_to(ArcState.WATCHING)
-            self.watching[arc.id] = rc
+            arc.watched = rc
             insort(rc.watchers, arc.rank)
             self.watched |= rc.bit
 
@@ -112,7 +106,7 @@ class QueueIndex:
         self._leave(arc)
         arc.move_to(ArcState.PARKED)
         self.parked[arc.id] = arc
-        self.footprints[arc.id] = footprint
+        arc.footprint = footprint
 
     def make_ready(self, arc: Arc) -> None:
         """The next pass checks `arc`, whatever happens."""
@@ -126,14 +120,13 @@ class QueueIndex:
             self._leave(arc)
             self.ready[arc.id] = arc
         arc.move_to(state)
-        self.footprints[arc.id], self.hidden[arc.id] = footprint, hidden
+        arc.footprint, arc.hidden = footprint, hidden
 
     def _leave(self, arc: Arc) -> None:
         self.ready.pop(arc.id, None)
         self.parked.pop(arc.id, None)
-        if self.footprints.pop(arc.id, None) is not None:
-            self.hidden.pop(arc.id, None)
-        rc = self.watching.pop(arc.id, None)
+        arc.footprint = None
+        rc, arc.watched = arc.watched, None
         if rc is not None:
             del rc.watchers[bisect_left(rc.watchers, arc.rank)]
             if not rc.watchers:
@@ -370,7 +363,7 @@ class SchedulerState:
     def protected_below(self, arc: Arc) -> int | None:
         """Below which priority nobody takes a hold that `arc` is granted now, before its minimum runtime is
         over; None: no such rule."""
-        promised = self.policy.promise == "all" and self.index.is_starving(arc)
+        promised = self.policy.promise == "all" and arc.starving
         return self.policy.operator_priority if promised or self.policy.preempt != "always" else None
 
     def quota_left(self, arc: Arc) -> int | None:
