@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tests.services.recorder.paper_run import rows
 from zscout.keyexpr import Sender
 from zscout.messages import BehaviorSaid, BuildingPlan, BuildingPoses, FrameHead, Placed, RcState
-from zscout.services.recorder.robot_tracker import RobotHold, RobotTracker
+from zscout.services.recorder.robot_tracker import RobotTracker
 from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import Grant, Term
 
@@ -225,9 +225,9 @@ def _hold(
     *,
     operator: bool = False,
 ) -> None:
-    holder = HolderRow(arc, operator)
+    holder = HolderRow(arc, operator, (f"robot/{robot}",))
     for rc in _rcs(robot, camera):
-        tracker.held(rc, {grant: RobotHold((f"robot/{robot}",), operator)})
+        tracker.holds[rc] = {grant: holder}
         timeline.holders(at, rc, [holder])
     _RADIO[arc] = holder
     timeline.holders(at, "radio/rf0", list(_RADIO.values()))
@@ -237,7 +237,7 @@ def _hold(
 
 def _free(tracker: RobotTracker, timeline: Timeline, at: float, arc: str, robot: str, camera: int) -> None:
     for rc in _rcs(robot, camera):
-        tracker.held(rc, {})
+        tracker.holds[rc] = {}
         timeline.holders(at, rc, [])
     _RADIO.pop(arc, None)
     timeline.holders(at, "radio/rf0", list(_RADIO.values()))

@@ -26,8 +26,8 @@ from tests.services.recorder.robot_run import (
 from zscout.drivers.image_size import jpeg_size, png_size
 from zscout.services.recorder import robots
 from zscout.services.recorder.colours import PALE
-from zscout.services.recorder.robot_tracker import RobotHold, RobotTracker
-from zscout.services.recorder.timeline import Timeline
+from zscout.services.recorder.robot_tracker import RobotTracker
+from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import Grant, Term
 
 
@@ -44,7 +44,7 @@ def test_a_picture_that_is_old_says_so(tmp_path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         tracker = RobotTracker(timeline)
         tracker.no_frame(0, CAMERA)
-        tracker.held(CAMERA, {GRANT: RobotHold(("robot/scout33",), operator=False)})
+        tracker.holds[CAMERA] = {GRANT: HolderRow("hide", robots=("robot/scout33",))}
         tracker.frame(1, CAMERA, head(1), picture)
         say(
             tracker, 1.5, "net/a/watch", "alert", camera=CAMERA, boxes=[[1, 2, 30, 40]], robot="robot/scout33"
@@ -52,7 +52,7 @@ def test_a_picture_that_is_old_says_so(tmp_path: Path) -> None:
         for at in (4, 7):
             tracker.no_frame(at, CAMERA)
         tracker.frame(8, CAMERA, head(2), picture)
-        tracker.dropped(CAMERA, {GRANT})
+        tracker.holds[CAMERA] = {}
         tracker.no_frame(11, CAMERA)
         tracker.frame(12, CAMERA, head(3, None), picture)
     assert [(at, text) for at, text, _ in captions(path, "fgrab1")] == [
@@ -72,10 +72,13 @@ def test_boxes_end_with_what_they_mark(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     picture = jpeg(0, "scout33", None)
     next_grant, box = Grant(Term(1, "rcm"), 8), [10, 10, 20, 20]
-    holds = {GRANT: RobotHold(("robot/a",)), next_grant: RobotHold(("robot/b",))}
+    holds = {
+        GRANT: HolderRow("a", robots=("robot/a",)),
+        next_grant: HolderRow("b", robots=("robot/b",)),
+    }
     with Timeline("lab", path=path) as timeline:
         tracker = RobotTracker(timeline)
-        tracker.held(CAMERA, holds)
+        tracker.holds[CAMERA] = holds
         say(tracker, 0, "net/a", "alert", camera=CAMERA, boxes=[box])  # no picture to draw on yet
         tracker.frame(1, CAMERA, head(1), picture)
         bad = [[150, 110, 20, 20], [-1, 0, 5, 5], [160, 0, 5, 5], [0, 0, 161, 5], [0, 0, 0, 5], [10**9] * 4]

@@ -20,12 +20,12 @@ from tests.services.recorder.paper_run import (
 from tests.services.recorder.placed_hour import TERM, placement, play
 from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Sender
-from zscout.mesh import IncomingQuery, Supervisor, ZenohMesh
+from zscout.mesh import IncomingQuery, ZenohMesh
 from zscout.messages import ListPlacements, Placement, Placements, PlacerOperation
 from zscout.services.recorder import hosts as module
 from zscout.services.recorder.hosts import Running, Use
 from zscout.services.recorder.placement_tracker import PlacementTracker
-from zscout.services.recorder.recorder import PlacementFollower
+from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import Term
 
@@ -238,10 +238,8 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
             served = mesh.serve(mesh.keys.placer, PlacerOperation, answer)
             fleet = lab.fleet
             async with await ZenohMesh.open(fleet.name, Sender("here", "recorder"), fleet.mesh) as ears:
-                supervisor = Supervisor("recorder", lambda error: pytest.fail(str(error)))
                 with Timeline("lab", path=path) as timeline:
-                    follower = PlacementFollower(ears, timeline, lambda: 1.0, supervisor)
-                    there = asyncio.Event()
+                    there, stop = asyncio.Event(), asyncio.Event()
                     runs = timeline.hosts.runs
 
                     def shown(at: float, host: str, components: Iterable[Running]) -> None:
@@ -249,8 +247,7 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
                         there.set()
 
                     timeline.hosts.runs = shown  # type: ignore[method-assign]
-                    heard = follower.subscribe()
-                    reading = asyncio.create_task(follower.keep_reading())
+                    recording = asyncio.create_task(Recorder(ears, fleet, timeline).run(stop))
                     async with asyncio.timeout(HANG):
                         await asked.wait()
                         await there.wait()
@@ -262,12 +259,12 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
                             ),
                         )
                         await there.wait()
-                    reading.cancel()
-                    heard.close()
+                    stop.set()
+                    await recording
             served.close()
 
     asyncio.run(run())
-    assert events(path) == [
+    assert [text for text in events(path) if text.startswith("counter")] == [
         "counter (counter) runs on anvil already",
         "counter moved anvil -> basil, dead 500 ms",
     ]

@@ -24,7 +24,7 @@ from zscout.config.fleet import default_fleet
 from zscout.config.node import RecorderConfig, load_node
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role, Sender, Token
-from zscout.mesh import Supervisor, ZenohMesh
+from zscout.mesh import ZenohMesh
 from zscout.messages import (
     BehaviorSaid,
     BuildingPlan,
@@ -34,7 +34,7 @@ from zscout.messages import (
     PlanAsk,
 )
 from zscout.services.recorder.process import RecorderJob, decode_job, encode_job
-from zscout.services.recorder.recorder import Recorder, RobotFollower
+from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
 
 
@@ -78,30 +78,28 @@ def test_who_takes_no_pictures_does_not_look(tmp_path: Path) -> None:
             here = Sender("here", "ears")
             async with await ZenohMesh.open(lab.fleet.name, here, lab.fleet.mesh) as ears:
                 with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
-                    supervisor = Supervisor("recorder", lambda error: pytest.fail(str(error)))
-                    blind, seeing = (
-                        RobotFollower(ears, timeline, lambda: 1.0, rate, supervisor) for rate in (0, 20)
-                    )
-                    heard = asyncio.Event()
-                    declared = blind.subscribe()
-                    token = Token("cart", Role.RC, CAMERA, "i1")
-                    blind.token(token, alive=True)
+                    heard, offered, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
+                    timeline.robots.behavior = lambda *_: heard.set()  # type: ignore[method-assign]
+                    timeline.event = lambda _, text, *level: offered.set() if CAMERA in text else None  # type: ignore[method-assign]
+                    recorders = [asyncio.create_task(Recorder(ears, lab.fleet, timeline, 0).run(stop))]
+                    token = speaker.alive(Token("cart", Role.RC, CAMERA, "i1"))
                     # What blind has asked for so far is known to the speaker once a question of it is.
                     said = speaker.publisher(speaker.keys.behavior(speaker.me), BehaviorSaid)
-                    blind.tracker.behavior = lambda *_: heard.set()  # type: ignore[method-assign]
                     async with asyncio.timeout(HANG):
+                        await offered.wait()
                         while not heard.is_set():
                             said.put(BehaviorSaid("net", "search"))
                             await asyncio.sleep(0.02)
                         assert not publisher.watched
                         assert watched.empty()
-                        seeing.token(token, alive=True)
+                        recorders.append(
+                            asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop))
+                        )
                         assert await watched.get()
-                        seeing.token(token, alive=False)
+                        token.close()
                         assert not await watched.get()
-                    await supervisor.close()
-                    for one in declared:
-                        one.close()
+                        stop.set()
+                        await asyncio.gather(*recorders)
             publisher.close()
 
     asyncio.run(run())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Self
@@ -81,13 +80,10 @@ class PictureRecording(Drawing):
         return self
 
     def __exit__(self, *_: object) -> None:
-        if not self.url:
+        if self.url:
+            self.disconnect(DISCONNECT_SECONDS)
+        else:
             self.recording.disconnect()
-            return
-        # A viewer that hangs can hold this up: then it is left to a thread that dies with the process.
-        thread = threading.Thread(target=self.recording.disconnect, daemon=True)
-        thread.start()
-        thread.join(DISCONNECT_SECONDS)
 
 
 class WatchRecording(PictureRecording):

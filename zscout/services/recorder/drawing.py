@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sized
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -102,6 +103,12 @@ class Drawing:
 
     def arrange(self) -> None:
         """There may be something new to lay out."""
+
+    def disconnect(self, seconds: float) -> None:
+        """A viewer that hangs can hold this up: then it is left to a thread that dies with the process."""
+        thread = threading.Thread(target=self.recording.disconnect, name="rerun-disconnect", daemon=True)
+        thread.start()
+        thread.join(seconds)
 
 
 @dataclass(slots=True)

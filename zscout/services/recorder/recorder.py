@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
@@ -67,51 +66,65 @@ MAX_REPORT: Final = 8_192
 MAX_POSES: Final = 65_536
 """Bytes."""
 
+EVENTS: Final = {
+    Role.NODE: ("node {host} is gone", "node {host} is there"),
+    Role.RCM: ("{host} does not lead any more", "{host} leads"),
+    Role.RC: ("{name} is gone from {host}", "{name} is offered by {host}"),
+    Role.CLIENT: ("client {host}/{name} left", "client {host}/{name} joined"),
+}
+"""By role: what is shown when its token goes, and when it comes."""
+
 
 class RecorderFailed(RuntimeError):
     """Part of a recorder raised; it was logged with its traceback."""
 
 
 class Recorder:
-    """Follows one fleet and writes it to `timeline`, in seconds since this object was made; of each camera at
-    most `frames` pictures a second, with 0 none."""
+    """Follows one fleet and writes it to `timeline`, in seconds since this object was made.
+
+    Of each camera at most `frames` pictures a second are shown, and with 0 none are subscribed to: then the
+    framegrabber sends none."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet, timeline: Timeline, frames: float = 2.0) -> None:
-        self.mesh, self.timeline = mesh, timeline
+        self.mesh, self.timeline, self.frames = mesh, timeline, frames
         self._zero = mesh.now()
         self._over = asyncio.Event()
         self._supervisor = Supervisor("the recorder", lambda _: self._over.set())
-        self._placements = PlacementFollower(mesh, timeline, self._now, self._supervisor)
-        self._robots = RobotFollower(mesh, timeline, self._now, frames, self._supervisor)
-        self._requests = RequestTracker(timeline, self._robots.tracker, fleet.operator_priority)
+        self._placements = PlacementTracker(timeline)
+        self._robots = RobotTracker(timeline)
+        self._requests = RequestTracker(timeline, self._robots, fleet.operator_priority)
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
         self._leaders: set[Token] = set()
         self._declared: list[Declaration] = []
-        self._wanted = asyncio.Event()
+        self._wanted, self._placer_wanted = asyncio.Event(), asyncio.Event()
+        self._fresher: set[str] | None = None
+        """Components published since the placer was asked for all, until it has answered."""
         self._missed = 0
         self._caught_up = False
+        self._cameras: dict[str, asyncio.Task[None]] = {}
+        self._asking: asyncio.Task[None] | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
         """Records until `stop`. Its liveliness token appears once it has read an RCM's whole state. Raises
         RecorderFailed."""
-        keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
+        keys, subscribe, guard = self.mesh.keys, self.mesh.subscribe, self._supervisor.guard
         self._declared = [
-            mesh.subscribe(keys.grants, Grants, guard(self._on_grants), depth=DEPTH),
-            mesh.subscribe(keys.notice_any, Notice, guard(self._on_notice), depth=DEPTH),
-            mesh.subscribe(keys.rc_state_any, RcState, guard(self._on_rc_state), depth=DEPTH),
-            mesh.subscribe(keys.load_any, LoadReport, guard(self._on_load)),
-            self._placements.subscribe(),
-            mesh.watch(keys.alive_any(), guard(self._on_token)),
+            subscribe(keys.grants, Grants, guard(self._on_grants), depth=DEPTH),
+            subscribe(keys.notice_any, Notice, guard(self._on_notice), depth=DEPTH),
+            subscribe(keys.rc_state_any, RcState, guard(self._on_rc_state), depth=DEPTH),
+            subscribe(keys.load_any, LoadReport, guard(self._on_load)),
+            subscribe(keys.placements, Placements, guard(self._on_placements), depth=DEPTH),
+            self.mesh.watch(keys.alive_any(), guard(self._on_token)),
         ]
         # Apart: of what these miss, the RCM's state has nothing.
-        robots = self._robots.subscribe()
+        behavior, poses = guard(self._on_behavior), guard(self._on_poses)
+        robots = [
+            subscribe(keys.behavior_any, BehaviorSaid, behavior, depth=ROBOT_DEPTH, limit=MAX_REPORT),
+            subscribe(keys.building_poses_any, BuildingPoses, poses, depth=ROBOT_DEPTH, limit=MAX_POSES),
+        ]
         self._wanted.set()
-        for work in (
-            self._keep_reading(),
-            self._placements.keep_reading(),
-            self._robots.tick(),
-            self._end_at(stop),
-        ):
+        self._placer_wanted.set()
+        for work in (self._keep_reading(), self._keep_asking_placer(), self._tick(), self._end_at(stop)):
             self._supervisor.spawn(work)
         try:
             await self._over.wait()
@@ -119,7 +132,7 @@ class Recorder:
                 raise RecorderFailed from self._supervisor.error
             # `stop` may be quicker than what was published before. An answer of the RCM comes behind all that
             # it has published, on the same link; where nobody leads there is nothing to wait for.
-            await mesh.ask(keys.rcm_state, StateAsk(), RcmState, timeout=DRAIN, enough=lambda _: True)
+            await self.mesh.ask(keys.rcm_state, StateAsk(), RcmState, timeout=DRAIN, enough=lambda _: True)
         finally:
             await self._supervisor.close()
             for declared in [*robots, *reversed(self._declared)]:
@@ -147,7 +160,7 @@ class Recorder:
         at = self._now()
         if state.ended:
             self._requests.dropped(at, state.rc, {ended.grant for ended in state.ended})
-        self._robots.tracker.state(at, state)
+        self._robots.state(at, state)
 
     def _on_load(self, key: str, report: LoadReport) -> None:
         host, at = self.mesh.keys.host_of(key), self._now()
@@ -166,14 +179,17 @@ class Recorder:
             (self._leaders.add if alive else self._leaders.discard)(token)
             if alive:
                 self._wanted.set()
-                self._placements.read_again()
+                self._placer_wanted.set()
         elif bool(instances) == before:
             return
-        self._robots.token(token, alive)
         at = self._now()
-        event = _event_of(token, alive)
-        if event is not None:
-            self.timeline.event(at, *event)
+        if token.role == Role.CLIENT and not alive:
+            self._robots.left(at, Sender(token.host, token.name))
+        if token.role == Role.RC and token.name.startswith(CAMERAS) and self.frames:
+            self._follow_camera(at, token.name, alive)
+        if token.role in EVENTS:
+            words = EVENTS[token.role][alive].format(host=token.host, name=token.name)
+            self.timeline.event(at, words, "INFO" if alive or token.role == Role.CLIENT else "WARN")
         # Before the state was read, nobody knows that a new RC is free.
         if token.role == Role.RC and self._caught_up:
             (self._requests.rc_joined if alive else self._requests.rc_left)(at, token.name)
@@ -191,7 +207,7 @@ class Recorder:
                     continue
                 log.warning("%d publications were missed; the state is read", missed - self._missed)
                 self._missed = missed
-                self._placements.read_again()
+                self._placer_wanted.set()
             self._wanted.clear()
             if not await self._read() and self._leaders:
                 await asyncio.sleep(PAUSE)
@@ -210,54 +226,15 @@ class Recorder:
             self._declared.append(self.mesh.alive(Token(me.host, Role.RECORDER, me.client, new_instance())))
         return True
 
-
-def _event_of(token: Token, alive: bool) -> tuple[str, str] | None:
-    """What happened, and how much people should look at it (INFO or WARN); None for what is of no use."""
-    level = "INFO" if alive else "WARN"
-    match token.role:
-        case Role.NODE:
-            return f"node {token.host} {'is there' if alive else 'is gone'}", level
-        case Role.RCM:
-            return f"{token.host} {'leads' if alive else 'does not lead any more'}", level
-        case Role.RC:
-            return f"{token.name} {'is offered by' if alive else 'is gone from'} {token.host}", level
-        case Role.CLIENT:
-            return f"client {token.host}/{token.name} {'joined' if alive else 'left'}", "INFO"
-        case _:
-            return None
-
-
-class PlacementFollower:
-    """Subscribes to the placer of a mesh, and asks it for what was published before. `now` is the timeline's
-    time."""
-
-    def __init__(
-        self, mesh: Mesh, timeline: Timeline, now: Callable[[], float], supervisor: Supervisor
-    ) -> None:
-        self.mesh, self._now, self._supervisor = mesh, now, supervisor
-        self.tracker = PlacementTracker(timeline)
-        self._fresher: set[str] | None = None
-        """Components published since a query that is not answered yet."""
-        self._wanted = asyncio.Event()
-        self._wanted.set()
-
-    def subscribe(self) -> Declaration:
-        handler = self._supervisor.guard(self._on_placements)
-        return self.mesh.subscribe(self.mesh.keys.placements, Placements, handler, depth=DEPTH)
-
-    def read_again(self) -> None:
-        """Something may have been missed."""
-        self._wanted.set()
-
-    async def keep_reading(self) -> None:
+    async def _keep_asking_placer(self) -> None:
         """Asks the placer at the start, and whenever something may have been missed. Does not return."""
         failed = 0
         while True:
             with suppress(TimeoutError):
                 async with asyncio.timeout(AGAIN if 0 < failed < TRIES else None):
-                    await self._wanted.wait()
+                    await self._placer_wanted.wait()
                     failed = 0
-            self._wanted.clear()
+            self._placer_wanted.clear()
             self._fresher = fresher = set[str]()
             reply = await self.mesh.ask_one(
                 self.mesh.keys.placer, ListPlacements(), Placements, timeout=READ_TIMEOUT
@@ -267,57 +244,27 @@ class PlacementFollower:
                 failed += 1
             else:
                 failed = 0
-                self.tracker.listed(self._now(), reply.message, fresher)
+                self._placements.listed(self._now(), reply.message, fresher)
 
     def _on_placements(self, _key: str, news: Placements) -> None:
         if self._fresher is not None and len(self._fresher) < MAX_FOLLOWED:
             self._fresher.update(one.component for one in news.components)
             self._fresher.update(news.forgotten)
-        self.tracker.published(self._now(), news)
+        self._placements.published(self._now(), news)
 
+    # Robots
 
-class RobotFollower:
-    """Subscribes to all that is published of robots: pictures, behaviors, and who is where in a building.
-
-    `now` is the timeline's time; of each camera at most `frames` pictures a second are shown, and with 0 none
-    are subscribed to: then the framegrabber sends none."""
-
-    def __init__(
-        self, mesh: Mesh, timeline: Timeline, now: Callable[[], float], frames: float, supervisor: Supervisor
-    ) -> None:
-        self.mesh, self.frames, self._now = mesh, frames, now
-        self._supervisor = supervisor
-        self.tracker = RobotTracker(timeline)
-        self._cameras: dict[str, asyncio.Task[None]] = {}
-        self._asking: asyncio.Task[None] | None = None
-
-    def subscribe(self) -> list[Declaration]:
-        keys, subscribe, guard = self.mesh.keys, self.mesh.subscribe, self._supervisor.guard
-        behavior, poses = guard(self._on_behavior), guard(self._on_poses)
-        return [
-            subscribe(keys.behavior_any, BehaviorSaid, behavior, depth=ROBOT_DEPTH, limit=MAX_REPORT),
-            subscribe(keys.building_poses_any, BuildingPoses, poses, depth=ROBOT_DEPTH, limit=MAX_POSES),
-        ]
-
-    async def tick(self) -> None:
-        """Does what time brings, until it is cancelled."""
+    async def _tick(self) -> None:
         while True:
             await asyncio.sleep(TICK)
-            self.tracker.tick(self._now())
+            self._robots.tick(self._now())
 
-    def token(self, token: Token, alive: bool) -> None:
-        """Something came to the mesh, or is gone from it, under all its instances."""
-        if token.role == Role.CLIENT and not alive:
-            self.tracker.left(self._now(), Sender(token.host, token.name))
-        if token.role != Role.RC or not token.name.startswith(CAMERAS) or not self.frames:
-            return
-        if not alive:
-            task = self._cameras.pop(token.name, None)
-            if task is not None:
-                task.cancel()
-                self.tracker.no_frame(self._now(), token.name)
-        elif token.name not in self._cameras and len(self._cameras) < MAX_CAMERAS:
-            self._cameras[token.name] = self._supervisor.spawn(self._look(token.name))
+    def _follow_camera(self, at: float, camera: str, alive: bool) -> None:
+        if alive and camera not in self._cameras and len(self._cameras) < MAX_CAMERAS:
+            self._cameras[camera] = self._supervisor.spawn(self._look(camera))
+        elif not alive and camera in self._cameras:
+            self._cameras.pop(camera).cancel()
+            self._robots.no_frame(at, camera)
 
     async def _look(self, camera: str) -> None:
         """Shows a camera's pictures: the newest there is, whenever the next one is due."""
@@ -325,27 +272,27 @@ class RobotFollower:
             while True:
                 frame = await watch.next(NO_PICTURE)
                 if frame is None:
-                    self.tracker.no_frame(self._now(), camera)
+                    self._robots.no_frame(self._now(), camera)
                     continue
-                self.tracker.frame(self._now(), camera, frame.head, frame.jpeg)
+                self._robots.frame(self._now(), camera, frame.head, frame.jpeg)
                 await asyncio.sleep(1 / self.frames)
 
     def _on_behavior(self, key: str, report: BehaviorSaid) -> None:
-        self.tracker.behavior(self._now(), self.mesh.keys.sender_of(key), report)
+        self._robots.behavior(self._now(), self.mesh.keys.sender_of(key), report)
 
     def _on_poses(self, key: str, poses: BuildingPoses) -> None:
         at = self._now()
-        self.tracker.poses(at, self.mesh.keys.sender_of(key), poses)
+        self._robots.poses(at, self.mesh.keys.sender_of(key), poses)
         if self._asking is None or self._asking.done():
-            sender = self.tracker.wants_plan(at)
+            sender = self._robots.wants_plan(at)
             if sender is not None:
-                self._asking = self._supervisor.spawn(self._ask(sender))
+                self._asking = self._supervisor.spawn(self._ask_plan(sender))
 
-    async def _ask(self, sender: Sender) -> None:
+    async def _ask_plan(self, sender: Sender) -> None:
         key = self.mesh.keys.building_plan(sender)
         replies = await self.mesh.ask(
             key, PlanAsk(), BuildingPlan, timeout=READ_TIMEOUT, enough=lambda _: True, limit=MAX_PLAN
         )
         for reply in replies:
             if reply.message is not None:
-                self.tracker.plan(self._now(), sender, reply.message)
+                self._robots.plan(self._now(), sender, reply.message)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, Revocation, absurd
-from zscout.services.recorder.robot_tracker import RobotTracker, hold_of
+from zscout.services.recorder.robot_tracker import RobotTracker
 from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import NO_TERM, Grant, Term
 
@@ -33,17 +33,16 @@ class _Request:
 
 
 class RequestTracker:
-    """Writes to `timeline` who holds what and what each ARC is doing; `robots` needs the holds as well."""
+    """Writes to `timeline` who holds what and what each ARC is doing; `robots` reads the holds as well."""
 
     def __init__(self, timeline: Timeline, robots: RobotTracker, operator_priority: int) -> None:
-        self.timeline, self.robots = timeline, robots
-        self.operator_priority = operator_priority
+        self.timeline, self.operator_priority = timeline, operator_priority
         self.term: Term = NO_TERM
         self.seq = 0
         """The newest publication; older ones are ignored."""
         self._requests: dict[Key, _Request] = {}
         self._labels: set[str] = set()
-        self._rcs: dict[str, dict[Grant, HolderRow]] = {}
+        self._rcs = robots.holds
 
     def grants(self, at: float, grants: Grants) -> bool:
         """What the RCM publishes; returns whether something before it was missed."""
@@ -123,7 +122,6 @@ class RequestTracker:
         held = self._rcs.get(rc, {})
         if grants & held.keys():
             self._rcs[rc] = {grant: holder for grant, holder in held.items() if grant not in grants}
-            self.robots.dropped(rc, grants)
             self.timeline.holders(at, rc, list(self._rcs[rc].values()))
 
     def _revoked(self, at: float, revoked: Revocation, grants: Grants) -> None:
@@ -203,7 +201,10 @@ class RequestTracker:
     def _show(self, at: float, rc: str, holders: Iterable[tuple[str, Holder | HoldView]]) -> None:
         if rc not in self._rcs and len(self._rcs) >= MAX_RCS:
             return
-        operator, holders = self.operator_priority, list(holders)
-        self._rcs[rc] = {hold.grant: HolderRow(label, hold.priority >= operator) for label, hold in holders}
-        self.robots.held(rc, {hold.grant: hold_of(hold, operator) for _, hold in holders})
+        rows: dict[Grant, HolderRow] = {}
+        for label, hold in holders:
+            rcs = hold.rcs if isinstance(hold, Holder) else hold.needs
+            robots = tuple(sorted(name for name in rcs if name.startswith("robot/")))
+            rows[hold.grant] = HolderRow(label, hold.priority >= self.operator_priority, robots)
+        self._rcs[rc] = rows
         self.timeline.holders(at, rc, list(self._rcs[rc].values()))

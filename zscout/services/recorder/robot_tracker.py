@@ -3,12 +3,10 @@ behavior does, who is where. Pure but for the timeline, whose times are passed i
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from fractions import Fraction
-from typing import Final, NamedTuple
+from typing import Final
 
-from zscout.drivers.airtime import Bucket
 from zscout.keyexpr import Sender
 from zscout.messages import (
     BehaviorSaid,
@@ -16,16 +14,14 @@ from zscout.messages import (
     BuildingPlan,
     BuildingPoses,
     FrameHead,
-    Holder,
-    HoldView,
     Placed,
     RcState,
 )
 from zscout.services.recorder.colours import DOING, OPERATOR, PALE
 from zscout.services.recorder.drawing import clean_text
 from zscout.services.recorder.floor_plan import PersonMark, RobotMark
-from zscout.services.recorder.timeline import Timeline
-from zscout.types import SECOND, Grant
+from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.types import SECOND, Grant, Ns
 
 RATE: Final = 20
 """Reports of one sender recorded in a second, and at once."""
@@ -56,7 +52,8 @@ BehaviorKey = tuple[Sender, str]
 
 @dataclass(slots=True)
 class _Sender:
-    bucket: Bucket
+    full_at: Ns
+    """When as many reports as in a second may come at once, in ns."""
     waiting: dict[str, BehaviorSaid] = field(default_factory=dict)
     """The newest report of each path that came too fast, oldest first."""
     dropped: int = 0
@@ -65,9 +62,9 @@ class _Sender:
     def take(self, at: float) -> bool:
         """Whether the rate allows one more report now."""
         now = round(at * SECOND)
-        if self.bucket.ready(1) > now:
+        if self.full_at - (RATE - 1) * SECOND // RATE > now:
             return False
-        self.bucket.take(1, now)
+        self.full_at = max(self.full_at, now) + SECOND // RATE
         return True
 
 
@@ -84,7 +81,7 @@ class RateLimiter:
         if state is None:
             if len(self._senders) >= MAX_SENDERS:
                 del self._senders[next(iter(self._senders))]
-            state = _Sender(Bucket(Fraction(RATE), Fraction(RATE), round(at * SECOND)))
+            state = _Sender(round(at * SECOND))
         self._senders[sender] = state
         if not state.waiting and state.take(at):
             return report
@@ -112,14 +109,7 @@ class RateLimiter:
         self._senders.pop(sender, None)
 
 
-class RobotHold(NamedTuple):
-    """What matters here of a hold: the robots of its gang, and whether it is an operator's."""
-
-    robots: tuple[str, ...] = ()
-    operator: bool = False
-
-
-NO_HOLD: Final = RobotHold()
+NO_HOLD: Final = HolderRow("")
 
 
 @dataclass(slots=True)
@@ -145,7 +135,7 @@ class _Health:
 
 @dataclass(slots=True)
 class _Camera:
-    hold: RobotHold = NO_HOLD
+    hold: HolderRow = NO_HOLD
     boxes: dict[BehaviorKey, list[Box]] = field(default_factory=dict)
 
     @property
@@ -161,26 +151,12 @@ class RobotTracker:
         self._limiter = RateLimiter()
         self._reports: dict[BehaviorKey, BehaviorSaid] = {}
         """What each behavior does, the one that reported longest ago first."""
-        self._holds: dict[str, Mapping[Grant, RobotHold]] = {}
-        """Of robots and framegrabbers."""
+        self.holds: dict[str, dict[Grant, HolderRow]] = {}
+        """By RC."""
         self._cameras: dict[str, _Camera] = {}
         self._health: dict[str, _Health] = {}
         self._building: _Building | None = None
         self._others: set[Sender] = set()
-
-    def held(self, rc: str, holds: Mapping[Grant, RobotHold]) -> None:
-        """The holds of an RC, all of them."""
-        if rc.partition("/")[0] not in ("robot", "framegrabber"):
-            return
-        if holds and (rc in self._holds or len(self._holds) < MAX_FOLLOWED):
-            self._holds[rc] = holds
-        else:
-            self._holds.pop(rc, None)
-
-    def dropped(self, rc: str, grants: Collection[Grant]) -> None:
-        """These holds of an RC are over."""
-        holds = self._holds.get(rc, {})
-        self.held(rc, {grant: hold for grant, hold in holds.items() if grant not in grants})
 
     # Behaviors
 
@@ -247,7 +223,7 @@ class RobotTracker:
             if len(self._cameras) >= MAX_FOLLOWED:
                 return
             seen = self._cameras[camera] = _Camera()
-        holds = self._holds.get(camera, {})
+        holds = self.holds.get(camera, {})
         hold = holds.get(head.grant, NO_HOLD) if head.grant is not None else NO_HOLD
         if hold.robots != seen.hold.robots:
             self._forget_boxes(at, camera, seen)
@@ -261,7 +237,7 @@ class RobotTracker:
             return
         self._forget_boxes(at, camera, seen)
         words = "not held"
-        if self._holds.get(camera):
+        if self.holds.get(camera):
             words = " · ".join(filter(None, (seen.names, "no picture")))
         self.panes.old_picture(at, _short(camera), words, PALE)
 
@@ -272,7 +248,7 @@ class RobotTracker:
 
     def _caption(self, seen: _Camera) -> tuple[str, int]:
         """Words and colour."""
-        robots, operator = seen.hold
+        _, operator, robots = seen.hold
         if operator:
             return (f"{seen.names} · operator" if robots else "operator"), OPERATOR
         report = self._doing(robots[0].partition("/")[2]) if len(robots) == 1 else None
@@ -351,7 +327,7 @@ class RobotTracker:
 
     def _robot(self, placed: Placed) -> RobotMark:
         report = self._doing(placed.name)
-        operator = any(hold.operator for hold in self._holds.get(f"robot/{placed.name}", {}).values())
+        operator = any(hold.operator for hold in self.holds.get(f"robot/{placed.name}", {}).values())
         return RobotMark(
             clean_text(placed.name, MAX_NAMED),
             placed.x,
@@ -384,10 +360,3 @@ def _short(rc: str) -> str:
 
 def _name(robot: str) -> str:
     return clean_text(robot.removeprefix("robot/"), MAX_NAMED)
-
-
-def hold_of(hold: Holder | HoldView, operator_priority: int) -> RobotHold:
-    """What matters here of a hold."""
-    rcs = hold.rcs if isinstance(hold, Holder) else hold.needs
-    robots = tuple(sorted(rc for rc in rcs if rc.startswith("robot/")))
-    return RobotHold(robots, hold.priority >= operator_priority)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ipaddress
 import os
 import socket
-import threading
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -46,10 +45,11 @@ class TimelineError(BadInput):
 
 
 class HolderRow(NamedTuple):
-    """An ARC that holds an RC; `operator` if its priority is an operator's."""
+    """An ARC that holds an RC; `operator` if its priority is an operator's; and the robots of its gang."""
 
     arc: str
     operator: bool = False
+    robots: tuple[str, ...] = ()
 
 
 class Timeline(Drawing):
@@ -101,7 +101,7 @@ class Timeline(Drawing):
             # The server comes up in a thread of its own; only a flush shows its failure.
             self.recording.flush(timeout_sec=FLUSH_SECONDS)
         except (RuntimeError, ValueError) as error:
-            self._disconnect()
+            self.disconnect(DISCONNECT_SECONDS)
             raise TimelineError(
                 f"timeline: can't write to {path or self.url} ({error}); make room there, or choose another"
             ) from error
@@ -142,19 +142,13 @@ class Timeline(Drawing):
                 "is there room on the disk?"
             ) from error
         finally:
-            self._disconnect()
+            self.disconnect(DISCONNECT_SECONDS)
 
     def __enter__(self) -> Timeline:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _disconnect(self) -> None:
-        # A viewer that hangs can hold this up: then it is left to a thread that dies with the process.
-        thread = threading.Thread(target=self.recording.disconnect, name="rerun-disconnect", daemon=True)
-        thread.start()
-        thread.join(DISCONNECT_SECONDS)
 
     def arrange(self) -> None:
         """Lays the viewer out anew if there is something new to show: a fleet without robots or components
