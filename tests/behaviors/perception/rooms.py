@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from zscout.behaviors.perception.lens import Picture
 from zscout.lab.building.bodies import Pose
-from zscout.lab.building.plan import (
-    Furniture,
-    Light,
-    Plan,
-    Robot,
-    Rug,
-)
+from zscout.lab.building.plan import Furniture, Light, Plan, Robot, Rug
 from zscout.lab.building.world import World
 
 

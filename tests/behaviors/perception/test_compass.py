@@ -7,18 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from tests.behaviors.perception.rooms import (
-    carton,
-    room,
-    seen_from,
-    sofa,
-)
-from zscout.behaviors.perception.hiding.compass import (
-    brighter,
-    floor_strip,
-    strip_and_tones,
-    turned,
-)
+from tests.behaviors.perception.rooms import carton, room, seen_from, sofa
+from zscout.behaviors.perception.hiding.compass import brighter, floor_strip, strip_and_tones, turned
 
 PLAN = room(sofa(4.0), carton(1.2))
 

@@ -7,12 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.behaviors.perception.rooms import (
-    carton,
-    room,
-    seen_from,
-    sofa,
-)
+from tests.behaviors.perception.rooms import carton, room, seen_from, sofa
 from zscout.behaviors.perception.darkness import analyse
 from zscout.behaviors.perception.lens import FIELD, GAMMA, bearing, linear
 from zscout.lab.building.plan import Rug

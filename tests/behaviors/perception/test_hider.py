@@ -20,12 +20,7 @@ from zscout.lab.building.drawn import drawn_plan
 from zscout.lab.building.plan import Plan, Rug
 from zscout.lab.building.plan_file import load_plan, shipped_plans
 from zscout.lab.building.world import World
-from zscout.lab.trials.hide import (
-    HideJob,
-    LinkConditions,
-    run,
-    trial,
-)
+from zscout.lab.trials.hide import HideJob, LinkConditions, run, trial
 
 STATES = {"search", "approach", "unstick", "enter", "turn", "hidden"}
 

@@ -20,13 +20,7 @@ from tests.behaviors.perception.recordings import (
 from tests.behaviors.perception.scenes import Scene, box_of, overlap
 from zscout.behaviors.perception.motion import MAX_SIDE, MotionDetector
 from zscout.lab.building.plan_file import load_plan, shipped_plans
-from zscout.lab.trials.watch import (
-    Case,
-    Watched,
-    cases,
-    plan_of,
-    watch,
-)
+from zscout.lab.trials.watch import Case, Watched, cases, plan_of, watch
 
 MISSING = "needs Debian's package opencv-doc (apt-get install opencv-doc)"
 

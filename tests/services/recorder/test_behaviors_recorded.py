@@ -10,18 +10,10 @@ from pathlib import Path
 import pytest
 import rerun as rr
 
-from tests.services.recorder.paper_run import (
-    colours,
-    events,
-    lanes,
-    rows,
-)
+from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.robot_run import NET, say
 from zscout.keyexpr import Sender
-from zscout.messages import (
-    BehaviorSaid,
-    RcState,
-)
+from zscout.messages import BehaviorSaid, RcState
 from zscout.services.recorder import robot_tracker
 from zscout.services.recorder import robots as robot_panes
 from zscout.services.recorder.colours import DOING, OTHER

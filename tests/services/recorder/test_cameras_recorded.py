@@ -13,16 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.services.recorder.paper_run import events, rows
-from tests.services.recorder.robot_run import (
-    CAMERA,
-    GRANT,
-    NET,
-    captions,
-    head,
-    jpeg,
-    png,
-    say,
-)
+from tests.services.recorder.robot_run import CAMERA, GRANT, NET, captions, head, jpeg, png, say
 from zscout.drivers.image_size import jpeg_size, png_size
 from zscout.services.recorder import robots
 from zscout.services.recorder.colours import PALE

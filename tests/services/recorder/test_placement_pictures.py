@@ -8,14 +8,7 @@ import numpy as np
 from PIL import Image
 
 from tests.services.recorder.placed_hour import play
-from tests.services.recorder.test_viewer_picture import (
-    DIMMED,
-    WIDTH,
-    Rgb,
-    rgb,
-    settled_picture,
-    viewer,
-)
+from tests.services.recorder.test_viewer_picture import DIMMED, WIDTH, Rgb, rgb, settled_picture, viewer
 from zscout.lab.plots.placement import record
 from zscout.lab.plots.recording import COLOURS
 from zscout.lab.study.placement.study import SCENARIOS, study

@@ -11,12 +11,7 @@ import rerun as rr
 
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.services.recorder.paper_run import (
-    colours,
-    events,
-    lanes,
-    rows,
-)
+from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.placed_hour import TERM, placement, play
 from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Sender

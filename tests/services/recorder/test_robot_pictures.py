@@ -8,24 +8,9 @@ import numpy as np
 from PIL import Image
 
 from tests.services.recorder.robot_run import jpeg, png, record
-from tests.services.recorder.test_viewer_picture import (
-    DIMMED,
-    WIDTH,
-    Rgb,
-    rgb,
-    settled_picture,
-    viewer,
-)
+from tests.services.recorder.test_viewer_picture import DIMMED, WIDTH, Rgb, rgb, settled_picture, viewer
 from zscout.services.recorder.blueprint import FLOOR_WORDS
-from zscout.services.recorder.colours import (
-    ALERT,
-    DOING,
-    HIDDEN,
-    IN_THE_OPEN,
-    OPERATOR,
-    PALE,
-    PERSON,
-)
+from zscout.services.recorder.colours import ALERT, DOING, HIDDEN, IN_THE_OPEN, OPERATOR, PALE, PERSON
 from zscout.services.recorder.timeline import Timeline
 
 HEIGHT = 900

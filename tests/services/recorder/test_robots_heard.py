@@ -13,26 +13,14 @@ from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.live.test_recorder import recording, run_recorder
 from tests.services.recorder.paper_run import events, rows
-from tests.services.recorder.robot_run import (
-    CAMERA,
-    captions,
-    jpeg,
-    png,
-)
+from tests.services.recorder.robot_run import CAMERA, captions, jpeg, png
 from zscout.behaviors.client.arc import hold
 from zscout.config.fleet import default_fleet
 from zscout.config.node import RecorderConfig, load_node
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import ZenohMesh
-from zscout.messages import (
-    BehaviorSaid,
-    BuildingPlan,
-    BuildingPoses,
-    FrameHead,
-    Placed,
-    PlanAsk,
-)
+from zscout.messages import BehaviorSaid, BuildingPlan, BuildingPoses, FrameHead, Placed, PlanAsk
 from zscout.services.recorder.process import RecorderJob, decode_job, encode_job
 from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline

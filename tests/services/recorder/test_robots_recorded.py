@@ -10,33 +10,12 @@ from pathlib import Path
 import pytest
 import rerun as rr
 
-from tests.services.recorder.paper_run import (
-    colours,
-    events,
-    lanes,
-    rows,
-)
-from tests.services.recorder.robot_run import (
-    BUILDING,
-    captions,
-    png,
-    poses,
-    record,
-)
+from tests.services.recorder.paper_run import colours, events, lanes, rows
+from tests.services.recorder.robot_run import BUILDING, captions, png, poses, record
 from tests.services.recorder.test_timeline import lab_of
 from zscout.keyexpr import Sender
-from zscout.messages import (
-    BuildingPlan,
-    Placed,
-)
-from zscout.services.recorder.colours import (
-    DOING,
-    HIDDEN,
-    IN_THE_OPEN,
-    OPERATOR,
-    PERSON,
-    bright,
-)
+from zscout.messages import BuildingPlan, Placed
+from zscout.services.recorder.colours import DOING, HIDDEN, IN_THE_OPEN, OPERATOR, PERSON, bright
 from zscout.services.recorder.robot_tracker import RobotTracker
 from zscout.services.recorder.timeline import Timeline
 

@@ -32,12 +32,7 @@ from tests.services.recorder.paper_run import (
 from zscout.services.recorder import drawing, hosts
 from zscout.services.recorder import timeline as module
 from zscout.services.recorder.colours import LINES, OPERATOR, PALETTE, STATES
-from zscout.services.recorder.timeline import (
-    OPERATOR_MARK,
-    HolderRow,
-    Timeline,
-    TimelineError,
-)
+from zscout.services.recorder.timeline import OPERATOR_MARK, HolderRow, Timeline, TimelineError
 
 
 @pytest.fixture(autouse=True)

@@ -192,7 +192,7 @@ class Recorder:
             self.timeline.event(at, words, "INFO" if alive or token.role == Role.CLIENT else "WARN")
         # Before the state was read, nobody knows that a new RC is free.
         if token.role == Role.RC and self._caught_up:
-            (self._requests.rc_joined if alive else self._requests.rc_left)(at, token.name)
+            self._requests.rc(at, token.name, alive)
 
     # The whole state, where something was missed
 

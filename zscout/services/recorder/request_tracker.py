@@ -3,7 +3,7 @@ in."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -54,8 +54,8 @@ class RequestTracker:
             self._revoked(at, revoked, grants)
         for rc, holders in grants.rcs.items():
             for holder in holders[:MAX_HOLDERS]:
-                self._runs(at, (holder.client, holder.id), holder, holder.rcs)
-            self._show(at, rc, [(self._label(holder), holder) for holder in holders[:MAX_HOLDERS]])
+                self._runs(at, holder)
+            self._show(at, rc, holders[:MAX_HOLDERS])
         return missed
 
     def notice(self, at: float, notice: Notice) -> None:
@@ -79,18 +79,15 @@ class RequestTracker:
         if (state.term, state.seq) < (self.term, self.seq):
             return False
         self.term, self.seq = state.term, state.seq
-        holders: dict[str, list[tuple[str, HoldView]]] = {view.rc: [] for view in state.rcs}
-        open_now: set[Key] = set()
+        holders: dict[str, list[HoldView]] = {view.rc: [] for view in state.rcs}
+        open_now = {(hold.client, hold.id) for hold in state.holds}
+        open_now |= {(wait.client, wait.id) for wait in state.queue}
         for hold in state.holds:
-            key = (hold.client, hold.id)
-            open_now.add(key)
-            self._runs(at, key, hold, hold.needs)
+            self._runs(at, hold)
             for rc in hold.needs:
-                holders.setdefault(rc, []).append((self._label(hold), hold))
+                holders.setdefault(rc, []).append(hold)
         for wait in state.queue:
-            key = (wait.client, wait.id)
-            open_now.add(key)
-            request = self._track(key, wait.arc)
+            request = self._track((wait.client, wait.id), wait.arc)
             if request is None:
                 continue
             if request.grant is not None or not request.state:
@@ -109,13 +106,10 @@ class RequestTracker:
             self._show(at, rc, held)
         return True
 
-    def rc_joined(self, at: float, rc: str) -> None:
-        """An RC that is not known yet is free."""
-        if rc not in self._rcs:
+    def rc(self, at: float, rc: str, alive: bool) -> None:
+        """An RC has come or gone. One that is not known yet is free."""
+        if not alive or rc not in self._rcs:
             self._show(at, rc, [])
-
-    def rc_left(self, at: float, rc: str) -> None:
-        self._show(at, rc, [])
 
     def dropped(self, at: float, rc: str, grants: set[Grant]) -> None:
         """These holds of an RC are over, by the RCM's word or by the RC's own."""
@@ -156,13 +150,13 @@ class RequestTracker:
                 return
         self._labels.discard(request.label)
 
-    def _runs(self, at: float, key: Key, hold: Holder | HoldView, rcs: Iterable[str]) -> None:
-        request = self._track(key, hold.arc)
+    def _runs(self, at: float, hold: Holder | HoldView) -> None:
+        request = self._track((hold.client, hold.id), hold.arc)
         if request is None or request.grant == hold.grant:
             return
         request.grant = hold.grant
         self._set(at, request, "running", f"priority {hold.priority} · min {float(hold.min_runtime):g} s")
-        self.timeline.event(at, f"{request.label} runs on {', '.join(sorted(rcs))}")
+        self.timeline.event(at, f"{request.label} runs on {', '.join(sorted(_rcs_of(hold)))}")
 
     def _waits(self, at: float, request: _Request, reason: str) -> None:
         if (request.state, request.detail) != ("waiting", reason):
@@ -190,21 +184,22 @@ class RequestTracker:
             request = self._requests[key] = _Request(label)
         return request
 
-    def _label(self, hold: Holder | HoldView) -> str:
-        request = self._requests.get((hold.client, hold.id))
-        return request.label if request is not None else hold.arc
-
     def _set(self, at: float, request: _Request, state: str, detail: str) -> None:
         request.state, request.detail = state, detail
         self.timeline.arc(at, request.label, state, detail)
 
-    def _show(self, at: float, rc: str, holders: Iterable[tuple[str, Holder | HoldView]]) -> None:
+    def _show(self, at: float, rc: str, holders: Sequence[Holder | HoldView]) -> None:
         if rc not in self._rcs and len(self._rcs) >= MAX_RCS:
             return
         rows: dict[Grant, HolderRow] = {}
-        for label, hold in holders:
-            rcs = hold.rcs if isinstance(hold, Holder) else hold.needs
-            robots = tuple(sorted(name for name in rcs if name.startswith("robot/")))
+        for hold in holders:
+            request = self._requests.get((hold.client, hold.id))
+            label = request.label if request is not None else hold.arc
+            robots = tuple(sorted(name for name in _rcs_of(hold) if name.startswith("robot/")))
             rows[hold.grant] = HolderRow(label, hold.priority >= self.operator_priority, robots)
         self._rcs[rc] = rows
         self.timeline.holders(at, rc, list(self._rcs[rc].values()))
+
+
+def _rcs_of(hold: Holder | HoldView) -> Iterable[str]:
+    return hold.rcs if isinstance(hold, Holder) else hold.needs

@@ -8,15 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zscout.keyexpr import Sender
-from zscout.messages import (
-    BehaviorSaid,
-    Box,
-    BuildingPlan,
-    BuildingPoses,
-    FrameHead,
-    Placed,
-    RcState,
-)
+from zscout.messages import BehaviorSaid, Box, BuildingPlan, BuildingPoses, FrameHead, Placed, RcState
 from zscout.services.recorder.colours import DOING, OPERATOR, PALE
 from zscout.services.recorder.drawing import clean_text
 from zscout.services.recorder.floor_plan import PersonMark, RobotMark

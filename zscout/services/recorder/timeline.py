@@ -14,13 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from zscout.config.strict import BadInput
-from zscout.services.recorder.blueprint import (
-    APPLICATION,
-    LIVE_HOST_ROWS,
-    LIVE_ROWS,
-    NO_ROBOTS,
-    blueprint,
-)
+from zscout.services.recorder.blueprint import APPLICATION, LIVE_HOST_ROWS, LIVE_ROWS, NO_ROBOTS, blueprint
 from zscout.services.recorder.colours import OPERATOR, OTHER, PALETTE, STATES
 from zscout.services.recorder.drawing import Drawing, Lanes, clean_text
 from zscout.services.recorder.hosts import HostPane
