@@ -22,7 +22,6 @@ from zscout.drivers.capture import Capture, CapturedFrame, kind_of, shown
 @contextmanager
 def capturing(source: str, **how: float) -> Iterator[Capture]:
     capture = Capture(source, **how)
-    capture.start()
     try:
         yield capture
     finally:
@@ -202,7 +201,6 @@ def test_of_two_openers_the_second_waits_for_the_first() -> None:
         with capturing(server.url) as first:
             picture_of(first)
             second = Capture(server.url)
-            second.start()
             until(lambda: "can't be opened" in second.health)
             assert later(first).number > 0
         picture_of(second)
@@ -214,7 +212,6 @@ def test_a_silent_server_holds_up_nobody_and_stop_does_not_wait_for_it() -> None
     with MjpegServer() as silent, MjpegServer() as server:
         silent.mode = "stall"
         blocked = Capture(silent.url, open_timeout=60)
-        blocked.start()
         until(lambda: silent.accepted == 1)
         with capturing(server.url) as capture:
             # OpenCV's own lock would keep this one out for 60 s.
@@ -234,7 +231,6 @@ def test_a_process_ends_whatever_its_captures_do(mode: str) -> None:
             "from zscout.drivers import capture\n"
             "capture.EXIT_WAIT = 0.3\n"
             "capture = capture.Capture(sys.argv[1], open_timeout=600)\n"
-            "capture.start()\n"
             "sys.stdin.readline()\n"
         )
         process = subprocess.Popen(

@@ -58,7 +58,7 @@ class CapturedFrame:
 
 
 class Capture:
-    """Reads one source in a thread of its own, from `start` to `stop`; begins only once.
+    """Reads one source in a thread of its own, until `stop`.
 
     `source` is a device (`/dev/video0`, or its number), a URL (`http://`, `rtsp://`, ...) or else a file,
     which is read at its own rate, and from its start again when it ends. `open_timeout` and `read_timeout`
@@ -87,10 +87,8 @@ class Capture:
         self._due = 0.0
         # A daemon: a process that ends need not wait for ever until OpenCV has given up.
         self._thread = threading.Thread(target=self._run, name=f"capture {shown(source)}"[:60], daemon=True)
-
-    def start(self) -> None:
-        _LIVING.add(self)
         self._thread.start()
+        _LIVING.add(self)
 
     def stop(self, wait: float = STOP_WAIT) -> None:
         """Ends the reading, and waits at most `wait` seconds for it: a thread that OpenCV holds up ends by
@@ -98,8 +96,7 @@ class Capture:
         self._stop.set()
         with self._news:
             self._news.notify_all()
-        if self._thread.ident is not None and self._thread is not threading.current_thread():
-            self._thread.join(wait)
+        self._thread.join(wait)
 
     @property
     def alive(self) -> bool:

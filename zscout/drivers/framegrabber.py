@@ -202,7 +202,6 @@ class FramegrabberDriver(Driver):
         self._let_go()
         self._source = source
         capture = self._capture = Capture(self._sources[source])
-        capture.start()
         if self._watching is None or self._watching.done():
             self._watching = self._rc.supervisor.spawn(self._watch_over())
         return capture

@@ -269,11 +269,9 @@ class RobotDriver(Driver):
             self._set_unsure(f"{self._radio} is not there")
 
     def _on_radio_state(self, _key: str, state: RcState) -> None:
-        if state.rc != self._radio:
-            return
-        if state.health != "ok":
+        if state.rc == self._radio and state.health != "ok":
             self._set_unsure(f"{self._radio}: {state.health}")
-        elif self._unsure.is_set():
+        elif state.rc == self._radio:
             self._wake.set()
 
     def figures(self) -> Figures:

@@ -139,7 +139,6 @@ class LiveSource:
         self.name = shown(source)
         self._report = report
         self._capture = Capture(source, open_timeout=OPEN_TIMEOUT, read_timeout=READ_TIMEOUT)
-        self._capture.start()
         try:
             first = None
             while first is None:
