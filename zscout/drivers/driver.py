@@ -20,24 +20,16 @@ LATELY: Final[Ns] = 10 * SECOND
 class RcHandle(Protocol):
     """The RC as its driver sees it."""
 
-    @property
-    def mesh(self) -> Mesh: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def holds(self) -> HoldTable: ...
-    @property
-    def directory(self) -> RcDirectory | None:
-        """Which host offers which RC; only of a driver that relays."""
-
-    @property
-    def supervisor(self) -> Supervisor:
-        """Of tasks, timers and handlers of the driver: at the end it is closed before `safe` and `close` are
-        called. What fails there fails the RC."""
-
-    @property
-    def health(self) -> str:
-        """`ok`, or in words why the device can't carry a holder."""
+    mesh: Mesh
+    name: str
+    holds: HoldTable
+    directory: RcDirectory | None
+    """Only of a driver that relays."""
+    supervisor: Supervisor
+    """Of tasks, timers and handlers of the driver: closed before `safe` and `close` at the end. What fails
+    there fails the RC."""
+    health: str
+    """`ok`, or in words why the device can't carry a holder."""
 
     def fail(self, why: str) -> None:
         """The device can't carry its holders any longer: their holds end, the RC counts as lost."""
