@@ -8,8 +8,11 @@ import time
 from typing import Any
 
 import pytest
+import zenoh
 
-from zscout.mesh import zenoh_mesh
+from tests.hang import HANG
+from zscout.keyexpr import Sender
+from zscout.mesh import ZenohMesh, zenoh_mesh
 
 
 class StuckSession:
@@ -49,4 +52,33 @@ def test_a_caller_that_is_cancelled_while_it_leaves_has_the_session_closed() -> 
 
     asyncio.run(main())
     assert session.closing.wait(10)
+    session.released.set()
+
+
+@pytest.mark.parametrize("opened_first", [True, False])
+def test_a_caller_that_is_cancelled_while_it_joins_has_the_session_closed(
+    monkeypatch: pytest.MonkeyPatch, opened_first: bool
+) -> None:
+    session, may_open, opened = StuckSession(), threading.Event(), threading.Event()
+
+    def slow(_settings: object) -> StuckSession:
+        may_open.wait(HANG)
+        opened.set()
+        return session
+
+    monkeypatch.setattr(zenoh, "open", slow)
+
+    async def main() -> None:
+        joining = asyncio.create_task(ZenohMesh.open("test", Sender("a", "b")))
+        await asyncio.sleep(0)
+        if opened_first:
+            may_open.set()
+            opened.wait(HANG)
+        joining.cancel()
+        await asyncio.wait([joining])
+        assert joining.cancelled()
+
+    asyncio.run(main())
+    may_open.set()
+    assert session.closing.wait(HANG)
     session.released.set()

@@ -8,6 +8,7 @@ import json
 import logging
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any, Self
 
 import zenoh
@@ -91,13 +92,32 @@ class ZenohMesh(Mesh):
         """Joins the mesh of `fleet`. Raises MeshError where an address can't be had."""
         keys = Keys(fleet)
         settings = zenoh_config(config or MeshConfig())
+        opening: Future[zenoh.Session] = Future()
+        opening.set_running_or_notify_cancel()
+        threading.Thread(target=_join, args=(opening, settings), name="joins the mesh", daemon=True).start()
         try:
-            session = await asyncio.to_thread(zenoh.open, settings)
+            session = await asyncio.wrap_future(opening)
+        except asyncio.CancelledError:
+            opening.add_done_callback(_close_abandoned)
+            raise
         except zenoh.ZError as error:
             raise MeshError(
                 f"the mesh can't be joined: {error}; check listen and connect under [mesh]"
             ) from None
         return cls(ZenohTransport(session), keys, me, clock.now)
+
+
+def _join(opening: Future[zenoh.Session], settings: zenoh.Config) -> None:
+    try:
+        opening.set_result(zenoh.open(settings))
+    except BaseException as error:  # noqa: BLE001 - it is raised to who awaits it
+        opening.set_exception(error)
+
+
+def _close_abandoned(opening: Future[zenoh.Session]) -> None:
+    """Whoever wanted this session was cancelled. In a thread: this may be the event loop's."""
+    if opening.exception() is None:
+        threading.Thread(target=opening.result().close, name="closes the mesh", daemon=True).start()
 
 
 class ZenohTransport(Transport):
