@@ -39,23 +39,12 @@ CONTROL_BATCHES = 8
 SCOUTING_DELAY_MS = 200
 CLOSE_TIMEOUT = 3.0
 """Seconds that closing a session may take."""
-CONTROL: Any = {
-    "congestion_control": zenoh.CongestionControl.BLOCK,
-    "priority": zenoh.Priority.INTERACTIVE_HIGH,
-    "express": True,
-}
+BLOCK, DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+CONTROL: Any = {"congestion_control": BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
 QUALITIES: dict[Quality, dict[str, Any]] = {
     Quality.CONTROL: CONTROL,
-    Quality.DATA: {
-        "congestion_control": zenoh.CongestionControl.DROP,
-        "priority": zenoh.Priority.DATA_LOW,
-        "express": False,
-    },
-    Quality.FRAME: {
-        "congestion_control": zenoh.CongestionControl.DROP,
-        "priority": zenoh.Priority.DATA,
-        "express": True,
-    },
+    Quality.DATA: {"congestion_control": DROP, "priority": zenoh.Priority.DATA_LOW, "express": False},
+    Quality.FRAME: {"congestion_control": DROP, "priority": zenoh.Priority.DATA, "express": True},
 }
 _ENCODINGS: dict[type, zenoh.Encoding] = {}
 
@@ -166,15 +155,12 @@ class ZenohTransport(Transport):
             raise MeshError(f"{key} can't be asked: {error}") from None
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
-        def on_zenoh_query(query: zenoh.Query) -> None:
-            on_query(ZenohQuery(query))
-
-        return _undeclare(self._session.declare_queryable(key, _direct(on_zenoh_query)))
+        callback = _direct(lambda query: on_query(ZenohQuery(query)))
+        return _undeclare(self._session.declare_queryable(key, callback))
 
     def publisher(self, key: str, kind: type | None, quality: Quality) -> TransportPublisher:
-        return ZenohPublisher(
-            self._session.declare_publisher(key, encoding=_encoding(kind), **QUALITIES[quality])
-        )
+        options = QUALITIES[quality]
+        return ZenohPublisher(self._session.declare_publisher(key, encoding=_encoding(kind), **options))
 
     def put(self, key: str, payload: bytes, kind: type) -> None:
         try:
@@ -206,12 +192,8 @@ class ZenohTransport(Transport):
         return _undeclare(self._session.liveliness().declare_token(key))
 
     def token_subscriber(self, key: str, on_token: Callable[[str, bool], None]) -> Undeclare:
-        def on_zenoh_sample(sample: zenoh.Sample) -> None:
-            on_token(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-
-        return _undeclare(
-            self._session.liveliness().declare_subscriber(key, _direct(on_zenoh_sample), history=True)
-        )
+        callback = _direct(lambda one: on_token(str(one.key_expr), one.kind == zenoh.SampleKind.PUT))
+        return _undeclare(self._session.liveliness().declare_subscriber(key, callback, history=True))
 
     def tokens(self, key: str, timeout: float, to: Collector) -> None:
         self._session.liveliness().get(key, _collecting(to), timeout=timeout)
@@ -265,10 +247,8 @@ class ZenohPublisher(TransportPublisher):
             log.warning("a publication on %s was not sent: %s", self._publisher.key_expr, error)
 
     def match(self, on_matching: Callable[[bool], None]) -> bool:
-        def on_zenoh_matching(status: zenoh.MatchingStatus) -> None:
-            on_matching(bool(status.matching))
-
-        self._listener = self._publisher.declare_matching_listener(_direct(on_zenoh_matching))
+        callback = _direct(lambda status: on_matching(bool(status.matching)))
+        self._listener = self._publisher.declare_matching_listener(callback)
         # The package's own types call it a bool; the object it gives is true in either case.
         status: Any = self._publisher.matching_status
         return bool(status.matching)
@@ -295,11 +275,7 @@ def _collecting(to: Collector) -> Callback[zenoh.Reply]:
 
 
 def _direct(callback: Callable[[Any], None]) -> Callback[Any]:
-    return Callback(callback, _nothing, indirect=False)
-
-
-def _nothing() -> None:
-    """Zenoh calls this when a declaration ends."""
+    return Callback(callback, lambda: None, indirect=False)
 
 
 def _undeclare(declared: Any) -> Undeclare:

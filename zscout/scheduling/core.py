@@ -124,7 +124,8 @@ class Core:
 
     def arcs_of(self, client: ClientId) -> list[ArcId]:
         """The ARCs of one client, those that wait first: so none of them profits from the others' end."""
-        return [arc.id for arc in self._state.arcs_of(client)]
+        arcs = self._state.arcs_of(client)
+        return [arc.id for arc in sorted(arcs, key=lambda arc: (arc.hold is not None, arc.entry))]
 
     def at_place(self, place: Place) -> list[ArcId]:
         """The ARCs of this place: one, or more where clients claim the same after a takeover."""

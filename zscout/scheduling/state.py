@@ -8,7 +8,7 @@ from __future__ import annotations
 import heapq
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from operator import itemgetter
 from typing import Protocol
@@ -276,10 +276,8 @@ class SchedulerState:
         if not arcs:
             del self._clients[arc.request.client]
 
-    def arcs_of(self, client: ClientId) -> list[Arc]:
-        """The ARCs of one client, first those that wait, each group in the order in which it came there."""
-        arcs = self._clients.get(client, {}).values()
-        return sorted(arcs, key=lambda arc: (arc.hold is not None, arc.entry))
+    def arcs_of(self, client: ClientId) -> Collection[Arc]:
+        return self._clients.get(client, {}).values()
 
     def hand_over(self, arc: Arc, to: ClientId, renamed: ArcId) -> None:
         """An ARC goes on under another client, by another name. Its hold stands, or its wait goes on."""

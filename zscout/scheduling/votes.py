@@ -6,6 +6,7 @@ every superset, and one answer settles many questions. Answers stand until the R
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -30,7 +31,7 @@ YES = Answer(accept=True)
 
 
 class RcVotes:
-    """One RC's answers. `silent` after an overdue vote: nobody waits for this RC until it answers."""
+    """One RC's answers."""
 
     def __init__(self) -> None:
         self.accepted: dict[HolderSet, None] = {}
@@ -39,8 +40,8 @@ class RcVotes:
         """The proposals of each set that is asked for, newest last."""
         self.overdue: set[HolderSet] = set()
         """Those whose newest proposal is overdue, and perhaps lost: they may be asked for anew."""
-        self.silent = False
         self.ask_again: Ns = 0
+        """When, if it is silent."""
         self._accepted_with: dict[ArcId, dict[HolderSet, None]] = {}
         """The accepted sets that each ARC is in."""
         self._vetoed_at: dict[ArcId, dict[HolderSet, None]] = {}
@@ -128,7 +129,7 @@ class Votes:
     """All ballots of a fleet. Proposals are numbered; an answer to a number that is not out is ignored."""
 
     def __init__(self) -> None:
-        self._ballots: dict[RcName, RcVotes] = {}
+        self._ballots: defaultdict[RcName, RcVotes] = defaultdict(RcVotes)
         self.out: dict[int, tuple[RcName, HolderSet]] = {}
         """The proposals that are out, by their numbers."""
         self._next = 1
@@ -143,11 +144,11 @@ class Votes:
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
         """The answer that stands for exactly this set, by itself or by what it implies; None if unknown."""
-        return self._ballot(rc).known(holders)
+        return self._ballots[rc].known(holders)
 
     def vetoed(self, rc: RcName) -> list[HolderSet]:
         """The sets that an RC has vetoed; each rules out every larger one as well."""
-        return list(self._ballot(rc).vetoed)
+        return list(self._ballots[rc].vetoed)
 
     def due(self, now: Ns) -> list[RcName]:
         """The silent RCs that may be asked again by now."""
@@ -157,8 +158,8 @@ class Votes:
         """The number of a new proposal to send, or None where one is out already or the RC is not due.
 
         A silent RC is asked again once a quantum, so that it can show that it is back."""
-        ballot = self._ballot(rc)
-        if ballot.silent:
+        ballot = self._ballots[rc]
+        if rc in self.silent:
             if now < ballot.ask_again:
                 return None
             ballot.ask_again = now + QUANTUM
@@ -174,14 +175,13 @@ class Votes:
         self.out[number] = (rc, holders)
         return number
 
-    def answer(self, proposal: int, *, accept: bool, reason: str) -> bool:
-        """Takes an answer, a late one too. False: nobody asked, or its question has become void."""
+    def answer(self, proposal: int, *, accept: bool, reason: str) -> None:
+        """Takes an answer, a late one too, unless nobody asked, or the question has become void."""
         if proposal not in self.out:
-            return False
+            return
         rc, holders = self.out[proposal]
         ballot = self._ballots[rc]
         self._close(ballot, holders)
-        ballot.silent = False
         self.silent.discard(rc)
         self.answered.add(rc)
         self.version += 1
@@ -189,24 +189,21 @@ class Votes:
             ballot.accept(holders)
         else:
             ballot.veto(holders, reason)
-        return True
 
-    def overdue(self, proposal: int, now: Ns) -> bool:
+    def overdue(self, proposal: int, now: Ns) -> None:
         """Marks the RC silent. The proposal stays open: an answer counts until the query for it ends."""
         if proposal not in self.out:
-            return False
+            return
         rc, holders = self.out[proposal]
         ballot = self._ballots[rc]
         if proposal != ballot.out[holders][-1]:
-            return False
+            return
         ballot.overdue.add(holders)
         self.answered.add(rc)
         self.version += 1
-        self.silent.add(rc)
-        if not ballot.silent:
-            ballot.silent = True
+        if rc not in self.silent:
+            self.silent.add(rc)
             ballot.ask_again = now + QUANTUM
-        return True
 
     def forget_rc(self, rc: RcName) -> None:
         """The RC left, came anew or changed its rules: no vote of it stands, no proposal is out."""
@@ -234,12 +231,6 @@ class Votes:
         if ballot is not None:
             for number in ballot.rename(arc, renamed):
                 self.out[number] = (rc, _renamed(self.out[number][1], arc, renamed))
-
-    def _ballot(self, rc: RcName) -> RcVotes:
-        ballot = self._ballots.get(rc)
-        if ballot is None:
-            ballot = self._ballots[rc] = RcVotes()
-        return ballot
 
     def _close(self, ballot: RcVotes, holders: HolderSet) -> None:
         ballot.overdue.discard(holders)
