@@ -24,7 +24,7 @@ from zscout.behaviors.components.channel import (
     StopOrder,
 )
 from zscout.config.fleet import default_fleet
-from zscout.messages import MAX_CHECKPOINT, OpenRequest
+from zscout.messages import MAX_CHECKPOINT, ComponentSpec, OpenRequest, StartComponent
 
 
 @pytest.fixture
@@ -37,7 +37,8 @@ def pair() -> Iterator[tuple[socket.socket, BinaryIO]]:
 def test_messages_arrive_in_order_and_the_end_is_seen(pair: tuple[socket.socket, BinaryIO]) -> None:
     ours, theirs = pair
     request = OpenRequest("1", "survey", {"robot/a": {"rate": Decimal("0.1")}}, 3, Decimal("2.5"))
-    job = ComponentJob("c", 7, "counter", "m:C", {"a": [1, None]}, "h", default_fleet(), "tag", memory=5)
+    start = StartComponent("c", 7, ComponentSpec("counter", {"a": [1, None]}))
+    job = ComponentJob(start, "m:C", "h", default_fleet(), "tag", memory=5)
     orders = [StopOrder(), RestoreOrder(1, b"\x00\xff", [request])]
     ours.sendall(b"".join(map(channel.pack, [job, *orders])))
     ours.close()

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Final, Literal, TypeAlias
 import msgspec
 
 from zscout.config.fleet import Fleet
-from zscout.messages import MAX_MOVE, HowEnded, OpenRequest, Problem
+from zscout.messages import MAX_MOVE, HowEnded, OpenRequest, Problem, StartComponent
 
 MAX_FRAME: Final = MAX_MOVE + 65_536
 """Bytes."""
@@ -24,19 +24,20 @@ class BadFrame(Exception):
 class ComponentJob(msgspec.Struct, frozen=True, tag="job"):
     """The first order: what to run, and as whom."""
 
-    component: str
-    incarnation: int
-    kind: str
+    start: StartComponent
     where: str
     """`module:class` of the kind."""
-    params: dict[str, Any]
     host: str
     fleet: Fleet
     tag: str
     """Stands in the environment of this process and of all that it starts."""
-    standby: bool = False
     memory: int = 0
     """Bytes that each process may allocate; 0: no limit of this sort."""
+
+    @property
+    def client(self) -> str:
+        """Its name on the mesh."""
+        return f"{self.start.component}.{self.start.incarnation}"
 
 
 class StopOrder(msgspec.Struct, frozen=True, tag="stop"):

@@ -68,7 +68,7 @@ class ComponentLifecycle:
         self._away: EndReport | None = None
         """How, once that is so."""
         self._supervisor = Supervisor(
-            f"component {job.component}.{job.incarnation}",
+            f"component {job.client}",
             lambda error: self.end(EndReport("failed", _words(error))),
         )
 
@@ -124,9 +124,7 @@ class ComponentLifecycle:
 
     async def _tell_story(self) -> EndReport:
         job = self._job
-        connecting = asyncio.create_task(
-            Client.connect(f"{job.component}.{job.incarnation}", fleet=job.fleet, host=job.host)
-        )
+        connecting = asyncio.create_task(Client.connect(job.client, fleet=job.fleet, host=job.host))
         # It joins the mesh in a thread: what follows is done meanwhile.
         await asyncio.sleep(0)
         try:
@@ -140,7 +138,7 @@ class ComponentLifecycle:
         movable = is_movable(made)
         watch = client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)
         try:
-            if job.standby:
+            if job.start.standby:
                 await _finds(client, Role.RCM, [lambda _: True], LINKED)
                 await self._tell(PhaseReport("standby", movable))
                 if not await self._called(client):
@@ -153,7 +151,7 @@ class ComponentLifecycle:
 
     def _load(self) -> type[Component]:
         try:
-            return kinds.load(self._job.kind, self._job.where)
+            return kinds.load(self._job.start.spec.kind, self._job.where)
         except kinds.BadKind as error:
             raise _Unusable(str(error)) from None
         except Exception as error:  # noqa: BLE001 - the author's code
@@ -163,7 +161,7 @@ class ComponentLifecycle:
     def _make(self, kind: type[Component]) -> Component:
         limit_allocations(self._job.memory)
         try:
-            return kind(self._job.params)
+            return kind(self._job.start.spec.params)
         except ValueError as error:
             raise _Unusable(f"these parameters are no good: {_words(error, named=False)}") from None
         except Exception as error:  # noqa: BLE001 - the author's code
@@ -177,14 +175,14 @@ class ComponentLifecycle:
         return False
 
     async def _perform(self, client: Client, component: Component, movable: bool) -> EndReport:
-        job = self._job
-        instance = f"{job.incarnation}-{new_instance()}"
-        token: Declaration = client.mesh.alive(Token(job.host, Role.COMPONENT, job.component, instance))
+        start, host = self._job.start, self._job.host
+        instance = f"{start.incarnation}-{new_instance()}"
+        token: Declaration = client.mesh.alive(Token(host, Role.COMPONENT, start.component, instance))
         self._running = True
         try:
             # Not waited for: nothing comes between this and its first step.
             self._tell(PhaseReport("running", movable))
-            await component.run(ComponentContext(client, job.component, job.incarnation, self._gate))
+            await component.run(ComponentContext(client, start.component, start.incarnation, self._gate))
         except asyncio.CancelledError:
             if self._wanted is None:
                 raise
@@ -219,7 +217,7 @@ class ComponentLifecycle:
     def _movable(self, *, standby: bool = False) -> tuple[Component, Client]:
         """Raises NotMoved where it does not run, or stand by, or can't be moved at all."""
         component, client = self._component, self._client
-        fits = self._job.standby and not self._running if standby else self._running
+        fits = self._job.start.standby and not self._running if standby else self._running
         if component is None or client is None or not fits:
             raise NotMoved("bad_request", "it does not stand by" if standby else "it does not run")
         if not is_movable(component):
@@ -239,7 +237,7 @@ class ComponentLifecycle:
 
     async def _move_away(self, order: channel.MoveOrder) -> None:
         component, client = self._movable()
-        name = self._job.component
+        name = self._job.start.component
         async with self._holding:
             self._move = OutgoingMove(client, component, self._gate, name, order.to, order.incarnation)
             try:
@@ -277,7 +275,7 @@ class ComponentLifecycle:
         await self._tell(OrderAnswer(order.number))
 
     def _on_component(self, token: Token, alive: bool) -> None:
-        if not alive or token.name != self._job.component:
+        if not alive or token.name != self._job.start.component:
             return
         try:
             incarnation = incarnation_of(token.instance)
@@ -285,7 +283,7 @@ class ComponentLifecycle:
             return
         if self._move is not None and incarnation == self._move.incarnation:
             self._move.successor_runs.set()
-        elif incarnation > self._job.incarnation:
+        elif incarnation > self._job.start.incarnation:
             self._superseded(incarnation, token.host)
 
     def _superseded(self, incarnation: int, host: str) -> None:

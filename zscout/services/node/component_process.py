@@ -255,7 +255,8 @@ class ComponentProcess:
         loop = asyncio.get_running_loop()
         stream, writer = await asyncio.open_unix_connection(sock=connection, limit=channel.MAX_FRAME)
         self._writer = writer
-        self._send(self._job())
+        each = self._group.each
+        self._send(ComponentJob(self.start, self._where, self._host, self._fleet, self._tag, each))
         if self.phase == "stopping":
             self._send(channel.StopOrder())
         if self._verdict is not None:
@@ -286,21 +287,6 @@ class ComponentProcess:
             pass_fds=(connection,),
             start_new_session=True,
             env=os.environ | {VARIABLE: self._tag, "PYTHONUNBUFFERED": "1", "ZSCOUT_HOST": self._host},
-        )
-
-    def _job(self) -> ComponentJob:
-        start = self.start
-        return ComponentJob(
-            component=start.component,
-            incarnation=start.incarnation,
-            kind=start.spec.kind,
-            where=self._where,
-            params=start.spec.params,
-            host=self._host,
-            fleet=self._fleet,
-            tag=self._tag,
-            standby=start.standby,
-            memory=self._group.each,
         )
 
     async def _receive(self, stream: asyncio.StreamReader) -> None:
