@@ -25,7 +25,6 @@ from zscout.messages import (
 from zscout.placement.balancer import Balancer
 from zscout.placement.events import (
     ComponentChanged,
-    ComponentForgotten,
     ComponentsListed,
     HostCommand,
     HostJoined,
@@ -35,7 +34,6 @@ from zscout.placement.events import (
     PlacementRefused,
     PlacerEffect,
     PlacerEvent,
-    PlacerTick,
     PlacerWakeAt,
     StartAnswered,
     StopAnswered,
@@ -78,7 +76,7 @@ class World(Hosts):
             at = self.queue[0][0]
             if self._wake is not None and self._wake <= min(at, until):
                 self.now, self._wake = max(self.now, self._wake), None
-                self.send(PlacerTick())
+                self.send()
             elif at <= until:
                 self.now, _, what = heapq.heappop(self.queue)
                 what()
@@ -151,10 +149,11 @@ class World(Hosts):
 
     def carry_out(self, effect: PlacerEffect) -> None:
         match effect:
-            case ComponentChanged(component):
-                self.published[component] = self.placer.status().components[component]
-            case ComponentForgotten(component):
-                del self.published[component]
+            case ComponentChanged(component, placement):
+                if placement is None:
+                    del self.published[component]
+                else:
+                    self.published[component] = placement
             case PlacementRefused():
                 self.refusals.append(effect)
             case PlacerWakeAt(at):

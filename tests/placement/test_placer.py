@@ -25,7 +25,6 @@ from zscout.placement import state
 from zscout.placement.balancer import Balancer, RankingCache
 from zscout.placement.events import (
     ComponentChanged,
-    ComponentForgotten,
     ComponentsListed,
     HostCommand,
     HostJoined,
@@ -35,7 +34,6 @@ from zscout.placement.events import (
     PlacementRefused,
     PlacerEffect,
     PlacerEvent,
-    PlacerTick,
     PlacerWakeAt,
     StartAnswered,
     StopAnswered,
@@ -69,15 +67,23 @@ def starts(effects: list[PlacerEffect]) -> list[tuple[str, StartComponent]]:
     ]
 
 
+def changes(effects: list[PlacerEffect]) -> list[tuple[str, str]]:
+    return [
+        (one.component, one.placement.state if one.placement is not None else "forgotten")
+        for one in effects
+        if isinstance(one, ComponentChanged)
+    ]
+
+
 def test_what_has_ended_is_forgotten_after_a_while_and_its_incarnations_are_not_used_again() -> None:
     (placer, balancer), spec = fleet(), ComponentSpec("job")
     [(host, first)] = starts(placer.handle(0, PlaceComponent("a", spec)))
     ended = ComponentsListed(
         host, (ComponentView("a", first.incarnation, host, spec, "ended", ended="completed"),)
     )
-    assert placer.handle(SECOND, ended)[0] == ComponentChanged("a")
-    assert ComponentForgotten("a") not in placer.handle(RETENTION, PlacerTick())
-    assert placer.handle(SECOND + RETENTION, PlacerTick()) == [ComponentForgotten("a"), PlacerWakeAt(None)]
+    assert changes(placer.handle(SECOND, ended)) == [("a", "ended")]
+    assert ("a", "forgotten") not in changes(placer.handle(RETENTION))
+    assert placer.handle(SECOND + RETENTION) == [ComponentChanged("a", None), PlacerWakeAt(None)]
     assert placer.status().components == {}
     now = SECOND + RETENTION
     balancer.reported(now, report("h0", 2))
@@ -93,12 +99,9 @@ def test_limits_hold_and_what_has_ended_makes_room(monkeypatch: pytest.MonkeyPat
     assert [type(one) for one in placer.handle(0, PlaceComponent("e", spec))] == [PlacementRefused]
     # Three end, two of them are remembered; and those two make room for others.
     effects = placer.handle(1, *(EndComponent(name) for name in "abc"))
-    assert effects[:3] == [ComponentForgotten("a"), ComponentChanged("b"), ComponentChanged("c")]
-    assert placer.handle(2, *(PlaceComponent(name, spec) for name in "xyz"))[:3] == [
-        ComponentChanged("x"),
-        ComponentForgotten("b"),
-        ComponentChanged("y"),
-    ]
+    assert changes(effects) == [("a", "forgotten"), ("b", "ended"), ("c", "ended")]
+    effects = placer.handle(2, *(PlaceComponent(name, spec) for name in "xyz"))
+    assert changes(effects)[:3] == [("x", "waiting"), ("b", "forgotten"), ("y", "waiting")]
     assert set(placer.status().components) == {"d", "x", "y", "z"}
 
 
@@ -113,15 +116,15 @@ def test_many_are_placed_a_part_at_a_time_and_all_of_them() -> None:
         [wake] = [one.at for one in effects if isinstance(one, PlacerWakeAt)]
         assert wake is not None
         now = wake
-        effects = placer.handle(now, PlacerTick())
+        effects = placer.handle(now)
     assert len({one.component for _, one in found}) == len(found) == count
 
 
 def test_time_does_not_go_backwards() -> None:
     placer, _ = fleet()
-    placer.handle(SECOND, PlacerTick())
+    placer.handle(SECOND)
     with pytest.raises(ValueError, match="time went backwards"):
-        placer.handle(0, PlacerTick())
+        placer.handle(0)
 
 
 @pytest.mark.parametrize("policy", ["least_loaded", "pending"])
@@ -210,6 +213,5 @@ def nonsense(rng: Random) -> PlacerEvent:
         HostJoined(host),
         HostLost(host),
         Inherited((record,), frozenset({host})),
-        PlacerTick(),
     ]
     return rng.choice(events)

@@ -28,7 +28,6 @@ from zscout.placement.events import (
     MoveAnswered,
     PlacerEffect,
     PlacerEvent,
-    PlacerTick,
     PlacerWakeAt,
     StartAnswered,
     StopAnswered,
@@ -132,7 +131,7 @@ class Fleet:
             self.report()
             if self.wake is not None and self.wake <= self.now:
                 self.wake = None
-                self.send(PlacerTick())
+                self.send()
 
     def counts(self) -> list[int]:
         return [list(self.where.values()).count(host) for host in self.hosts]

@@ -43,7 +43,6 @@ from zscout.messages import (
 from zscout.placement.balancer import Balancer
 from zscout.placement.events import (
     ComponentChanged,
-    ComponentForgotten,
     ComponentsListed,
     HostCommand,
     HostJoined,
@@ -53,7 +52,6 @@ from zscout.placement.events import (
     PlacementRefused,
     PlacerEffect,
     PlacerEvent,
-    PlacerTick,
     PlacerWakeAt,
     StartAnswered,
     StopAnswered,
@@ -98,7 +96,7 @@ class PlacerPlayer:
                 events += self.lead(int(words[1]), rebalance="rebalance" in words)
             elif words and (event := self.event(words[0], words[1:])) is not None:
                 events.append(event)
-        if not events:
+        if not events and words != ["tick"]:
             return []
         return self.handle(*events) or ["nothing"]
 
@@ -125,7 +123,7 @@ class PlacerPlayer:
             )
             self.pass_to(due)
             if self.wake is not None and self.wake <= due:
-                found += [f"at {seconds(due)}: {line}" for line in self.handle(PlacerTick())]
+                found += [f"at {seconds(due)}: {line}" for line in self.handle()]
             if due == until:
                 return found
         raise ValueError(f"woke {MOST_WAKES} times")
@@ -202,7 +200,7 @@ class PlacerPlayer:
                 self.reports.pop(host, None)
                 return HostLost(host)
             case ("tick",):
-                return PlacerTick()
+                return None
             case _:
                 raise ValueError(f"no such command: {' '.join([verb, *words])}")
 
@@ -231,10 +229,8 @@ class PlacerPlayer:
                 return f"move {component} {incarnation} on {host} to {to_incarnation} on {to}"
             case HostCommand(host, ListComponents(component)):
                 return f"look at {host} for {component}"
-            case ComponentChanged(component):
-                return _print(self.placer.status().components[component])
-            case ComponentForgotten(component):
-                return f"forgotten {component}"
+            case ComponentChanged(component, placement):
+                return f"forgotten {component}" if placement is None else _print(placement)
             case PlacementRefused(about, code, message):
                 return f"refused {about} {code}: {message}"
             case PlacerWakeAt(at):

@@ -43,9 +43,9 @@ def completion(ctx: click.Context, shell: str | None) -> None:
 
 
 def kinds(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    from zscout.behaviors.components.kinds import installed
+    from zscout.behaviors.components.component import installed_kinds
 
-    return [name for name in installed() if name.startswith(incomplete)]
+    return [name for name in installed_kinds() if name.startswith(incomplete)]
 
 
 def components(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:

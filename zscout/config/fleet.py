@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
-from zscout.config.endpoints import check_links, check_multicast
 from zscout.config.scheduling_policy import (
     OPERATOR_PRIORITY,
     PATIENCE,
@@ -22,7 +23,9 @@ from zscout.config.strict import (
     Where,
     check_name,
     check_names,
+    check_unique,
     key,
+    quoted,
     read_toml,
     seconds,
 )
@@ -33,6 +36,13 @@ FLEET_VARIABLE: Final = "ZSCOUT_FLEET"
 DEFAULT_FLEET_NAME: Final = "zscout"
 MAX_CANDIDATES: Final = 1_000
 MAX_ENDPOINTS: Final = 256
+
+_ENDPOINT: Final = re.compile(
+    r"(?P<protocol>[a-z]+)/(?P<host>\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9_.-]+):(?P<port>[0-9]{1,5})"
+    r"(?P<more>[?#][A-Za-z0-9_.,:;=/#-]+)?"
+)
+_PROTOCOLS: Final = ("tcp", "tls", "udp", "quic", "ws")
+_INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:,@-]{1,64}")
 
 Endpoints = Annotated[tuple[str, ...], Meta(max_length=MAX_ENDPOINTS)]
 
@@ -230,3 +240,57 @@ def _check_above(value: Ns, bound: Ns, meaning: str, where: Where) -> None:
     if value <= bound:
         limit = f"{bound / SECOND:g}"
         raise where.bad(f"is {value / SECOND:g} s", f"write more than {meaning}, which is {limit} s")
+
+
+# Endpoints and addresses, checked before Zenoh sees them
+
+
+def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: str, at: Where) -> None:
+    """Refuses endpoints and interfaces that Zenoh would not understand. Raises BadInput."""
+    for name, endpoints, lowest_port in (("listen", listen, 0), ("connect", connect, 1)):
+        for number, endpoint in enumerate(endpoints):
+            _check_endpoint(endpoint, (at / name).item(number), lowest_port=lowest_port)
+        check_unique(endpoints, at / name)
+    if not _INTERFACE.fullmatch(interface):
+        raise (at / "interface").bad(
+            f"{quoted(interface)} names no interface", 'write "auto", or as in "eth0"'
+        )
+
+
+def _check_endpoint(endpoint: str, where: Where, *, lowest_port: int) -> None:
+    found = _ENDPOINT.fullmatch(endpoint)
+    if not found or found["protocol"] not in _PROTOCOLS or not _is_host(found["host"]):
+        remedy = f'write protocol/host:port, as in "tcp/127.0.0.1:7447"; protocols: {", ".join(_PROTOCOLS)}'
+        raise where.bad(f"{quoted(endpoint)} is not an endpoint", remedy)
+    if not lowest_port <= int(found["port"]) <= 65_535:
+        raise where.bad(f"{quoted(endpoint)} has no valid port", f"write one from {lowest_port} to 65535")
+
+
+def check_multicast(address: str, where: Where) -> None:
+    """Refuses what is not a multicast `ip:port`. Raises BadInput."""
+    host, _, port = address.rpartition(":")
+    ip = ip_of(host.removeprefix("[").removesuffix("]"))
+    if (
+        ip is None
+        or not ip.is_multicast
+        or not re.fullmatch("[0-9]{1,5}", port)
+        or not 0 < int(port) < 65_536
+    ):
+        raise where.bad(
+            f"{quoted(address)} is not a multicast address", 'write ip:port, as in "224.0.0.224:7446"'
+        )
+
+
+def _is_host(host: str) -> bool:
+    if host.startswith("["):
+        return isinstance(ip_of(host[1:-1]), ipaddress.IPv6Address)
+    # Digits and dots alone are meant as an IPv4 address.
+    return ip_of(host) is not None if re.fullmatch("[0-9.]+", host) else True
+
+
+def ip_of(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """The IP address that a text is, or None."""
+    try:
+        return ipaddress.ip_address(text)
+    except ValueError:
+        return None

@@ -9,8 +9,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta, Struct, structs
 
 from zscout.config.devices import RcConfig, check_rc
-from zscout.config.endpoints import check_links, ip_of
-from zscout.config.fleet import Endpoints, Fleet, default_fleet, load_fleet
+from zscout.config.fleet import Endpoints, Fleet, check_links, default_fleet, ip_of, load_fleet
 from zscout.config.strict import (
     BadInput,
     Where,

@@ -110,11 +110,6 @@ class Inherited:
     cordoned: frozenset[HostName] = frozenset()
 
 
-@dataclass(frozen=True, slots=True)
-class PlacerTick:
-    """Time has passed."""
-
-
 PlacerEvent: TypeAlias = (
     PlacementOperation
     | DrainHost
@@ -128,7 +123,6 @@ PlacerEvent: TypeAlias = (
     | HostJoined
     | HostLost
     | Inherited
-    | PlacerTick
 )
 
 
@@ -146,14 +140,10 @@ class HostCommand:
 
 @dataclass(frozen=True, slots=True)
 class ComponentChanged:
-    """Publish the component's placement, and answer requests that wait for it."""
+    """Publish the component's placement (None: it is forgotten), and answer requests that wait for it."""
 
     component: ComponentId
-
-
-@dataclass(frozen=True, slots=True)
-class ComponentForgotten:
-    component: ComponentId
+    placement: Placement | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,11 +158,9 @@ class PlacementRefused:
 
 @dataclass(frozen=True, slots=True)
 class PlacerWakeAt:
-    """Send a PlacerTick then, if no event came before. Replaces the last one; None: not needed."""
+    """Have the core handle no event then, if none came before. Replaces the last one; None: not needed."""
 
     at: Ns | None
 
 
-PlacerEffect: TypeAlias = (
-    HostCommand | ComponentChanged | ComponentForgotten | PlacementRefused | PlacerWakeAt
-)
+PlacerEffect: TypeAlias = HostCommand | ComponentChanged | PlacementRefused | PlacerWakeAt

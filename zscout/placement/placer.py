@@ -38,7 +38,6 @@ from zscout.placement.events import (
     MoveAnswered,
     PlacerEffect,
     PlacerEvent,
-    PlacerTick,
     PlacerWakeAt,
     StartAnswered,
     StopAnswered,
@@ -82,7 +81,7 @@ class Placer:
         return PlacerStatus(MappingProxyType(state.published), frozenset(state.balancer.cordoned))
 
     def handle(self, now: Ns, *events: PlacerEvent) -> list[PlacerEffect]:
-        """Applies one instant's events. Raises ValueError if `now` goes backwards."""
+        """Applies one instant's events, or only the time. Raises ValueError if `now` goes backwards."""
         state = self._state
         state.begin(now)
         for event in events:
@@ -130,8 +129,6 @@ class Placer:
                 self._state.balancer.cordoned |= cordoned
                 for status in components:
                     self._reconciler.inherited(status)
-            case PlacerTick():
-                pass
 
     def _stop(self, component: ComponentId) -> None:
         record = self._state.get(component)

@@ -28,7 +28,6 @@ from zscout.messages import (
 from zscout.placement.balancer import LOAD_TIME, Balancer, RankingCache
 from zscout.placement.events import (
     ComponentChanged,
-    ComponentForgotten,
     HostCommand,
     PlacementRefused,
     PlacerEffect,
@@ -281,12 +280,12 @@ class PlacementState:
             record = self.components.get(component)
             if record is None:
                 if self.published.pop(component, None) is not None:
-                    effects.append(ComponentForgotten(component))
+                    effects.append(ComponentChanged(component, None))
                 continue
             status = record.status()
             if always or self.published.get(component) != status:
                 self.published[component] = status
-                effects.append(ComponentChanged(component))
+                effects.append(ComponentChanged(component, status))
         # A host may have been lost in this very instant, after a command to it.
         return effects + [
             one for one in self._commands if isinstance(one, PlacementRefused) or one.host in self.alive

@@ -7,24 +7,22 @@ from pathlib import Path
 import pytest
 
 from tests.behaviors.components.kit import ODD, register_odd_kinds
-from zscout.behaviors.components import kinds
-from zscout.behaviors.components.component import Component, is_movable
-from zscout.behaviors.components.kinds import BadKind
+from zscout.behaviors.components.component import BadKind, Component, installed_kinds, is_movable, load_kind
 from zscout.behaviors.components.shipped import Counter, Spin
 
 
 def test_what_comes_with_zscout_is_installed_and_can_be_loaded() -> None:
-    there = kinds.installed()
-    assert [kinds.load(kind, there[kind]) for kind in ("counter", "spin")] == [Counter, Spin]
+    there = installed_kinds()
+    assert [load_kind(kind, there[kind]) for kind in ("counter", "spin")] == [Counter, Spin]
     assert is_movable(Counter({}))
     assert not is_movable(Component({}))
 
 
 def test_kinds_of_other_packages_are_seen_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "still" not in kinds.installed()
+    assert "still" not in installed_kinds()
     register_odd_kinds(tmp_path / "site")
     monkeypatch.syspath_prepend(tmp_path / "site")
-    assert set(ODD) < set(kinds.installed())
+    assert set(ODD) < set(installed_kinds())
 
 
 def test_a_name_that_means_two_things_or_none_is_no_kind(
@@ -35,7 +33,7 @@ def test_a_name_that_means_two_things_or_none_is_no_kind(
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1\n")
     (info / "entry_points.txt").write_text("[zscout.components]\nspin = a:B\nbad/name = a:B\nfine = a:B\n")
     monkeypatch.syspath_prepend(tmp_path)
-    there = kinds.installed()
+    there = installed_kinds()
     assert there["fine"] == "a:B"
     assert "spin" not in there
     assert "bad/name" not in there
@@ -47,7 +45,7 @@ def test_a_name_that_means_two_things_or_none_is_no_kind(
 )
 def test_what_is_no_component_is_refused_in_one_line(where: str) -> None:
     with pytest.raises(BadKind, match=r"kind x: .* no subclass of .*; mend the entry point") as caught:
-        kinds.load("x", where)
+        load_kind("x", where)
     assert "\n" not in str(caught.value)
 
 

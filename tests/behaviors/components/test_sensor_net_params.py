@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from tests.config.kit import NAME_RULE, RC_RULE
-from zscout.behaviors.components import kinds
-from zscout.behaviors.components.component import is_movable
+from zscout.behaviors.components.component import installed_kinds, is_movable, load_kind
 from zscout.behaviors.components.sensor_net import PlaceRobotComponent, PlaceSensorNetComponent, StatusPrinter
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
@@ -149,9 +148,9 @@ def test_each_robot_of_a_net_is_placed_with_what_the_net_was_told() -> None:
 
 
 def test_both_are_installed_and_can_be_moved() -> None:
-    there = kinds.installed()
-    assert kinds.load("place_robot", there["place_robot"]) is PlaceRobotComponent
-    assert kinds.load("place_sensor_net", there["place_sensor_net"]) is PlaceSensorNetComponent
+    there = installed_kinds()
+    assert load_kind("place_robot", there["place_robot"]) is PlaceRobotComponent
+    assert load_kind("place_sensor_net", there["place_sensor_net"]) is PlaceSensorNetComponent
     for made, same in (
         (PlaceRobotComponent(ONE), PlaceRobotComponent(ONE)),
         (PlaceSensorNetComponent(TWO), PlaceSensorNetComponent(TWO)),

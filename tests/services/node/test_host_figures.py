@@ -11,8 +11,7 @@ import psutil
 import pytest
 
 from zscout.services.node import host_figures
-from zscout.services.node.cgroup import Cgroup, HostMemory
-from zscout.services.node.host_figures import CpuMeter, Paced
+from zscout.services.node.host_figures import Cgroup, CpuMeter, HostMemory, Paced
 
 GB = 1_000_000_000
 NO_V1_LIMIT = "9223372036854771712"

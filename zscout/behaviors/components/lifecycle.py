@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Final
 
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.components import channel, kinds
+from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import (
     ComponentJob,
     ComponentReport,
@@ -19,10 +19,12 @@ from zscout.behaviors.components.channel import (
     PhaseReport,
 )
 from zscout.behaviors.components.component import (
+    BadKind,
     Component,
     ComponentContext,
     SafePointGate,
     is_movable,
+    load_kind,
 )
 from zscout.behaviors.components.migration import NotMoved, OutgoingMove, state_of
 from zscout.behaviors.components.processes import limit_allocations
@@ -151,8 +153,8 @@ class ComponentLifecycle:
 
     def _load(self) -> type[Component]:
         try:
-            return kinds.load(self._job.start.spec.kind, self._job.where)
-        except kinds.BadKind as error:
+            return load_kind(self._job.start.spec.kind, self._job.where)
+        except BadKind as error:
             raise _Unusable(str(error)) from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()

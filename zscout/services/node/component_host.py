@@ -11,7 +11,7 @@ from typing import Final
 
 import msgspec
 
-from zscout.behaviors.components.kinds import installed
+from zscout.behaviors.components.component import installed_kinds
 from zscout.config.fleet import Fleet
 from zscout.config.node import MAX_KINDS, ComponentsConfig
 from zscout.keyexpr import BadName, check_name
@@ -166,7 +166,7 @@ class ComponentHost:
 
     async def _launch(self, start: StartComponent) -> ComponentProcess:
         self._check(start)
-        kinds = await asyncio.to_thread(installed)
+        kinds = await asyncio.to_thread(installed_kinds)
         # Another one may have asked meanwhile.
         process = self._same(start)
         if process is not None:
@@ -223,7 +223,7 @@ class ComponentHost:
             )
 
     async def _list(self, component: str | None) -> ComponentList:
-        kinds = await asyncio.to_thread(installed)
+        kinds = await asyncio.to_thread(installed_kinds)
         found = {**self._ended, **self._living}
         views = [found[name].view() for name in sorted(found) if component in (None, name)]
         return ComponentList(self.mesh.me.host, views, self._startable(kinds)[:MAX_KINDS])

@@ -15,7 +15,7 @@ from typing import Final
 
 import psutil
 
-from zscout.services.node.cgroup import group_folders, own_groups, read_field, read_text
+from zscout.services.node.host_figures import group_folders, own_groups, read_field, read_text
 
 log = logging.getLogger("zscout.components")
 

@@ -11,8 +11,17 @@ from typing import Final, NamedTuple
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Mesh, Supervisor
 from zscout.messages import LoadReport
-from zscout.services.node.cgroup import Cgroup, HostMemory
-from zscout.services.node.host_figures import CpuMeter, Paced, clock, cores, memory, speed, temperature
+from zscout.services.node.host_figures import (
+    Cgroup,
+    CpuMeter,
+    HostMemory,
+    Paced,
+    clock,
+    cores,
+    memory,
+    speed,
+    temperature,
+)
 from zscout.services.node.process_use import Running, TreeMeter, TreeUse, UseMeter, faded
 
 log = logging.getLogger("zscout.load")

@@ -20,14 +20,12 @@ from zscout.mesh.supervision import Supervisor
 from zscout.messages import ListComponents, Placement, Placements, PlacerOperation
 from zscout.placement.events import (
     ComponentChanged,
-    ComponentForgotten,
     HostCommand,
     HostJoined,
     HostLost,
     Inherited,
     PlacementRefused,
     PlacerEvent,
-    PlacerTick,
     PlacerWakeAt,
     TokenAppeared,
     TokenVanished,
@@ -159,26 +157,23 @@ class ComponentPlacer:
 
     # Events into the core, effects out of it
 
-    def _feed(self, event: PlacerEvent) -> list[PlacementRefused]:
-        """Carries out what follows from an event; returns what the core refused."""
+    def _feed(self, *events: PlacerEvent) -> list[PlacementRefused]:
+        """Carries out what follows from events, or from the time; returns what the core refused."""
         refusals: list[PlacementRefused] = []
         changed: dict[str, Placement | None] = {}
-        effects = self._core.handle(self.mesh.now(), event)
-        status = self._core.status()
-        for effect in effects:
+        for effect in self._core.handle(self.mesh.now(), *events):
             match effect:
                 case PlacementRefused():
                     refusals.append(effect)
-                case ComponentChanged(component):
-                    changed[component] = status.components[component]
-                case ComponentForgotten(component):
-                    changed[component] = None
+                case ComponentChanged(component, placement):
+                    changed[component] = placement
                 case PlacerWakeAt(at):
                     self._wake_at(at)
                 case _:
                     self._supervisor.spawn(self._command(effect))
-        if changed or self._cordoned != status.cordoned:
-            self._publish(changed, status.cordoned)
+        cordoned = self._core.status().cordoned
+        if changed or self._cordoned != cordoned:
+            self._publish(changed, cordoned)
         return refusals
 
     async def _command(self, command: HostCommand) -> None:
@@ -199,7 +194,7 @@ class ComponentPlacer:
         if self.mesh.now() < at:
             self._wake_at(at)
         else:
-            self._feed(PlacerTick())
+            self._feed()
 
     def _publish(self, changed: dict[str, Placement | None], cordoned: frozenset[HostName]) -> None:
         self._cordoned = cordoned
