@@ -274,17 +274,18 @@ class Balancer:
             return NO_REPORT
         at, report = self.reports[host]
         if now - at > STALE:
-            return Exclusion("stale", f"its last report is {(now - at) / SECOND:.1f} s old")
+            words = f"its last report is {(now - at) / SECOND:.1f} s old"
+            return Exclusion(words, cause="its last report is")
         if host in self.cordoned:
-            return Exclusion("cordoned", "it is cordoned")
+            return Exclusion("it is cordoned")
         missing = sorted(query.labels.difference(report.labels))
         if missing:
-            return Exclusion("label", f"it has no label {', '.join(missing)}")
+            return Exclusion(f"it has no label {', '.join(missing)}")
         if query.memory:
             available = max(0, self.outlook(now, host, pending=query.policy in COUNTING).memory)
             if available < query.memory:
                 words = f"{available:,} bytes available, {query.memory:,} required"
-                return Exclusion("memory", words)
+                return Exclusion(words, cause="bytes available")
         return None
 
 

@@ -75,15 +75,15 @@ class Lifecycle:
         if record.state == "given_up":
             self._finish(record, "ended", "stopped")
         elif record.state not in ("ended", "stopping"):
-            record.state = "stopping"
+            record.enter("stopping")
             record.reason = "asked to stop"
-            self._end_incarnation(record)
+            self.end_incarnation(record)
 
     # Choosing a host
 
     def place_again(self, record: ComponentRecord, cause: str = "") -> None:
         """Has it placed at the end of this instant."""
-        record.state = "waiting"
+        record.enter("waiting")
         record.restart_cause, record.whereabouts_unknown = cause, False
         self.state.wake(record, None)
         self.state.to_place[record.component] = None
@@ -117,6 +117,9 @@ class Lifecycle:
         elif not hosts:
             tried.clear()
             causes = eligible.causes()
+            if record.no_host is None and eligible.explain(record.reason):
+                # Inherited: all that is known of the causes then is the reason.
+                record.no_host = causes, record.reason
             if record.no_host != (causes, record.reason):
                 record.reason = f"no host will do: {eligible.why_none()}"
                 record.no_host = causes, record.reason
@@ -135,7 +138,7 @@ class Lifecycle:
 
     def _start_on(self, record: ComponentRecord, chosen: RankedHost) -> None:
         state, cause = self.state, record.restart_cause
-        record.state = "starting"
+        record.enter("starting")
         record.incarnation = state.next_incarnation(record.component)
         record.host, record.superseded, record.running_since = chosen.host, False, None
         record.token, record.confirmed, record.probed, record.unanswered = False, False, False, 0
@@ -144,12 +147,12 @@ class Lifecycle:
         state.start(record)
 
     def _back_off(self, record: ComponentRecord, reason: str, pause: Ns) -> None:
-        record.state = "backing_off"
+        record.enter("backing_off")
         record.reason = reason
         self.state.wake(record, self.state.now + pause)
 
     def _finish(self, record: ComponentRecord, over: ComponentState, reason: str) -> None:
-        record.state = over
+        record.enter(over)
         record.reason, record.drain_reason, record.restart_cause = reason, "", ""
         record.whereabouts_unknown = False
         self.state.retire(record)
@@ -201,7 +204,7 @@ class Lifecycle:
     def runs(self, record: ComponentRecord, *, anew: bool = False) -> None:
         """It is known to run where it is; `anew`: as another incarnation than before."""
         if record.state != "running" or anew:
-            record.state = "running"
+            record.enter("running")
             record.running_since, record.whereabouts_unknown = self.state.now, False
             record.failed_rounds, record.reason = 0, record.host_reason
             record.tried.clear()
@@ -296,7 +299,7 @@ class Lifecycle:
 
     # Stopping: what is to end is surplus
 
-    def _end_incarnation(self, record: ComponentRecord) -> None:
+    def end_incarnation(self, record: ComponentRecord) -> None:
         state, host = self.state, record.host
         if host is not None and host in state.alive:
             start_until, token = record.start_until, record.token
@@ -353,7 +356,7 @@ class Lifecycle:
                 if (end := self.check(record)) is not None:
                     self.ended(record, end)
             case "stopping":
-                self._end_incarnation(record)
+                self.end_incarnation(record)
             case _:
                 state.forget(record.component)
 

@@ -76,7 +76,7 @@ class Migrations:
     def begin(self, record: ComponentRecord, to: HostName, why: str) -> None:
         """The record runs and is movable, and `to` is eligible for it. `why`: in words."""
         state = self.state
-        record.state = "moving"
+        record.enter("moving")
         record.migration = Migration(to, state.next_incarnation(record.component), why)
         record.reason, record.drain_reason = f"moving to {to}, {why}", ""
         state.component_arrives(_reservation(record), record.spec.kind, to)
@@ -282,7 +282,7 @@ class Migrations:
         state.balancer.gone(_reservation(record))
         state.rankings.invalidate(move.to)
         record.migration, record.not_before = None, state.now + RETRY
-        record.state = "running"
+        record.enter("running")
         state.wake_migration(record, None)
 
     # Drained hosts: nothing is placed there, and what is movable leaves, heaviest first

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 from zscout.messages import ComponentSpec, LoadReport, RankAsk, RankedHost
 from zscout.types import SECOND, HostName, Kind, Metric, Ns, Policy
@@ -65,13 +65,13 @@ class RankQuery:
 
 
 class Exclusion(NamedTuple):
-    """Why a host can't be used, and the same in words. Figures in these change all the time."""
+    """Why a host can't be used. `cause`: what stays of the words while the figures in them change."""
 
-    cause: Literal["no_report", "stale", "cordoned", "label", "memory", "gone", "not_named"]
     words: str
+    cause: str = ""
 
 
-NO_REPORT: Final = Exclusion("no_report", "no report of it")
+NO_REPORT: Final = Exclusion("no report of it")
 
 
 @dataclass(frozen=True, slots=True)

@@ -141,9 +141,13 @@ class Placer:
     # Answers: those about an incarnation that no longer counts change nothing
 
     def _start_answered(self, answer: StartAnswered) -> None:
-        if self._surplus.start_answered(answer.component, answer.incarnation):
-            return
         record = self._state.get(answer.component)
+        may_run = answer.result in ("ok", "unknown")
+        if record is None or record.state != "stopping" or record.incarnation != answer.incarnation:
+            may_run = True  # a refusal may be of another try to start it
+        if self._surplus.start_answered(answer.component, answer.incarnation, may_run=may_run):
+            self._lifecycle.surplus_ended(answer.component)
+            return
         if record is None:
             return
         move, answering = record.migration, (answer.incarnation, answer.host)

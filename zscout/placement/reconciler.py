@@ -180,7 +180,7 @@ class Reconciler:
                 else:
                     self.lifecycle.runs(record)
             elif record.state in ("waiting", "backing_off"):
-                record.state = "starting"
+                record.enter("starting")
                 self.state.start(record)
 
     def _listed_as_ended(
@@ -251,7 +251,7 @@ class Reconciler:
                     record.not_before = state.now + PROBE_TIMEOUT
                 state.wake(record, max(state.now, record.not_before))
             elif record.state == "stopping" and record.host == host:
-                state.wake(record, state.now)
+                self.lifecycle.end_incarnation(record)
             elif record.state == "running" and record.host == host:
                 # Its list or its token comes in a moment.
                 state.wake(record, state.now + GRACE)

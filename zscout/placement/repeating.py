@@ -61,10 +61,12 @@ class SurplusIncarnations:
             self._stop(component, incarnation, one)
         self._set_timer(component)
 
-    def start_answered(self, component: ComponentId, incarnation: Incarnation) -> bool:
+    def start_answered(self, component: ComponentId, incarnation: Incarnation, *, may_run: bool) -> bool:
         """Whether it is surplus. It is stopped once more: the first stop may have come before its start."""
         one = self._get(component, incarnation)
-        if one is not None and one.start_until is not None:
+        if one is not None and not may_run:
+            self.ended(component, incarnation)
+        elif one is not None and one.start_until is not None:
             one.start_until = None
             self._stop(component, incarnation, one)
             self._set_timer(component)

@@ -53,10 +53,20 @@ MAX_ENDED_INCARNATIONS: Final = 16
 HOSTS_NAMED: Final = 3
 """In the reason why there is no eligible host."""
 
+TRANSITIONS: Final[Mapping[ComponentState, frozenset[ComponentState]]] = {
+    "waiting": frozenset({"starting", "running", "backing_off", "stopping", "ended", "given_up"}),
+    "starting": frozenset({"waiting", "running", "backing_off", "stopping", "ended", "given_up"}),
+    "running": frozenset({"waiting", "moving", "backing_off", "stopping", "ended", "given_up"}),
+    "moving": frozenset({"running"}),
+    "backing_off": frozenset({"waiting", "starting", "running", "stopping", "ended", "given_up"}),
+    "stopping": frozenset({"waiting", "ended"}),
+    "ended": frozenset({"waiting"}),
+    "given_up": frozenset({"waiting", "ended"}),
+}
 OVER: Final[frozenset[ComponentState]] = frozenset({"ended", "given_up"})
 
-GONE: Final = Exclusion("gone", "its node is not there")
-NOT_NAMED: Final = Exclusion("not_named", "it is not among the hosts that the component asks for")
+GONE: Final = Exclusion("its node is not there")
+NOT_NAMED: Final = Exclusion("it is not among the hosts that the component asks for")
 
 SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
 """What is known of the source or the target of a migration."""
@@ -99,6 +109,7 @@ class ComponentRecord:
     component: ComponentId
     spec: ComponentSpec
     state: ComponentState = "waiting"
+    """Changed by `enter` alone."""
     incarnation: Incarnation = 0
     superseded: bool = False
     """The incarnation belongs to what was placed before under this name, and must not live."""
@@ -142,6 +153,12 @@ class ComponentRecord:
         default_factory=lambda: deque(maxlen=MAX_ENDED_INCARNATIONS)
     )
 
+    def enter(self, state: ComponentState) -> None:
+        """Raises ValueError for a transition that the table does not have."""
+        if state not in TRANSITIONS[self.state] and state != self.state:
+            raise ValueError(f"{self.component}: from {self.state} to {state}")
+        self.state = state
+
     def status(self) -> Placement:
         return Placement(
             component=self.component,
@@ -178,7 +195,14 @@ class EligibleHosts:
 
     def causes(self) -> dict[HostName, str]:
         """The same without the figures, which change all the time."""
-        return {host: why.cause for host, why in self.left_out.items()}
+        return {host: why.cause or why.words for host, why in self.left_out.items()}
+
+    def explain(self, reason: str) -> bool:
+        """Whether a reason of before names these hosts and causes."""
+        named = islice(sorted(self.causes().items()), HOSTS_NAMED)
+        return reason.startswith("no host will do") and all(
+            f"{host}: " in reason and cause in reason for host, cause in named
+        )
 
 
 class TimerKind(IntEnum):
