@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import rerun as rr
 
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.robot_run import NET, say
@@ -19,13 +17,6 @@ from zscout.services.recorder import robots as robot_panes
 from zscout.services.recorder.colours import DOING, OTHER
 from zscout.services.recorder.robot_tracker import MAX_WAITING, RATE, RateLimiter, RobotTracker
 from zscout.services.recorder.timeline import Timeline
-
-
-@pytest.fixture(autouse=True)
-def _strict() -> Iterator[None]:
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 def test_a_sender_s_last_word_comes_through_whatever_it_says(tmp_path: Path) -> None:

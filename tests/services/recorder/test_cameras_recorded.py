@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,13 +18,6 @@ from zscout.services.recorder.colours import PALE
 from zscout.services.recorder.robot_tracker import RobotTracker
 from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import Grant, Term
-
-
-@pytest.fixture(autouse=True)
-def _strict() -> Iterator[None]:
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 def test_a_picture_that_is_old_says_so(tmp_path: Path) -> None:

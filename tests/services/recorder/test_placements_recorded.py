@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-import rerun as rr
 
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -25,13 +24,6 @@ from zscout.services.recorder.timeline import HolderRow, Timeline
 from zscout.types import Term
 
 SCALARS = "Scalars:scalars"
-
-
-@pytest.fixture(autouse=True)
-def _strict() -> Iterator[None]:
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 def marks(path: Path) -> list[tuple[float, str, str, str]]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import rerun as rr
 
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -24,13 +22,6 @@ from zscout.messages import BehaviorSaid, BuildingPlan, BuildingPoses, FrameHead
 from zscout.services.recorder.process import RecorderJob, decode_job, encode_job
 from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
-
-
-@pytest.fixture(autouse=True)
-def _strict() -> Iterator[None]:
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 def test_how_many_pictures_a_recorder_takes_is_set_in_the_node_file(tmp_path: Path) -> None:

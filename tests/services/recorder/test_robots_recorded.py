@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
 import pytest
-import rerun as rr
 
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.robot_run import BUILDING, captions, png, poses, record
@@ -18,13 +16,6 @@ from zscout.messages import BuildingPlan, Placed
 from zscout.services.recorder.colours import DOING, HIDDEN, IN_THE_OPEN, OPERATOR, PERSON, bright
 from zscout.services.recorder.robot_tracker import RobotTracker
 from zscout.services.recorder.timeline import Timeline
-
-
-@pytest.fixture(autouse=True)
-def _strict() -> Iterator[None]:
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 def test_a_minute_reads_as_it_was(tmp_path: Path) -> None:

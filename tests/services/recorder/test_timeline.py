@@ -8,13 +8,11 @@ import subprocess
 import threading
 import time
 import warnings
-from collections.abc import Iterator
 from contextlib import suppress
 from itertools import combinations
 from pathlib import Path
 
 import pytest
-import rerun as rr
 from rerun.chunk import RrdReader
 
 from tests.services.recorder.paper_run import (
@@ -33,13 +31,6 @@ from zscout.services.recorder import drawing, hosts
 from zscout.services.recorder import timeline as module
 from zscout.services.recorder.colours import LINES, OPERATOR, PALETTE, STATES
 from zscout.services.recorder.timeline import OPERATOR_MARK, HolderRow, Timeline, TimelineError
-
-
-@pytest.fixture(autouse=True)
-def _strict() -> Iterator[None]:
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 def test_table_1_recorded_reads_as_table_2(tmp_path: Path) -> None:

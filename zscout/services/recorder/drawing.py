@@ -192,6 +192,11 @@ def clean_path(folder: str, name: str, depth: int = 4) -> str:
     return f"/{folder}/{'/'.join(part or '_' for part in parts)}"
 
 
+def with_detail(word: str, detail: str) -> str:
+    """The text of a bar; none without a word."""
+    return clean_text(f"{word} · {detail}" if word and detail else word)
+
+
 def clean_text(text: str, limit: int = MAX_STATE) -> str:
     """One line of at most `limit` characters, of letters that the viewer has: one that it lacks ends it."""
     line = " ".join(text[: 2 * limit].split())

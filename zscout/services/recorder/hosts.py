@@ -10,7 +10,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 import rerun as rr
 
 from zscout.services.recorder.colours import LINES, MARKS, STATES
-from zscout.services.recorder.drawing import Drawing, Lanes, clean_path, clean_text
+from zscout.services.recorder.drawing import Drawing, Lanes, clean_path, clean_text, with_detail
 
 MAX_HOSTS: Final = 256
 MAX_CURVES: Final = 32
@@ -114,9 +114,8 @@ class HostPane:
         self._drawing.arrange()
         shown = dict[str, tuple[str, int]]()
         for one in components:
-            text = clean_text(f"{one.component} · {one.state}" if one.state else one.component)
             colour = self._colour(one.component) if one.ready else STATES["waiting"]
-            shown[one.component] = text, colour
+            shown[one.component] = with_detail(one.component, one.state), colour
         self.lanes.show(at, host, shown)
 
     def mark(self, at: float, host: str, mark: Mark, component: str) -> None:

@@ -34,7 +34,7 @@ class PlacementTracker:
         self.timeline = timeline
         self.term: Term = NO_TERM
         self._components: dict[str, _Component] = {}
-        self._hosts: dict[str, dict[str, Running]] = {}
+        """The one that changed longest ago first."""
         self._cordoned: frozenset[str] = frozenset()
 
     def published(self, at: float, news: Placements) -> None:
@@ -62,10 +62,11 @@ class PlacementTracker:
             if placement.component not in fresher:
                 touched |= self._take(at, placement, news=seen or placement.component in self._components)
         for name in forgotten:
-            touched |= self._unseat(name)
-            self._components.pop(name, None)
+            known = self._components.pop(name, None)
+            touched |= _seats(known.placement).keys() if known is not None else set()
         for host in sorted(touched):
-            self.timeline.hosts.runs(at, host, list(self._hosts[host].values()))
+            seats = (_seats(known.placement).get(host) for known in self._components.values())
+            self.timeline.hosts.runs(at, host, filter(None, seats))
         cordoned, before = frozenset(news.cordoned), self._cordoned
         self._cordoned = cordoned
         for host in sorted(cordoned - before):
@@ -79,10 +80,9 @@ class PlacementTracker:
         if not all(NAME.fullmatch(name) for name in names):
             log.warning("the placer published a component or host with a bad name: %.200r", names)
             return set()
-        known = self._components.get(now.component)
-        touched = self._unseat(now.component)
+        known = self._components.pop(now.component, None)
         if known is None and len(self._components) >= MAX_FOLLOWED:
-            return touched
+            return set()
         before = known.placement if known is not None else None
         known = known or _Component(now)
         known.placement = now
@@ -90,10 +90,7 @@ class PlacementTracker:
         self._log_change(at, known, before, news=news)
         if now.state in ("running", "moving") and now.host is not None:
             known.ran, known.where = max(known.ran, now.incarnation), now.host
-        for host, running in _seats(now).items():
-            self._hosts.setdefault(host, {})[now.component] = running
-            touched.add(host)
-        return touched
+        return {*_seats(now), *(_seats(before) if before is not None else ())}
 
     def _log_change(self, at: float, known: _Component, before: Placement | None, *, news: bool) -> None:
         """The event, and the marks, if any."""
@@ -137,14 +134,6 @@ class PlacementTracker:
                 event(at, f"{name} is given up{why}", "ERROR")
             case _:
                 pass
-
-    def _unseat(self, name: str) -> set[str]:
-        """Takes a component out of the lanes; returns the hosts where it was."""
-        known = self._components.get(name)
-        seats = _seats(known.placement) if known is not None else {}
-        for host in seats:
-            self._hosts[host].pop(name, None)
-        return set(seats)
 
 
 def _seats(placement: Placement) -> dict[str, Running]:

@@ -16,7 +16,7 @@ from zscout.drivers.image_size import jpeg_size
 from zscout.messages import Box
 from zscout.services.recorder.blueprint import RobotLayout
 from zscout.services.recorder.colours import ALERT, DOING, LINES, OTHER, PALE, bright
-from zscout.services.recorder.drawing import Drawing, Lanes, clean_path, clean_text
+from zscout.services.recorder.drawing import Drawing, Lanes, clean_path, clean_text, with_detail
 from zscout.services.recorder.floor_plan import FloorPlan
 
 MAX_CAMERAS: Final = 32
@@ -136,7 +136,7 @@ class RobotPanes:
         if not doing and known is None:
             return
         word = clean_text(doing)
-        text = clean_text(f"{doing} · {detail}" if doing and detail else doing)
+        text = with_detail(doing, detail)
         # A text that had lost its colour would get any; the word alone says as much in the right one.
         if known is not None and len(known) >= DETAILS and text not in known:
             text = word

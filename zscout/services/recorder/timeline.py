@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from zscout.config.strict import BadInput
 from zscout.services.recorder.blueprint import APPLICATION, LIVE_HOST_ROWS, LIVE_ROWS, NO_ROBOTS, blueprint
 from zscout.services.recorder.colours import OPERATOR, OTHER, PALETTE, STATES
-from zscout.services.recorder.drawing import Drawing, Lanes, clean_text
+from zscout.services.recorder.drawing import Drawing, Lanes, clean_text, with_detail
 from zscout.services.recorder.hosts import HostPane
 from zscout.services.recorder.robots import RobotPanes
 
@@ -116,7 +116,7 @@ class Timeline(Drawing):
         `detail` says more in the same bar, as why it waits. An empty `state` ends the lane."""
         self._colour(at, arc)
         if arc in self._arcs:
-            text = clean_text(f"{state} · {detail}" if state and detail else state)
+            text = with_detail(state, detail)
             self._arc_lanes.show(at, arc, {text: (text, STATES.get(state, OTHER))})
 
     def close(self) -> None:
