@@ -37,7 +37,8 @@ from zscout.drivers.packets import (
     StopPacket,
     encode,
 )
-from zscout.drivers.transmit_queue import MAX_WAITING, OutgoingPacket, QueueFull, TransmitQueue
+from zscout.drivers.transmit_queue import MAX_WAITING, OutgoingPacket, TransmitQueue
+from zscout.mesh import Refused
 from zscout.types import (
     NO_TERM,
     SECOND,
@@ -371,16 +372,16 @@ def test_a_robot_is_halted_at_the_end_of_the_hold_under_which_it_was_last_driven
 def test_what_a_share_has_no_room_for_is_refused_in_words() -> None:
     queue = TransmitQueue(line_rate(9600))
     queue.join(place(1), Share(Fraction(0), Fraction(10)), 0)
-    with pytest.raises(ValueError, match="command_rate 0"):
+    with pytest.raises(Refused, match="command_rate 0"):
         queue.offer(place(1), grant(1), drive(1), 0)
     queue.join(place(2), Share(Fraction(1), Fraction(8)), 0)
     queue.offer(place(2), grant(2), RadioCamera(1, 1), 0)
-    with pytest.raises(ValueError, match="packet_size = 10"):
+    with pytest.raises(Refused, match="packet_size = 10"):
         queue.offer(place(2), grant(2), drive(1), 0)
     queue.join(place(3), Share(Fraction(1), Fraction(10)), 0)
     for robot in range(MAX_WAITING):
         queue.offer(place(3), grant(3), drive(robot), 0)
-    with pytest.raises(QueueFull):
+    with pytest.raises(Refused, match="too many packets"):
         queue.offer(place(3), grant(3), drive(200), 0)
     queue.offer(place(3), grant(3), drive(1, 0.5), 0)  # it takes the place of its own
 

@@ -21,7 +21,7 @@ from zscout.drivers.commands import RadioHalt, RadioStop, radio_command
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.drivers.packets import MAX_PACKET, HaltPacket, StopPacket, encode
 from zscout.drivers.serial_line import CLOSE_TIMEOUT, DEPTH, SerialLine
-from zscout.drivers.transmit_queue import QueueFull, TransmitQueue
+from zscout.drivers.transmit_queue import TransmitQueue
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
@@ -50,8 +50,8 @@ class RadioDriver(Driver):
         self._air = TransmitQueue(self._rate, first_number=random.randrange(256))  # noqa: S311
         self._robots: dict[int, str] = {}
         """Which robot RC an id belongs to: the first that commanded it, while it is there."""
-        self._up = False
-        self._why = "its line is not open yet"
+        self._down = "its line is not open yet"
+        """Why nothing can be sent; empty while the line is open."""
         self._known = asyncio.Event()
         """Whether there is a line was found out."""
         self._quiet = asyncio.Event()
@@ -71,11 +71,11 @@ class RadioDriver(Driver):
         try:
             await asyncio.wait_for(self._known.wait(), OPENING)
         except TimeoutError:
-            rc.fail(self._why)
+            rc.fail(self._down)
 
     async def close(self) -> None:
         """Halts that are not out yet still go out, if the line works."""
-        if self._up and self._air.urgent:
+        if not self._down and self._air.urgent:
             self._quiet.clear()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._quiet.wait(), CLOSE_TIMEOUT)
@@ -114,7 +114,7 @@ class RadioDriver(Driver):
         self._leave(holder.place)
 
     async def safe(self) -> None:
-        for place in self._air.places():
+        for place in list(self._air.members):
             self._leave(place)
 
     def _leave(self, place: Place) -> None:
@@ -128,16 +128,11 @@ class RadioDriver(Driver):
         owner = self._robots.get(order.robot)
         if owner is not None and owner not in holder.rcs and self._is_offered(owner):
             raise Refused("not_yours", f"robot {order.robot} is {owner}, which this ARC does not hold")
-        if not self._up:
-            raise Refused("down", self._why)
+        if self._down:
+            raise Refused("down", self._down)
         if isinstance(order, RadioStop | RadioHalt):
             return self._send_urgent(order)
-        try:
-            after = self._air.offer(holder.place, holder.grant, order, self._rc.mesh.now())
-        except QueueFull:
-            raise Refused("busy", "too many packets of this ARC wait; send fewer") from None
-        except ValueError as error:
-            raise Refused("bad_command", str(error)) from None
+        after = self._air.offer(holder.place, holder.grant, order, self._rc.mesh.now())
         self._pump()
         return {"after": after / SECOND}
 
@@ -154,8 +149,8 @@ class RadioDriver(Driver):
         owner = self._robots.get(order.robot)
         if owner is None or not self._is_offered(owner):
             self._robots[order.robot] = order.rc
-        if not self._up:
-            raise Refused("down", self._why)
+        if self._down:
+            raise Refused("down", self._down)
         return self._send_urgent(order)
 
     def _is_offered(self, rc: str) -> bool:
@@ -176,7 +171,7 @@ class RadioDriver(Driver):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if not self._up:
+        if self._down:
             return
         while self._outstanding < DEPTH:
             now = self._rc.mesh.now()
@@ -202,15 +197,15 @@ class RadioDriver(Driver):
         return held is not None and holds.check(grant, held.holder.client, self._rc.mesh.now()) is None
 
     def _line_up(self) -> None:
-        self._up, self._why, self._outstanding = True, "", 0
+        self._down, self._outstanding = "", 0
         self._known.set()
         if self._rc.health != "ok":
             self._rc.recover()
         self._pump()
 
     def _line_down(self, why: str) -> None:
-        self._losses += self._up
-        self._up, self._why = False, why
+        self._losses += not self._down
+        self._down = why
         self._known.set()
         self._quiet.set()
         self._rc.fail(why)

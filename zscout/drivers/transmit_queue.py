@@ -32,6 +32,7 @@ from zscout.drivers.packets import (
     StopPacket,
     encode,
 )
+from zscout.mesh import Refused
 from zscout.types import SECOND, Grant, Ns, Place
 
 MAX_WAITING: Final = 64
@@ -40,10 +41,6 @@ TIMES: Final = 3
 """How often a packet that is repeated goes out in all."""
 SPACING: Final[Ns] = SECOND // 20
 """From one to the next: longer than most bursts of interference, short against a person's patience."""
-
-
-class QueueFull(Exception):
-    """A holder has too much waiting."""
 
 
 @dataclass(slots=True)
@@ -169,7 +166,7 @@ class TransmitQueue:
         self._ahead = MAX_PACKET * self._ns_per_byte
         """How much earlier than the line is free the next packet is written: one waits in the kernel."""
         self._free_at = Fraction(0)
-        self._members: dict[Place, _Member] = {}
+        self.members: dict[Place, _Member] = {}
         self._queue: deque[QueuedPacket] = deque()
         self._urgent: dict[int, tuple[type[StopPacket] | type[HaltPacket], Ns]] = {}
         self._robots: dict[int, _Robot] = {}
@@ -183,46 +180,39 @@ class TransmitQueue:
 
     def join(self, place: Place, share: Share, now: Ns) -> None:
         """A holder begins. On a busy line it earns its first packet, so that the bound holds for all."""
-        if place not in self._members:
-            self._members[place] = _Member(share, now, full=not self._queue and not self._urgent)
+        if place not in self.members:
+            self.members[place] = _Member(share, now, full=not self._queue and not self._urgent)
             self._fit_reserve()
 
     def leave(self, place: Place) -> set[int]:
         """A holder is gone, and what waits for it. Returns the robots that it made do something."""
-        if place not in self._members:
+        if place not in self.members:
             return set()
         self.dropped += self._remove(lambda waiting: waiting.place == place)
-        member = self._members.pop(place)
+        member = self.members.pop(place)
         self._fit_reserve()
         return member.robots
 
-    def places(self) -> list[Place]:
-        """Who has joined and not left."""
-        return list(self._members)
-
     def _fit_reserve(self) -> None:
-        self._reserve.size = Fraction(urgent_burst(len(self._members)))
+        self._reserve.size = Fraction(urgent_burst(len(self.members)))
 
     # What is to be sent
 
     def offer(self, place: Place, grant: Grant, order: RadioDrive | RadioCamera, now: Ns) -> Ns:
         """A drive or camera packet of a holder that has joined. Returns in about how many ns it is through.
 
-        Raises QueueFull, and ValueError with a reason in words where the holder's share has no room for it.
-        """
-        member = self._members[place]
+        Raises Refused where too much of the holder waits, or its share has no room for such a packet."""
+        member = self.members[place]
         waiting = QueuedPacket(place, grant, order, now)
         if member.bucket is None:
-            raise ValueError("this ARC asked for command_rate 0: only stops and halts go out")
+            raise Refused("bad_command", "this ARC asked for command_rate 0: only stops and halts go out")
         if waiting.size > member.share.size:
-            raise ValueError(
-                f"this packet has {waiting.size} bytes, and this ARC asked for {float(member.share.size):g}; "
-                f"ask for packet_size = {MAX_PACKET}"
-            )
+            sizes = f"{waiting.size} bytes, and this ARC asked for {float(member.share.size):g}"
+            raise Refused("bad_command", f"this packet has {sizes}; ask for packet_size = {MAX_PACKET}")
         self._release(now)
         if isinstance(order, RadioDrive):
             # Driven under a newer hold: the end of an older one that is learned of late halts it no more.
-            for other in self._members.values():
+            for other in self.members.values():
                 other.robots.discard(order.robot)
         member.robots.add(order.robot)
         for earlier in chain(self._queue, member.waiting):
@@ -234,7 +224,7 @@ class TransmitQueue:
                 break
         else:
             if len(member.waiting) >= MAX_WAITING:
-                raise QueueFull
+                raise Refused("busy", "too many packets of this ARC wait; send fewer")
             member.waiting.append(waiting)
             self._release(now)
         if waiting.queued:
@@ -263,7 +253,7 @@ class TransmitQueue:
         """Takes out what is `gone` of all that waits; returns how much that was."""
         before = self.waiting
         self._queue = deque(waiting for waiting in self._queue if not gone(waiting))
-        for member in self._members.values():
+        for member in self.members.values():
             member.waiting = deque(waiting for waiting in member.waiting if not gone(waiting))
         return before - self.waiting
 
@@ -304,7 +294,7 @@ class TransmitQueue:
             else:
                 packet = CameraPacket(order.robot, number, order.channel)
             return self._transmit(packet, waiting.entered, now)
-        for member in self._members.values():
+        for member in self.members.values():
             # Nothing waits: whoever joined while something did may have its packet now.
             if member.earning and member.bucket is not None:
                 member.earning = False
@@ -315,7 +305,7 @@ class TransmitQueue:
         """When to call `next` again; None: not before something else happens."""
         times = [Fraction(now)] if self._urgent or self._queue else []
         times += [self._may_repeat(repeat) for _, repeat in self._repeats()]
-        times += [at for member in self._members.values() if (at := member.enters_at()) is not None]
+        times += [at for member in self.members.values() if (at := member.enters_at()) is not None]
         return math.ceil(max(self._free_at - self._ahead, min(times))) if times else None
 
     @property
@@ -326,11 +316,11 @@ class TransmitQueue:
     @property
     def waiting(self) -> int:
         """Drive and camera packets that have not gone out."""
-        return len(self._queue) + sum(len(member.waiting) for member in self._members.values())
+        return len(self._queue) + sum(len(member.waiting) for member in self.members.values())
 
     def _release(self, now: Ns) -> None:
         """Lets into the queue what the buckets let through up to now, in the order of its times."""
-        entering = [waiting for member in self._members.values() for waiting in member.enter(now)]
+        entering = [waiting for member in self.members.values() for waiting in member.enter(now)]
         self._queue.extend(sorted(entering, key=lambda waiting: waiting.entered))
 
     def _repeats(self) -> Iterator[tuple[_Robot, _Repeat]]:
