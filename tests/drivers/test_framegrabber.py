@@ -8,14 +8,19 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.drivers.mjpeg import numbered
-from zscout.drivers.framegrabber import RATE_SPAN, FramegrabberDriver, FrameMeter, FramePacer, encode, is_grey
+from zscout.drivers.framegrabber import RATE_SPAN, FramegrabberDriver, FrameMeter, encode, is_grey, pace_of
 from zscout.messages import FrameHead
+from zscout.types import SECOND, Ns
+
+
+def ns(at: float) -> Ns:
+    return round(at * SECOND)
 
 
 @pytest.mark.parametrize("source", [1, 5, 9, 10, 10.2, 11, 14, 15, 20, 25, 29.97, 30, 60, 240])
 def test_a_pace_admits_no_more_than_its_rate_and_little_less(source: float) -> None:
-    pace = FramePacer(10)
-    admitted = [at for at in (n / source for n in range(int(60 * source))) if pace.admits(at)]
+    pace = pace_of(10)
+    admitted = [at for at in (n / source for n in range(int(60 * source))) if pace.admits(1, ns(at))]
     expected = 60 * min(10.0, source)
     assert 0.93 * expected <= len(admitted) <= expected + 1
     # Never more than two too close to each other, never a hole of more than one picture.
@@ -28,16 +33,16 @@ def test_a_pace_admits_no_more_than_its_rate_and_little_less(source: float) -> N
 
 
 def test_uneven_pictures_at_the_very_rate_are_all_admitted() -> None:
-    pace = FramePacer(10)
+    pace = pace_of(10)
     rng = np.random.default_rng(1)
     jitter = rng.uniform(-0.02, 0.02, 600)
-    assert all(pace.admits(n / 10 + late) for n, late in enumerate(jitter))
+    assert all(pace.admits(1, ns(n / 10 + late)) for n, late in enumerate(jitter))
 
 
 def test_after_a_pause_there_is_no_burst() -> None:
-    pace = FramePacer(10)
-    assert pace.admits(0)
-    admitted = [n for n in range(101) if pace.admits(60 + n / 100)]
+    pace = pace_of(10)
+    assert pace.admits(1, 0)
+    admitted = [n for n in range(101) if pace.admits(1, ns(60 + n / 100))]
     # 10 in a second, the one at its beginning, and the half interval that one may be early.
     assert admitted[0] == 0
     assert 10 <= len(admitted) <= 11

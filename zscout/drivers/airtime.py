@@ -101,22 +101,28 @@ def objection(rate: Fraction, bound: Fraction, shares: Iterable[Share]) -> str:
 
 
 class Bucket:
-    """A token bucket in bytes, of a positive rate. Times are whole ns going in, exact ns coming out."""
+    """A token bucket of bytes, or frames, at a positive rate a second. Times are whole ns going in, exact ns
+    coming out."""
 
-    __slots__ = ("_full_at", "_ns_per_byte", "size")
-
-    def __init__(self, size: Fraction, bytes_per_second: Fraction, now: Ns, *, full: bool = True) -> None:
+    def __init__(self, size: Fraction, rate: Fraction, now: Ns, *, full: bool = True) -> None:
         self.size = size
-        self._ns_per_byte = SECOND / bytes_per_second
-        self._full_at = now + (0 if full else size * self._ns_per_byte)
+        self._period = SECOND / rate
+        self._full_at = now + (0 if full else size * self._period)
 
     def ready(self, needed: int) -> Fraction:
-        """When there is enough for `needed` bytes (at most `size`)."""
-        return Fraction(self._full_at - (self.size - needed) * self._ns_per_byte)
+        """When there is enough for `needed` (at most `size`)."""
+        return Fraction(self._full_at - (self.size - needed) * self._period)
 
     def take(self, needed: int, at: Fraction | Ns) -> None:
-        """Takes `needed` bytes out at `at`; more than there is leaves it in debt."""
-        self._full_at = max(self._full_at, at) + needed * self._ns_per_byte
+        """Takes `needed` out at `at`; more than there is leaves it in debt."""
+        self._full_at = max(self._full_at, at) + needed * self._period
+
+    def admits(self, needed: int, now: Ns) -> bool:
+        """Takes `needed` out if there is enough; whether there was."""
+        if self.ready(needed) > now:
+            return False
+        self.take(needed, now)
+        return True
 
     def fill(self, now: Ns) -> None:
         self._full_at = min(self._full_at, now)

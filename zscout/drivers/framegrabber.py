@@ -15,17 +15,19 @@ import statistics
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zscout.drivers.airtime import Bucket
 from zscout.drivers.capture import Capture, CapturedFrame, seconds
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.mesh import Refused
 from zscout.messages import MAX_FRAME, Figures, FrameHead, Holder
-from zscout.types import Grant
+from zscout.types import SECOND, Grant
 
 if TYPE_CHECKING:
     from zscout.mesh.frames import FramePublisher
@@ -42,7 +44,7 @@ MAX_AGE: Final = 1.0
 """Seconds; an older picture is not published as if it were new."""
 PATIENCE: Final = 0.25
 """Seconds from one look at whether it should stop to the next, where no pictures come."""
-EARLY: Final = 0.5
+EARLY: Final = Fraction(1, 2)
 """Share of the interval between two frames by which one may come early."""
 GREY: Final = 3
 """Difference of the colours up to which a picture is grey: what decoding makes of a grey picture that was
@@ -270,23 +272,11 @@ class FramegrabberDriver(Driver):
         return found
 
 
-class FramePacer:
-    """At most `rate` frames a second without holding any back: one that comes too early is passed over.
-
-    The generic cell rate algorithm (ITU-T I.371, annex A) with a tolerance of EARLY intervals, so that a
-    source that is a little faster, or uneven, loses no more than what is too much. Times are seconds.
-    """
-
-    def __init__(self, rate: float) -> None:
-        self._period = 1 / rate
-        self._due = float("-inf")
-
-    def admits(self, now: float) -> bool:
-        """Whether a picture that is there `now` is published."""
-        if now < self._due - EARLY * self._period:
-            return False
-        self._due = max(self._due, now) + self._period
-        return True
+def pace_of(rate: float) -> Bucket:
+    """Admits at most `rate` frames a second without holding any back: one that comes too early is skipped.
+    Its tolerance of EARLY intervals keeps a source that is a little faster, or uneven, from losing more than
+    its surplus (the generic cell rate algorithm, ITU-T I.371, annex A)."""
+    return Bucket(1 + EARLY, Fraction(rate), 0)
 
 
 class FrameMeter:
@@ -339,7 +329,7 @@ class FramePump:
         self._publisher, self._capture, self._meter = publisher, capture, meter
         self._first, self._grant, self._source = first, grant, source
         self._quality = quality
-        self._pace = FramePacer(rate)
+        self._pace = pace_of(rate)
         self._after = capture.number
         self._lock = threading.Lock()
         self._stopped = False
@@ -364,7 +354,7 @@ class FramePump:
                     return
                 continue
             self._after = captured.number
-            if self._publisher.watched and self._pace.admits(captured.time):
+            if self._publisher.watched and self._pace.admits(1, round(captured.time * SECOND)):
                 self._publish(captured)
 
     def _publish(self, captured: CapturedFrame) -> None:
