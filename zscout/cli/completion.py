@@ -48,64 +48,55 @@ def kinds(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list
     return [name for name in installed_kinds() if name.startswith(incomplete)]
 
 
-def components(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+def _on_mesh(
+    find: Callable[[Mesh, str], Awaitable[Iterable[str]]],
+) -> Callable[[click.Context, click.Parameter, str], list[str]]:
+    """Offers what `find(mesh, name of the parameter)` finds, but what is given; nothing without a mesh."""
+
+    def offered(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+        from zscout.cli import common
+        from zscout.config.fleet import fleet_from_env, load_fleet
+        from zscout.config.strict import BadInput
+        from zscout.keyexpr import BadName
+        from zscout.mesh import MeshError
+
+        async def look() -> Iterable[str]:
+            # Click has not run anything yet, so the fleet is only an option.
+            file = ctx.find_root().params.get("fleet")
+            fleet = load_fleet(Path(os.fspath(file))) if file is not None else fleet_from_env()
+            async with common.connected("complete", fleet, need_rcm=False) as client:
+                # A mesh that was just joined shows nobody yet.
+                with suppress(common.NobodyThere, TimeoutError):
+                    async with asyncio.timeout(LOOK):
+                        await common.see_rcm(client)
+                return await find(client.mesh, param.name or "")
+
+        try:
+            names = asyncio.run(look())
+        except (BadInput, BadName, MeshError):
+            return []
+        given = ctx.params.get(param.name or "")
+        taken = given if isinstance(given, tuple) else ()
+        return sorted(name for name in names if name.startswith(incomplete) and name not in taken)
+
+    return offered
+
+
+@_on_mesh
+async def components(mesh: Mesh, _parameter: str) -> Iterable[str]:
     from zscout.messages import ListPlacements, Placements
 
-    async def find(mesh: Mesh) -> Iterable[str]:
-        listed = await mesh.ask_one(mesh.keys.placer, ListPlacements(), Placements, timeout=LOOK)
-        return {one.component for one in listed.message.components} if listed and listed.message else ()
-
-    return _offered(ctx, param, incomplete, find)
+    listed = await mesh.ask_one(mesh.keys.placer, ListPlacements(), Placements, timeout=LOOK)
+    return {one.component for one in listed.message.components} if listed and listed.message else ()
 
 
-def hosts(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    from zscout.keyexpr import Role
-
-    async def find(mesh: Mesh) -> Iterable[str]:
-        return {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK)}
-
-    return _offered(ctx, param, incomplete, find)
+@_on_mesh
+async def hosts(mesh: Mesh, _parameter: str) -> Iterable[str]:
+    return {token.host for token in await mesh.living(mesh.keys.alive_any("node"), timeout=LOOK)}
 
 
-def rcs(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    """RCs of the kind that the parameter is called by."""
-    from zscout.keyexpr import Role
-
-    async def find(mesh: Mesh) -> Iterable[str]:
-        found = await mesh.living(mesh.keys.alive_any(Role.RC), timeout=LOOK)
-        return {token.name for token in found if token.name.startswith(f"{param.name}/")}
-
-    return _offered(ctx, param, incomplete, find)
-
-
-def _offered(
-    ctx: click.Context,
-    param: click.Parameter,
-    incomplete: str,
-    find: Callable[[Mesh], Awaitable[Iterable[str]]],
-) -> list[str]:
-    """What is found and not yet given; nothing where there is no mesh."""
-    from zscout.cli import common
-    from zscout.config.fleet import fleet_from_env, load_fleet
-    from zscout.config.strict import BadInput
-    from zscout.keyexpr import BadName
-    from zscout.mesh import MeshError
-
-    async def look() -> Iterable[str]:
-        # Click has not run anything yet, so the fleet is only an option.
-        file = ctx.find_root().params.get("fleet")
-        fleet = load_fleet(Path(os.fspath(file))) if file is not None else fleet_from_env()
-        async with common.connected("complete", fleet, need_rcm=False) as client:
-            # A mesh that was just joined shows nobody yet.
-            with suppress(common.NobodyThere, TimeoutError):
-                async with asyncio.timeout(LOOK):
-                    await common.see_rcm(client)
-            return await find(client.mesh)
-
-    try:
-        names = asyncio.run(look())
-    except (BadInput, BadName, MeshError):
-        return []
-    given = ctx.params.get(param.name or "")
-    taken = given if isinstance(given, tuple) else ()
-    return sorted(name for name in names if name.startswith(incomplete) and name not in taken)
+@_on_mesh
+async def rcs(mesh: Mesh, kind: str) -> Iterable[str]:
+    """Of the kind that the parameter is called by."""
+    names = {token.name for token in await mesh.living(mesh.keys.alive_any("rc"), timeout=LOOK)}
+    return {name for name in names if name.startswith(f"{kind}/")}

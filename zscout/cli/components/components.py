@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,7 +17,7 @@ from zscout.cli.components.placing import (
     unknown_here,
 )
 from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView
-from zscout.cli.fleet.watching import Overview, display, pause, show_once
+from zscout.cli.fleet.watching import Overview, show
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role
 from zscout.messages import ComponentList, ComponentUse, ListComponents, Placement
@@ -88,6 +87,11 @@ class Listing:
             return all(host is not None and (host.load or not host.has(Role.LOAD)) for host in found)
 
         await self.fleet_view.until(reported, FIND_LOADS)
+        await self.find_ages()
+
+    async def refresh(self) -> None:
+        # Without a leader what was known last is shown on.
+        await self.placer.try_refresh()
         await self.find_ages()
 
     async def find_ages(self) -> None:
@@ -185,25 +189,10 @@ async def _list(name: str | None, *, watch: bool, as_json: bool) -> int:
         placer = stack.enter_context(listing.placer)
         stack.enter_context(listing.fleet_view)
         await listing.find()
-        if not watch:
-            show_once(listing, as_json=as_json)
-            tail = tail_of(placer.placements[name]) if name is not None and not as_json else []
-            for line in ["\nThe end of its output:", *tail] if tail else []:
+        await show(listing, placer.changed, listing.refresh, watch=watch, as_json=as_json)
+        if name is not None and not (watch or as_json) and (tail := tail_of(placer.placements[name])):
+            for line in ("\nThe end of its output:", *tail):
                 terminal.print_line(line)
-            return 0
-        stop = asyncio.Event()
-
-        def end() -> None:
-            stop.set()
-            placer.changed.set()
-
-        show = stack.enter_context(display(as_json=as_json, end=end))
-        while not stop.is_set():
-            show(listing)
-            await pause(placer.changed, stop)
-            # Without a leader what was known last is shown on.
-            await placer.try_refresh()
-            await listing.find_ages()
     return 0
 
 

@@ -87,27 +87,25 @@ class Progress(terminal.LiveLine):
 # Words
 
 
+STANDING: Final = {
+    "running": "runs on {host}",
+    "starting": "is starting on {host}",
+    "waiting": "waits for a host{why}",
+    "moving": "is moving from {host} to {to}",
+    "backing_off": "failed, and will be started again{why}",
+    "stopping": "is being stopped on {host}",
+    "ended": "has ended{why}",
+    "given_up": "is given up{why}",
+}
+
+
 def standing(placement: Placement) -> str:
     """How a component stands, in words that follow its name."""
-    why = f": {placement.reason}" if placement.reason else ""
-    where = placement.host or "no host"
-    match placement.state:
-        case "running":
-            return f"runs on {where}"
-        case "starting":
-            return f"is starting on {where}"
-        case "waiting":
-            return f"waits for a host{why}"
-        case "moving":
-            return f"is moving from {where} to {placement.to or 'another host'}"
-        case "backing_off":
-            return f"failed, and will be started again{why}"
-        case "stopping":
-            return f"is being stopped on {where}"
-        case "ended":
-            return f"has ended{why}"
-        case "given_up":
-            return f"is given up{why}"
+    return STANDING[placement.state].format(
+        host=placement.host or "no host",
+        to=placement.to or "another host",
+        why=f": {placement.reason}" if placement.reason else "",
+    )
 
 
 def unknown(name: str, known: Iterable[str]) -> common.Failed:

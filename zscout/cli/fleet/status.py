@@ -13,7 +13,7 @@ from msgspec import structs
 
 from zscout.cli import common
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
-from zscout.cli.fleet.watching import Overview, display, pause, show_once
+from zscout.cli.fleet.watching import Overview, show
 from zscout.keyexpr import Role, Token
 from zscout.messages import Notice, RcmState
 from zscout.terminal import Table, many, span
@@ -49,12 +49,6 @@ def status(watch: bool, every: bool, as_json: bool) -> None:
 
 
 async def _status(every: bool, *, watch: bool, as_json: bool) -> None:
-    news, stop = asyncio.Event(), asyncio.Event()
-
-    def end() -> None:
-        stop.set()
-        news.set()
-
     async with AsyncExitStack() as stack:
         client = await stack.enter_async_context(common.connected("status", need_rcm=False))
         fleet_view = stack.enter_context(FleetView(client))
@@ -65,20 +59,12 @@ async def _status(every: bool, *, watch: bool, as_json: bool) -> None:
         except common.NobodyThere as error:  # hosts and RCs are shown all the same
             nobody = error
         await standing.devices.ask()
-        if not watch:
-            show_once(standing, as_json=as_json)
-            if nobody is not None:
-                raise nobody
-            return
         # Whatever becomes of an ARC is published to its client.
+        news = asyncio.Event()
         client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
-        show = stack.enter_context(display(as_json=as_json, end=end))
-        while not stop.is_set():
-            show(standing)
-            await pause(news, stop)
-            standing.state = await client.state(forecast=True)
-            fleet_view.forget_gone()
-            await standing.devices.ask()
+        await show(standing, news, standing.refresh, watch=watch, as_json=as_json)
+        if nobody is not None and not watch:
+            raise nobody
 
 
 @dataclass(slots=True)
@@ -89,6 +75,11 @@ class Standing:
     state: RcmState | None
     devices: Devices
     every: bool
+
+    async def refresh(self) -> None:
+        self.state = await self.fleet_view.client.state(forecast=True)
+        self.fleet_view.forget_gone()
+        await self.devices.ask()
 
     # For people
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from zscout import terminal
 from zscout.cli import common
@@ -75,18 +75,39 @@ class Displayed(Protocol):
         """For `--json`."""
 
 
-Show: TypeAlias = Callable[[Displayed], None]
+async def show(
+    shown: Displayed,
+    news: asyncio.Event,
+    refresh: Callable[[], Awaitable[None]],
+    *,
+    watch: bool,
+    as_json: bool,
+) -> None:
+    """Shows it once; with `watch` again as there is news and each second, after a `refresh`, until somebody
+    presses q."""
+    if not watch:
+        if as_json:
+            terminal.print_json(shown.as_object())
+        else:
+            shown.overview().print()
+        return
+    stop = asyncio.Event()
 
+    def end() -> None:
+        stop.set()
+        news.set()
 
-def show_once(shown: Displayed, *, as_json: bool) -> None:
-    if as_json:
-        terminal.print_json(shown.as_object())
-    else:
-        shown.overview().print()
+    with _display(as_json=as_json, end=end) as draw:
+        while not stop.is_set():
+            draw(shown)
+            await common.within(EVERY, news)
+            await common.within(HASTE, stop)
+            news.clear()
+            await refresh()
 
 
 @contextmanager
-def display(*, as_json: bool, end: Callable[[], None]) -> Iterator[Show]:
+def _display(*, as_json: bool, end: Callable[[], None]) -> Iterator[Callable[[Displayed], None]]:
     """Gives what shows it each time; calls `end` when somebody presses q."""
     if as_json:
         yield lambda shown: terminal.print_json(shown.as_object())
@@ -104,18 +125,11 @@ def display(*, as_json: bool, end: Callable[[], None]) -> Iterator[Show]:
             yield lambda shown: live.draw(shown.overview().picture(hint))
 
 
-async def pause(news: asyncio.Event, stop: asyncio.Event) -> None:
-    """Until the next refresh is due."""
-    await common.within(EVERY, news)
-    await common.within(HASTE, stop)
-    news.clear()
-
-
-def _blocks() -> Show:
+def _blocks() -> Callable[[Displayed], None]:
     """Prints a block where something has changed that is not a load or a span of time."""
     last: Any = None
 
-    def show(shown: Displayed) -> None:
+    def draw(shown: Displayed) -> None:
         nonlocal last
         before, last = last, lasting(shown.as_object())
         if before is not None and last != before:
@@ -123,7 +137,7 @@ def _blocks() -> Show:
         if last != before:
             shown.overview().print()
 
-    return show
+    return draw
 
 
 def lasting(value: Any) -> Any:
