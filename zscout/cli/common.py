@@ -12,8 +12,9 @@ import signal
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
 from contextlib import asynccontextmanager, suppress
 from decimal import Decimal
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
 import click
 
@@ -33,6 +34,7 @@ STATE_TRIES: Final = 3
 MAX_NAMED: Final = 8
 """Names that are listed of those known."""
 
+P = ParamSpec("P")
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -90,6 +92,16 @@ def run(main: Coroutine[Any, Any, T]) -> T:
         if not got:
             raise
         raise Interrupted(got[0]) from None
+
+
+def runs(main: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
+    """Lets a coroutine function be a command's."""
+
+    @wraps(main)
+    def command(*args: P.args, **kwargs: P.kwargs) -> T:
+        return run(main(*args, **kwargs))
+
+    return command
 
 
 # Joining the mesh

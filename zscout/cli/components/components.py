@@ -9,13 +9,7 @@ import click
 
 from zscout import terminal
 from zscout.cli import common, completion
-from zscout.cli.components.placing import (
-    COMPONENT,
-    placement_object,
-    placer_of,
-    tail_of,
-    unknown_here,
-)
+from zscout.cli.components.placing import COMPONENT, placement_object, placer_of, tail_of, unknown_here
 from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView
 from zscout.cli.fleet.watching import Overview, show
 from zscout.config.strict import BadInput
@@ -44,7 +38,8 @@ STYLES: Final = {
 @click.option("--kinds", is_flag=True, help="List what can be started, and on which hosts.")
 @click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
-def components(name: str | None, kinds: bool, watch: bool, as_json: bool) -> int:
+@common.runs
+async def components(name: str | None, kinds: bool, watch: bool, as_json: bool) -> None:
     """List the components of the fleet: where each runs, since when, what it uses, and why it is there.
 
     Ended ones are listed for an hour. RESTARTS are those in a row, CORES and MEMORY what it uses with all its
@@ -61,8 +56,18 @@ def components(name: str | None, kinds: bool, watch: bool, as_json: bool) -> int
     if kinds and (name is not None or watch):
         raise BadInput("--kinds lists what can be started; leave NAME and --watch out")
     if kinds:
-        return common.run(_kinds(as_json=as_json))
-    return common.run(_list(name, watch=watch, as_json=as_json))
+        await _kinds(as_json=as_json)
+        return
+    async with AsyncExitStack() as stack:
+        client = await stack.enter_async_context(common.connected("components"))
+        listing = Listing(client, name)
+        placer = stack.enter_context(listing.placer)
+        stack.enter_context(listing.fleet_view)
+        await listing.find()
+        await show(listing, placer.changed, listing.refresh, watch=watch, as_json=as_json)
+        if name is not None and not (watch or as_json) and (tail := tail_of(placer.placements[name])):
+            for line in ("\nThe end of its output:", *tail):
+                terminal.print_line(line)
 
 
 class Listing:
@@ -182,21 +187,7 @@ async def ask_nodes(client: Client, asked: ListComponents) -> list[ComponentList
     return sorted(lists, key=lambda one: one.host)
 
 
-async def _list(name: str | None, *, watch: bool, as_json: bool) -> int:
-    async with AsyncExitStack() as stack:
-        client = await stack.enter_async_context(common.connected("components"))
-        listing = Listing(client, name)
-        placer = stack.enter_context(listing.placer)
-        stack.enter_context(listing.fleet_view)
-        await listing.find()
-        await show(listing, placer.changed, listing.refresh, watch=watch, as_json=as_json)
-        if name is not None and not (watch or as_json) and (tail := tail_of(placer.placements[name])):
-            for line in ("\nThe end of its output:", *tail):
-                terminal.print_line(line)
-    return 0
-
-
-async def _kinds(*, as_json: bool) -> int:
+async def _kinds(*, as_json: bool) -> None:
     async with common.connected("components", need_rcm=False) as client:
         with suppress(common.NobodyThere):
             await common.see_rcm(client)
@@ -211,11 +202,10 @@ async def _kinds(*, as_json: bool) -> int:
     if as_json:
         hosts = [{"host": one.host, "kinds": sorted(one.kinds)} for one in nodes]
         terminal.print_json({"fleet": fleet, "hosts": hosts})
-        return 0
+        return
     kinds = sorted({kind for one in nodes for kind in one.kinds})
     rows = [(kind, ", ".join(one.host for one in nodes if kind in one.kinds)) for kind in kinds]
     nothing = [one.host for one in nodes if not one.kinds]
     without = f"; nothing on {', '.join(nothing)}" if nothing else ""
     headline = f"Fleet {fleet}: {len(kinds)} kinds can be started{without}"
     Overview(headline, [Table("Kinds", ("KIND", "ON"), rows)]).print()
-    return 0

@@ -36,7 +36,8 @@ UNKNOWN: Final = 3
     "--lines", type=click.IntRange(0, 100_000), help="Only the last so many lines of what there is."
 )
 @host_option("--host", "What it wrote there; else where it ran last.")
-def logs(name: str, follow: bool, lines: int | None, host: str | None) -> int:
+@common.runs
+async def logs(name: str, follow: bool, lines: int | None, host: str | None) -> None:
     """Print the output of a component, of its running or its last incarnation.
 
     Its host keeps the last 64 KiB of each, until zscout-node ends there. With --follow also what comes, on
@@ -49,10 +50,6 @@ def logs(name: str, follow: bool, lines: int | None, host: str | None) -> int:
       zscout logs counter --follow --lines 10
       zscout logs counter --host anvil > before-it-moved.txt
     """
-    return common.run(_logs(name, follow=follow, lines=lines, host=host))
-
-
-async def _logs(name: str, *, follow: bool, lines: int | None, host: str | None) -> int:
     async with common.connected("logs", need_rcm=False) as client:
         with placer_of(client, {name}) as placer:
             reader = Reader(client, placer, name, host)
@@ -62,7 +59,6 @@ async def _logs(name: str, *, follow: bool, lines: int | None, host: str | None)
                 await reader.follow(output)
             elif terminal.at_terminal() and output.text and not output.text.endswith("\n"):
                 reader.write("\n")
-    return 0
 
 
 class Reader:

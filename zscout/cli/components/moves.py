@@ -31,7 +31,8 @@ from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, 
 @component_argument
 @host_option("--to", "Where to. Default: the best other host.")
 @common.json_option("Print one JSON object.")
-def migrate(name: str, to: str | None, as_json: bool) -> int:
+@common.runs
+async def migrate(name: str, to: str | None, as_json: bool) -> None:
     """Move a running component to another host, with its state and all that it holds.
 
     Only what can give and take a checkpoint can be moved. Says where it went, and for how long it was out of
@@ -42,10 +43,6 @@ def migrate(name: str, to: str | None, as_json: bool) -> int:
       zscout migrate counter
       zscout migrate counter --to bellows --json | jq .dead
     """
-    return common.run(_migrate(name, to, as_json=as_json))
-
-
-async def _migrate(name: str, to: str | None, *, as_json: bool) -> int:
     async with placing("migrate", as_json=as_json) as (shown, placer):
         before = placer.placements.get(name)
         if before is None:
@@ -61,7 +58,6 @@ async def _migrate(name: str, to: str | None, *, as_json: bool) -> int:
         shown.say(f"{name} is on {after.host} already")
     else:
         shown.say(f"{name} went from {before.host} to {after.host}{out_of_work(after) if moved else ''}")
-    return 0
 
 
 async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: str | None) -> Placement:
@@ -99,7 +95,8 @@ async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: s
 @host_argument
 @timeout_option("Wait at most so long until it is empty, then exit with 1.")
 @common.json_option("Print one JSON object.")
-def drain(host: str, timeout: float | None, as_json: bool) -> int:
+@common.runs
+async def drain(host: str, timeout: float | None, as_json: bool) -> None:
     """Place nothing on a host any more, and move away what can be moved.
 
     Ends when no movable component is left; exit code 1 names what stays, and why. The host stays cordoned,
@@ -110,23 +107,6 @@ def drain(host: str, timeout: float | None, as_json: bool) -> int:
       zscout drain anvil && ssh anvil sudo reboot
       zscout drain anvil --timeout 2m
     """
-    return common.run(_drain(host, timeout, as_json=as_json))
-
-
-@click.command()
-@host_argument
-@common.json_option("Print one JSON object.")
-def uncordon(host: str, as_json: bool) -> int:
-    """Use a host again that was drained. Nothing moves back by itself.
-
-    \b
-    Example:
-      zscout uncordon anvil
-    """
-    return common.run(_uncordon(host, as_json=as_json))
-
-
-async def _drain(host: str, timeout: float | None, *, as_json: bool) -> int:
     cordoned = f"{host} stays cordoned; to use it again: zscout uncordon {host}"
     async with placing("drain", as_json=as_json) as (shown, placer):
         at_first = {one.component for one in _there(placer, host)}
@@ -153,17 +133,25 @@ async def _drain(host: str, timeout: float | None, *, as_json: bool) -> int:
             terminal.clean(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
         )
     shown.say(f"{host} is empty; {cordoned}")
-    return 0
 
 
-async def _uncordon(host: str, *, as_json: bool) -> int:
+@click.command()
+@host_argument
+@common.json_option("Print one JSON object.")
+@common.runs
+async def uncordon(host: str, as_json: bool) -> None:
+    """Use a host again that was drained. Nothing moves back by itself.
+
+    \b
+    Example:
+      zscout uncordon anvil
+    """
     async with common.connected("uncordon") as client:
         uncordoned = await placer_of(client).request(UncordonHost(host), Placements)
     if as_json:
         terminal.print_json({"host": host, "components": list(map(placement_object, uncordoned.components))})
     else:
         terminal.print_line(f"{host} is used again")
-    return 0
 
 
 def _there(placer: PlacerClient, host: str) -> list[Placement]:

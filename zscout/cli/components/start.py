@@ -133,9 +133,10 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
 @click.option("--no-wait", is_flag=True, help="Don't wait until it runs.")
 @timeout_option("Wait at most so long until it runs, then exit with 1.")
 @common.json_option("Print one JSON object.")
-def start(
+@common.runs
+async def start(
     kind: str, name: str | None, no_wait: bool, timeout: float | None, as_json: bool, **wanted: Any
-) -> int:
+) -> None:
     """Have a component run on the best host of the fleet, and keep it running.
 
     KIND is the name of what is installed on the hosts: zscout components --kinds lists them. The component
@@ -154,13 +155,33 @@ def start(
       zscout start spin --params '{"cpu": 0.5}' --label gpu --memory 2G --cpu-limit 1
       zscout start counter --host anvil --restart never --timeout 30
     """
-    called = kind if name is None else name
-    if len(called) > MAX_COMPONENT_NAME:
+    name = kind if name is None else name
+    if len(name) > MAX_COMPONENT_NAME:
         raise BadInput(
-            f"the name {quoted(called)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name"
+            f"the name {quoted(name)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name"
         )
     spec = gather_spec(kind, **wanted)
-    return common.run(_start(called, spec, wait=not no_wait, timeout=timeout, as_json=as_json))
+    stays = f"{name} stays placed; to end it: zscout stop {name}"
+    async with placing("start", {name}, as_json=as_json) as (shown, placer):
+
+        def late() -> str:
+            record = placer.placements.get(name)
+            now = f" {standing(record)};" if record is not None else ""
+            return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
+
+        before = placer.placements.get(name)
+        placement = await _place(placer, name, spec, before)
+        if not no_wait:
+            async with shown.within(timeout, late, stays):
+                placement = await _until_settled(placer, shown, name, spec)
+    if as_json:
+        terminal.print_json(placement_object(placement))
+    if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
+        for line in tail_of(placement):
+            terminal.print_line(line, sys.stderr)
+        raise common.Failed(f"{name} {standing(placement)}")
+    ran = before is not None and before.state == placement.state == "running"
+    shown.say(f"{name} {'already ' if ran else ''}{standing(placement)}")
 
 
 def gather_spec(
@@ -190,31 +211,6 @@ def gather_spec(
         cpu_limit=cpu_limit or 0.0,
         **same,
     )
-
-
-async def _start(name: str, spec: ComponentSpec, *, wait: bool, timeout: float | None, as_json: bool) -> int:
-    stays = f"{name} stays placed; to end it: zscout stop {name}"
-    async with placing("start", {name}, as_json=as_json) as (shown, placer):
-
-        def late() -> str:
-            record = placer.placements.get(name)
-            now = f" {standing(record)};" if record is not None else ""
-            return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
-
-        before = placer.placements.get(name)
-        placement = await _place(placer, name, spec, before)
-        if wait:
-            async with shown.within(timeout, late, stays):
-                placement = await _until_settled(placer, shown, name, spec)
-    if as_json:
-        terminal.print_json(placement_object(placement))
-    if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
-        for line in tail_of(placement):
-            terminal.print_line(line, sys.stderr)
-        raise common.Failed(f"{name} {standing(placement)}")
-    ran = before is not None and before.state == placement.state == "running"
-    shown.say(f"{name} {'already ' if ran else ''}{standing(placement)}")
-    return 0
 
 
 async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: Placement | None) -> Placement:
@@ -254,7 +250,8 @@ async def _until_settled(placer: PlacerClient, shown: Progress, name: str, spec:
 )
 @timeout_option("Wait at most so long for the end, then exit with 1.")
 @common.json_option("Print one JSON object.")
-def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> int:
+@common.runs
+async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> None:
     """End components for good: they are asked to end, and killed if they don't.
 
     Returns when they have ended. What they held is given back. One that has ended before is no error.
@@ -264,10 +261,7 @@ def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> int:
       zscout stop counter
       zscout stop blue green --timeout 10
     """
-    return common.run(_stop(sorted(set(names)), timeout, as_json=as_json))
-
-
-async def _stop(names: list[str], timeout: float | None, *, as_json: bool) -> int:
+    names = sorted(set(names))
     stays = f"{', '.join(names)} will be stopped all the same; zscout components tells how that goes"
     async with placing("stop", names, as_json=as_json) as (shown, placer):
 
@@ -299,7 +293,6 @@ async def _stop(names: list[str], timeout: float | None, *, as_json: bool) -> in
         raise common.Failed("; ".join(map(str, failures)))
     if failures:
         raise failures[0]
-    return 0
 
 
 async def _end(placer: PlacerClient, name: str) -> Placement:

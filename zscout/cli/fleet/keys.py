@@ -14,7 +14,8 @@ from zscout.keyexpr import Keys, Role, Sender, Token
 
 @click.command()
 @common.json_option("Print one JSON object.")
-def keys(as_json: bool) -> None:
+@common.runs
+async def keys(as_json: bool) -> None:
     """List who is alive on the mesh, by host, and the keys that each serves, publishes or hears.
 
     For writing a client in another language, or access rules, and to see whether two hosts see each other.
@@ -25,10 +26,6 @@ def keys(as_json: bool) -> None:
       zscout keys
       zscout keys --json | jq -r '.alive[].keys[].key'
     """
-    common.run(_list(as_json))
-
-
-async def _list(as_json: bool) -> None:
     async with common.connected("keys", need_rcm=False) as client:
         sharable: set[str] | None = None
         with FleetView(client) as fleet_view:
@@ -85,10 +82,7 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
                 ("hear", own.notice(sender), "what becomes of them"),
             ]
         case Role.CANDIDATE | Role.RECORDER:
-            found = [
-                ("hear", own.grants, "who holds what"),
-                ("hear", own.placements, "how components stand"),
-            ]
+            found = [("hear", own.grants, "who holds what"), ("hear", own.placements, "how components stand")]
         case _:
             found = []
     return [{"how": how, "key": key, "what": what} for how, key, what in found]

@@ -30,7 +30,8 @@ MAX_FIGURES_SHOWN: Final = 12
     "--devices", "every", is_flag=True, help="Show the figures of all devices: rates, drops, latency."
 )
 @common.json_option("Print one JSON object; with --watch, one on each line.")
-def status(watch: bool, every: bool, as_json: bool) -> None:
+@common.runs
+async def status(watch: bool, every: bool, as_json: bool) -> None:
     """Show the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
 
     The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are
@@ -45,10 +46,6 @@ def status(watch: bool, every: bool, as_json: bool) -> None:
       zscout status --json | jq -r '.queue[] | .arc + ": " + .reason'
       zscout status --devices --watch
     """
-    common.run(_status(every, watch=watch, as_json=as_json))
-
-
-async def _status(every: bool, *, watch: bool, as_json: bool) -> None:
     async with AsyncExitStack() as stack:
         client = await stack.enter_async_context(common.connected("status", need_rcm=False))
         fleet_view = stack.enter_context(FleetView(client))

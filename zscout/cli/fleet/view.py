@@ -49,7 +49,8 @@ HOSTING: Final = "Hosting a web-viewer at"
     help="Without FILE: the folder in which the live recording is kept.",
 )
 @common.json_option("Print one JSON object as soon as it is served or recorded: url, live, file.")
-def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path, as_json: bool) -> None:
+@common.runs
+async def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path, as_json: bool) -> None:
     """Open the recording FILE (.rrd), or record the fleet and show it live.
 
     The viewer is a window of its own, which ends the command when it is closed. On a host without a display
@@ -63,22 +64,15 @@ def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path, a
       zscout view --web --json | jq -r --unbuffered .url
     """
     try:
-        address = ipaddress.ip_address("127.0.0.1" if bind == "localhost" else bind)
+        bind = str(ipaddress.ip_address("127.0.0.1" if bind == "localhost" else bind))
     except ValueError:
         raise BadInput(f"--bind: {quoted(bind)} is not an IP address; write one, as in 127.0.0.1") from None
     if file is not None:
-        _check(file)
-        file = file.absolute()  # it may begin with a dash
+        file = _checked(file)
     if not web and not has_display():
         raise common.Failed(
             "no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser"
         )
-    common.run(_view(file, web, str(address), port, out, as_json=as_json))
-
-
-async def _view(
-    file: Path | None, web: bool, bind: str, port: int | None, out: Path, *, as_json: bool
-) -> None:
     # The page comes last, so what it shows needs its own port first.
     async with _source(file, bind, None if web else port, out) as (recording, recorder):
         shown = recording.url or recording.file
@@ -141,8 +135,8 @@ async def _say_if_alone() -> None:
         terminal.print_line(f"zscout: {error}", sys.stderr)
 
 
-def _check(file: Path) -> None:
-    """Raises BadInput where FILE can't be a recording."""
+def _checked(file: Path) -> Path:
+    """The whole path of FILE, which may begin with a dash. Raises BadInput where it can't be a recording."""
     try:
         if not file.is_file():
             raise BadInput(
@@ -158,6 +152,7 @@ def _check(file: Path) -> None:
         raise BadInput(f"{file}: is not a Rerun recording; name a .rrd file")
     if file.suffix != ".rrd":
         raise BadInput(f"{file}: the viewer knows a recording by its name; rename it to end in .rrd")
+    return file.absolute()
 
 
 def free_port(bind: str, *ports: int) -> int:

@@ -11,13 +11,7 @@ from click.shell_completion import CompletionItem
 
 from zscout.cli import common
 from zscout.config.strict import BadInput, quoted
-from zscout.lab.building.plan_file import (
-    MAX_SEED,
-    RANDOM,
-    known_buildings,
-    plan_named,
-    shipped_plans,
-)
+from zscout.lab.building.plan_file import MAX_SEED, RANDOM, known_buildings, plan_named, shipped_plans
 
 BUILDING: Final = common.Parsed("building", lambda text, _: text)
 MAX_FRAMEGRABBERS: Final = 16

@@ -64,7 +64,21 @@ def _rc_option(kind: str) -> Callable[[F], F]:
     help="Keep what was seen.",
 )
 @common.json_option("Print JSON lines: taken, waiting, free, and what came of it.")
-def drive(robot: str, as_json: bool, **options: Any) -> int:
+@common.runs
+async def drive(
+    robot: str,
+    radio: str,
+    video: str,
+    framegrabber: str,
+    rate: float,
+    speed: float,
+    stand_by: bool,
+    pad: Path | None,
+    no_picture: bool,
+    no_view: bool,
+    record: Path | None,
+    as_json: bool,
+) -> None:
     """Take ROBOT with radio, video channel and framegrabber, and drive it.
 
     Asks at the fleet's operator priority, without a question: who holds them is preempted,
@@ -84,25 +98,7 @@ def drive(robot: str, as_json: bool, **options: Any) -> int:
     """
     if not sys.stdin.isatty():
         raise BadInput("zscout drive reads keys: run it at a terminal, its standard input is none")
-    common.check_recording("--record", options["record"])
-    return common.run(_drive(robot, as_json=as_json, **options))
-
-
-async def _drive(
-    robot: str,
-    *,
-    radio: str,
-    video: str,
-    framegrabber: str,
-    rate: float,
-    speed: float,
-    stand_by: bool,
-    pad: Path | None,
-    no_picture: bool,
-    no_view: bool,
-    record: Path | None,
-    as_json: bool,
-) -> int:
+    common.check_recording("--record", record)
     from zscout.behaviors.sensor_net.held_robot import RobotNeeds
     from zscout.behaviors.teleop import Pilot, Teleop
     from zscout.cli.operator.hands import Hands, game_pad
@@ -136,7 +132,6 @@ async def _drive(
         works = [end.wait(), teleop.run(), console.keep_drawing(teleop)]
         await common.first_of(*works, *([] if no_picture else [look()]))
     console.event("ended", "given back")
-    return 0
 
 
 async def _stream(

@@ -11,7 +11,8 @@ from typing import Any
 import click
 
 from zscout.behaviors.client.client import Client
-from zscout.cli.common import Failed, connected, run, state_of, the_fleet
+from zscout.cli import common
+from zscout.cli.common import Failed
 from zscout.cli.requests.contention import contention_of, hold_json, hold_text
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, Need, gather, hold_options
 from zscout.cli.requests.request import carry_out
@@ -27,7 +28,10 @@ MAX_ANSWER = 4_096
 @click.option("--no-keep", is_flag=True, help="Give back when the minimum runtime is over.")
 @hold_options
 @click.pass_context
-def take(ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any) -> int:
+@common.runs
+async def take(
+    ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any
+) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
     Says who will be preempted and asks, on stderr; without a terminal it needs
@@ -41,13 +45,9 @@ def take(ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name: str 
       zscout take robot/scout33 radio/rf0:command_rate=5 --yes -- ./drive.py
       zscout take 'robot/*' 'framegrabber/*' --no-keep --min-runtime 2m
     """
-    priority = the_fleet().operator_priority
+    priority = common.the_fleet().operator_priority
     wanted = gather(ctx, needs, name, "operator", priority=priority, keep=not no_keep, **rest)
-    return run(_take(wanted, yes=yes))
-
-
-async def _take(wanted: HoldOptions, *, yes: bool) -> int:
-    async with connected("take") as client:
+    async with common.connected("take") as client:
         await _agree(client, wanted, yes=yes)
         return await carry_out(client, wanted)
 
@@ -122,7 +122,7 @@ async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
     """Says whom it will preempt and asks, again where that has changed meanwhile. Raises Failed for a no."""
     agreed: set[tuple[str, str]] = set()
     while True:
-        cost = takeover_cost(await state_of(client), wanted)
+        cost = takeover_cost(await common.state_of(client), wanted)
         victims = {(hold.client, hold.id) for hold in (*cost.ends, *cost.may_end)}
         if victims and victims <= agreed:
             return

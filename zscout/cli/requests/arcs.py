@@ -13,16 +13,7 @@ from zscout.cli import common
 from zscout.cli.requests.contention import NeedContention, contention_of, hold_json
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import check_name, client_of
-from zscout.messages import (
-    Cancel,
-    HoldView,
-    Notice,
-    RcAsk,
-    RcmState,
-    RcState,
-    Release,
-    WaitView,
-)
+from zscout.messages import Cancel, HoldView, Notice, RcAsk, RcmState, RcState, Release, WaitView
 
 MAX_NAME: Final = 200
 """Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
@@ -50,7 +41,8 @@ every_option = click.option("--all", "every", is_flag=True, help="All ARCs of th
 @click.command()
 @arc_argument
 @common.json_option("Print one JSON object.")
-def why(arc: str, as_json: bool) -> None:
+@common.runs
+async def why(arc: str, as_json: bool) -> None:
     """Tell what became of ARC, and why it waits if it does.
 
     ARC is its name, its id, or HOST/CLIENT/ID. Of each RC that it needs: who holds it, with which priority,
@@ -61,7 +53,7 @@ def why(arc: str, as_json: bool) -> None:
       zscout why survey
       zscout why 4caaac1a6451 --json | jq .arcs[0].story
     """
-    found = common.run(_look(arc))
+    found = await _look(arc)
     if as_json:
         terminal.print_json(found)
         return
@@ -75,7 +67,8 @@ def why(arc: str, as_json: bool) -> None:
 @arc_argument
 @every_option
 @common.json_option("Print one JSON object.")
-def cancel(arc: str, every: bool, as_json: bool) -> None:
+@common.runs
+async def cancel(arc: str, every: bool, as_json: bool) -> None:
     """End an ARC, whether it runs or waits: by name, id, or <host>/<client>/<id>.
 
     Its program is told; one that `zscout request` runs is stopped. A name that
@@ -87,14 +80,15 @@ def cancel(arc: str, every: bool, as_json: bool) -> None:
       zscout cancel 5f0c2a9d13be
       zscout cancel survey --all
     """
-    common.run(_end(arc, "cancel", every=every, as_json=as_json))
+    await _end(arc, "cancel", every=every, as_json=as_json)
 
 
 @click.command()
 @arc_argument
 @every_option
 @common.json_option("Print one JSON object.")
-def release(arc: str, every: bool, as_json: bool) -> None:
+@common.runs
+async def release(arc: str, every: bool, as_json: bool) -> None:
     """End the hold of a running ARC: by name, id, or <host>/<client>/<id>.
 
     The same as `zscout cancel`, but only for ARCs that run: one that waits is
@@ -105,7 +99,7 @@ def release(arc: str, every: bool, as_json: bool) -> None:
       zscout release survey
       zscout release anvil/request-5f0c2a9d13be/0b1d3c5e7f90 --json
     """
-    common.run(_end(arc, "release", every=every, as_json=as_json))
+    await _end(arc, "release", every=every, as_json=as_json)
 
 
 # Its end

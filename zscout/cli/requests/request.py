@@ -15,13 +15,7 @@ from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common
 from zscout.cli.common import Failed
 from zscout.cli.requests.contention import held_text
-from zscout.cli.requests.options import (
-    CommandAfterDashes,
-    HoldOptions,
-    Need,
-    gather,
-    hold_options,
-)
+from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, Need, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.waiting import Report
 from zscout.messages import Foresight
@@ -50,7 +44,8 @@ LAST_WORD: Final = 0.5
 )
 @hold_options
 @click.pass_context
-def request(
+@common.runs
+async def request(
     ctx: click.Context, /, needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, **rest: Any
 ) -> int:
     """Wait until all of the devices are granted at once, then hold them.
@@ -95,12 +90,8 @@ def request(
       zscout request robot/scout33 --priority 5 --dry-run
     """
     wanted = gather(ctx, needs, name, priority=priority, keep=keep, **rest)
-    return common.run(_foresee(wanted) if dry_run else _request(wanted))
-
-
-async def _request(wanted: HoldOptions) -> int:
     async with common.connected("request") as client:
-        return await carry_out(client, wanted)
+        return await (_foresee(client, wanted) if dry_run else carry_out(client, wanted))
 
 
 async def carry_out(client: Client, wanted: HoldOptions) -> int:
@@ -240,14 +231,13 @@ def _ending(arc: OpenArc) -> HoldEnd:
 # What would come of it
 
 
-async def _foresee(wanted: HoldOptions) -> int:
+async def _foresee(client: Client, wanted: HoldOptions) -> int:
     """Prints when it would start and whom it would preempt at once. Exit code 1: it would not start.
 
     Raises RequestRefused, NobodyThere."""
-    async with common.connected("request") as client:
-        foretold = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
-        if foretold is None:
-            raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
+    foretold = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
+    if foretold is None:
+        raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
     if wanted.as_json:
         print_json(
             {
