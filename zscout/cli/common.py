@@ -10,7 +10,7 @@ import difflib
 import os
 import signal
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
-from contextlib import asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, suppress
 from decimal import Decimal
 from functools import wraps
 from pathlib import Path
@@ -144,25 +144,19 @@ async def see_rcm(client: Client) -> None:
     mesh, seen = client.mesh, asyncio.Event()
     candidates: set[Token] = set()
 
-    def on_rcm(_: Token, alive: bool) -> None:
-        if alive:
+    def on_token(token: Token, alive: bool) -> None:
+        if token.role == Role.CANDIDATE:
+            (candidates.add if alive else candidates.discard)(token)
+        elif alive:
             seen.set()
 
-    def on_candidate(token: Token, alive: bool) -> None:
-        (candidates.add if alive else candidates.discard)(token)
-
-    watches = [
-        mesh.watch(mesh.keys.alive_any(Role.RCM), on_rcm),
-        mesh.watch(mesh.keys.alive_any(Role.CANDIDATE), on_candidate),
-    ]
-    try:
+    with ExitStack() as stack:
+        for role in (Role.RCM, Role.CANDIDATE):
+            stack.callback(mesh.watch(mesh.keys.alive_any(role), on_token).close)
         if await within(LOOK_FOR_RCM, seen):
             return
         if candidates and await within(LOOK_FOR_TAKEOVER - LOOK_FOR_RCM, seen):
             return
-    finally:
-        for watch in watches:
-            watch.close()
     fleet, links = client.fleet.name, mesh.links()
     if candidates:
         names = ", ".join(sorted(token.host for token in candidates)[:5])

@@ -140,20 +140,10 @@ class Listing:
         found = []
         for one in self._all():
             use = self._use(one)
-            found.append(
-                placement_object(one)
-                | {
-                    "uptime": self._uptime(one),
-                    "cpu": None if use is None else use.cpu,
-                    "memory": None if use is None else use.memory,
-                    "processes": None if use is None else use.processes,
-                }
-            )
-        return {
-            "fleet": self.client.fleet.name,
-            "components": found,
-            "cordoned": sorted(self.placer.cordoned),
-        }
+            used = {name: getattr(use, name, None) for name in ("cpu", "memory", "processes")}
+            found.append(placement_object(one) | {"uptime": self._uptime(one), **used})
+        cordoned = sorted(self.placer.cordoned)
+        return {"fleet": self.client.fleet.name, "components": found, "cordoned": cordoned}
 
     def _headline(self) -> str:
         running = self._running()

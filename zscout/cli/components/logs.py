@@ -105,7 +105,8 @@ class Reader:
             if over and (self._only or not await self._successor()):
                 break
             if not over and not output.text:
-                await self._pause()
+                await common.within(READ_EVERY, self._placer.changed)
+                self._placer.changed.clear()
             found = await self._read()
             if found is None:
                 # Its host is gone or busy, or has forgotten it; the placer knows which.
@@ -149,11 +150,7 @@ class Reader:
         mesh = self._client.mesh
         asked = ReadOutput(self._name)
         replies = await mesh.ask(mesh.keys.component_any, asked, Output, timeout=READ_TIMEOUT)
-        found = [
-            (reply.message.incarnation, mesh.keys.host_of(reply.key))
-            for reply in replies
-            if reply.message is not None
-        ]
+        found = [(one.message.incarnation, mesh.keys.host_of(one.key)) for one in replies if one.message]
         if not found:
             return None
         _, self._host = max(found)
@@ -177,10 +174,6 @@ class Reader:
                     self._host = record.host
                     return True
             await self._placer.wait_changed()
-
-    async def _pause(self) -> None:
-        await common.within(READ_EVERY, self._placer.changed)
-        self._placer.changed.clear()
 
     async def _see_hosts(self) -> None:
         with FleetView(self._client) as fleet_view:

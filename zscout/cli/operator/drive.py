@@ -19,7 +19,6 @@ from zscout.config.strict import BadInput, quoted
 from zscout.types import SECOND
 
 if TYPE_CHECKING:
-    from zscout.behaviors.client.client import Client
     from zscout.behaviors.teleop import Teleop
     from zscout.cli.operator.picture_recording import PictureRecording
 
@@ -127,7 +126,7 @@ async def drive(
 
         async def look() -> None:
             stream = await _stream(stack, robot, record, console, view=not no_view)
-            await show_pictures(client, teleop, stream, console)
+            await show_pictures(teleop, stream, console)
 
         works = [end.wait(), teleop.run(), console.keep_drawing(teleop)]
         await common.first_of(*works, *([] if no_picture else [look()]))
@@ -156,9 +155,9 @@ async def _stream(
     return stream
 
 
-async def show_pictures(client: Client, teleop: Teleop, stream: PictureRecording, console: _Console) -> None:
+async def show_pictures(teleop: Teleop, stream: PictureRecording, console: _Console) -> None:
     """Passes the newest picture of the held framegrabber on, without end."""
-    mesh = client.mesh
+    mesh = teleop.client.mesh
     zero = mesh.now()
     while True:
         robot, held = teleop.robot, teleop.held
@@ -198,15 +197,11 @@ class _Console(terminal.LiveLine):
             return
         before, self._told = self._told, now
         if teleop.state == "driving" and teleop.takeover is not None:
-            self.event(
-                "driving",
-                f"{self._robot} obeys, {1000 * teleop.takeover:.0f} ms after you took it",
-                takeover=teleop.takeover,
-            )
+            words = f"{self._robot} obeys, {1000 * teleop.takeover:.0f} ms after you took it"
+            self.event("driving", words, takeover=teleop.takeover)
         elif teleop.state == "driving":
-            self.event(
-                "taken", f"{self._robot} is yours: {', '.join(teleop.held.rcs if teleop.held else [])}"
-            )
+            rcs = ", ".join(teleop.held.rcs if teleop.held else [])
+            self.event("taken", f"{self._robot} is yours: {rcs}")
         elif teleop.state == "waiting":
             self.event("waiting", f"{self._robot} waits: {teleop.why}", why=teleop.why)
         elif before is not None:

@@ -187,12 +187,8 @@ async def _look(asked: str) -> dict[str, Any]:
         arcs = [await _described(client, view, state) for view in same[:MAX_LISTED]]
         if not same:
             arcs = [{"arc": asked, "state": "ended", "story": list(map(structs.asdict, state.story))}]
-        return {
-            "fleet": client.fleet.name,
-            "asked": asked,
-            "arcs": arcs,
-            "more": max(0, len(same) - MAX_LISTED),
-        }
+        more = max(0, len(same) - MAX_LISTED)
+        return {"fleet": client.fleet.name, "asked": asked, "arcs": arcs, "more": more}
 
 
 async def _described(client: Client, view: View, state: RcmState) -> dict[str, Any]:
@@ -218,11 +214,8 @@ def _need(seen: NeedContention, view: View) -> dict[str, Any]:
     holders = [
         hold_json(hold) | {"rc": rc.rc, "params": hold.needs[rc.rc]} for rc in seen.rcs for hold in rc.holds
     ]
-    return seen.as_json() | {
-        "need": met.get(seen.need, seen.need),
-        "params": view.needs[seen.need],
-        "holders": holders,
-    }
+    need, params = met.get(seen.need, seen.need), view.needs[seen.need]
+    return seen.as_json() | {"need": need, "params": params, "holders": holders}
 
 
 async def _health(client: Client, need: NeedContention) -> str | None:

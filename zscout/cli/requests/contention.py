@@ -106,15 +106,8 @@ def hold_text(hold: HoldView) -> str:
 
 def hold_json(hold: HoldView) -> dict[str, Any]:
     """The same for programs."""
-    return {
-        "arc": hold.arc,
-        "id": hold.id,
-        "client": hold.client,
-        "priority": hold.priority,
-        "held": round(hold.held, 3),
-        "remaining": round(hold.remaining, 3),
-        "keep": hold.keep,
-    }
+    said = {name: getattr(hold, name) for name in ("arc", "id", "client", "priority", "keep")}
+    return said | {"held": round(hold.held, 3), "remaining": round(hold.remaining, 3)}
 
 
 def held_text(rcs: Collection[str], bound: dict[str, str]) -> str:

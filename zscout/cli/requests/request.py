@@ -121,7 +121,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
 async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc | None) -> OpenArc:
     """Until it is granted. Raises Failed where it is not."""
     try:
-        async with common.beside(report.follow_wait()), asyncio.timeout(wanted.timeout):
+        async with report.telling(report.follow_wait()), asyncio.timeout(wanted.timeout):
             if arc is None:
                 arc = await client.request(wanted.name, wanted.needs, **wanted.terms(), estimate=True)
             grant = await client.granted(arc)
@@ -137,8 +137,6 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
             await client.end(arc)
         report.event("ended", f"{wanted.name} is cancelled", {"outcome": "cancelled"})
         raise
-    finally:
-        report.hide()
     if grant is None:
         report.event("ended", "", {"outcome": arc.outcome, "reason": arc.reason})
         raise Failed(clean(f"{wanted.name} was not granted: {arc.reason or arc.outcome}"))
@@ -153,18 +151,16 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     held = Held(client, arc, grant)
     rcs = held_text(held.rcs, held.bound)
     length = "until it is needed elsewhere" if arc.keep else f"for {span(held.remaining)}"
-    left = round(held.remaining, 3)
-    details = {
-        "id": arc.id,
-        "grant": grant,
-        "rcs": held.rcs,
-        "bound": held.bound,
-        "remaining": left,
-        "keep": arc.keep,
-    }
+    details = {"id": arc.id, "grant": grant, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
+    details["remaining"] = round(held.remaining, 3)
     report.event("granted", f"{arc.name} holds {rcs} {length}", details)
     try:
-        code = await (_run(wanted, report, held, client) if wanted.command else _hold(report, held))
+        code = None
+        if wanted.command:
+            code = await _run(wanted, report, held, client)
+        else:
+            async with report.telling(report.follow_hold(arc)):
+                await held.over()
     except BaseException:
         await client.end(arc)
         report.event("ended", f"{arc.name} gave back {rcs}", {"outcome": "released"})
@@ -181,15 +177,6 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         report.event("ended", f"the time of {arc.name} is over", {"outcome": "completed"})
         return TIME_OVER if wanted.command else 0
     return await _taken(client, wanted, report, arc)
-
-
-async def _hold(report: Report, held: Held) -> None:
-    """Until the hold is over."""
-    try:
-        async with common.beside(report.follow_hold(held.arc)):
-            await held.over()
-    finally:
-        report.hide()
 
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
@@ -239,14 +226,8 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
     if foretold is None:
         raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
     if wanted.as_json:
-        print_json(
-            {
-                "arc": wanted.name,
-                "starts_in": foretold.starts_in,
-                "preempts": foretold.preempts,
-                "reason": foretold.reason,
-            }
-        )
+        found = {name: getattr(foretold, name) for name in ("starts_in", "preempts", "reason")}
+        print_json({"arc": wanted.name, **found})
     else:
         for line in _words(foretold):
             print_line(clean(line))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from contextlib import asynccontextmanager
 from typing import IO, Any, Final
 
 from msgspec.structs import replace
@@ -48,6 +49,15 @@ class Report(LiveLine):
         """A watcher for the client."""
         self._arc = arc
         self._changed.set()
+
+    @asynccontextmanager
+    async def telling(self, follow: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+        """Runs `follow_wait` or `follow_hold` for as long as the context lasts."""
+        try:
+            async with common.beside(follow):
+                yield
+        finally:
+            self.hide()
 
     async def follow_wait(self) -> None:
         """Tells how the request waits, until cancelled."""
@@ -109,7 +119,7 @@ class Report(LiveLine):
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         ahead = f", {arc.ahead} ahead" if arc.ahead else ""
         lines = [
-            f"{arc.name} waits {span(self._since(arc))}{ahead}{start and f', {start}'}: {arc.reason}",
+            f"{arc.name} waits {span(self._since(arc))}{ahead}{f', {start}' if start else ''}: {arc.reason}",
             *(f"  {rc.text()}" for rc in in_way),
         ]
         self.draw("\n".join(lines))
@@ -118,13 +128,8 @@ class Report(LiveLine):
             return
         self._said = _how(arc)
         more = "".join(f"; {text}" for text in (start, *(rc.text() for rc in in_way)) if text)
-        details = {
-            "id": arc.id,
-            "reason": arc.reason,
-            "ahead": arc.ahead,
-            "starts_in": starts_in,
-            "needs": [need.as_json() for need in needs],
-        }
+        details: dict[str, Any] = {"id": arc.id, "reason": arc.reason, "ahead": arc.ahead}
+        details |= {"starts_in": starts_in, "needs": [need.as_json() for need in needs]}
         self.event("waits", f"{arc.name} waits{ahead}: {arc.reason}{more}", details)
 
     def _since(self, arc: OpenArc) -> float:
