@@ -24,8 +24,8 @@ SERVER_MEMORY: Final = "200MB"
 """What the live server keeps for viewers that come late; the oldest goes first."""
 MAX_ARCS: Final = 2000
 MAX_RCS: Final = 1000
-MAX_COMPONENTS: Final = 10_000
-"""Components that have a colour of their own."""
+MAX_COLOURS: Final = 10_000
+"""ARCs and components that have a colour of their own."""
 RC_STATES: Final = 256
 ARC_STATES: Final = 16
 OPERATOR_MARK: Final = " (operator)"
@@ -66,12 +66,12 @@ class Timeline(Drawing):
         self.url: str | None = None
         """Where a viewer finds the live server: `rerun URL`."""
         self._path = path
-        self._arcs: dict[str, int] = {}
-        self._components: dict[str, int] = {}
-        self._coloured = 0
+        self._arcs: set[str] = set()
+        self._colours: dict[str, int] = {}
+        """Of ARCs and components, by order of appearance: a component has that of the ARC with its name."""
         self._rc_lanes = Lanes(self, "rc", MAX_RCS, "RCs: the others have no lane", colours=RC_STATES)
         self._arc_lanes = Lanes(self, "arc", MAX_ARCS, "ARCs: the others have no lane", colours=ARC_STATES)
-        self.hosts = HostPane(self, self._component_colour)
+        self.hosts = HostPane(self, self._colour_of)
         self.robots = RobotPanes(self)
         self._arranged: object = (False, NO_ROBOTS)
         self.recording.set_log_time_enabled(False)
@@ -171,27 +171,20 @@ class Timeline(Drawing):
         )
 
     def _colour(self, at: float, arc: str) -> int:
-        """The ARC's colour, by order of appearance."""
+        """The ARC's colour."""
         if arc not in self._arcs:
             others = "ARC names: the others have no lane and no colour of their own"
             if not self.room(at, self._arcs, MAX_ARCS, others):
                 return OTHER
-            self._arcs[arc] = self._components.get(arc) or self._next_colour()
-        return self._arcs[arc]
+            self._arcs.add(arc)
+        return self._colour_of(arc)
 
-    def _component_colour(self, component: str) -> int:
-        """That of the ARC with this name, if there is one."""
-        if component in self._arcs:
-            return self._arcs[component]
-        if component not in self._components:
-            if len(self._components) >= MAX_COMPONENTS:
+    def _colour_of(self, name: str) -> int:
+        if name not in self._colours:
+            if len(self._colours) >= MAX_COLOURS:
                 return OTHER
-            self._components[component] = self._next_colour()
-        return self._components[component]
-
-    def _next_colour(self) -> int:
-        self._coloured += 1
-        return PALETTE[(self._coloured - 1) % len(PALETTE)]
+            self._colours[name] = PALETTE[len(self._colours) % len(PALETTE)]
+        return self._colours[name]
 
 
 def _free_port(bind: str, port: int) -> int:
