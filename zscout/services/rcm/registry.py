@@ -92,7 +92,7 @@ class RequestRegistry:
             self._estimated.add(arc)
 
     def name(self, arc: ArcId) -> str:
-        return self._names.get(arc, request_id(arc))
+        return self._names.get(arc) or request_id(arc)
 
     def ended(self, arc: ArcId) -> bool:
         """Whether `arc` ended lately."""
