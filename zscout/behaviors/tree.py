@@ -9,16 +9,15 @@
     root.add(Greet("door"))           # its path is hall/door
     await root.perform(context)
 
-A behavior runs its children as it likes: one after the other, or side by side with `side_by_side`, where one
-that fails does not stop the others. The status that any of them reports is published under its path, so that
-people see the tree; the memory of each is checkpointed with the whole tree.
+A behavior performs its children as it likes. The status that any of them reports is published under its
+path, so that people see the tree; the memory of each is checkpointed with the whole tree.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final
 
 from msgspec.structs import replace
@@ -92,12 +91,6 @@ class Behavior:
         above = self.above if self.parent is None else self.parent.path
         return f"{above}/{self.name}" if above else self.name
 
-    def walk(self) -> Iterator[Behavior]:
-        """This behavior and all below it."""
-        yield self
-        for child in self.children:
-            yield from child.walk()
-
     async def run(self, context: BehaviorContext) -> None:
         """Does its work. To raise is to fail; cancelled when it is to end."""
         raise NotImplementedError(f"{type(self).__name__} has no run(); write one")
@@ -109,15 +102,6 @@ class Behavior:
             await self.run(context)
         finally:
             self.report("")
-
-    async def side_by_side(
-        self, context: BehaviorContext, children: Iterable[Behavior]
-    ) -> list[BaseException]:
-        """Performs `children` at once and returns the failures; one that fails leaves the others running."""
-        results = await asyncio.gather(
-            *(child.perform(context) for child in children), return_exceptions=True
-        )
-        return [result for result in results if isinstance(result, BaseException)]
 
     def report(
         self,

@@ -264,10 +264,12 @@ class ResourceController:
             work = await self.queue.get()
             if isinstance(work, HoldChange):
                 await self._carry_out_change(work)
-            elif self._is_early(work):
-                self._set_aside(work)
-            else:
+            elif not self._is_early(work):
                 await self._answer(work, self._carry_out(work))
+            elif self.queue.set_aside(work, self.mesh.keys.sender_of(work.key).host):
+                self._read_state()  # nothing else waits for that
+            else:
+                work.refuse(Refused("busy", f"too many commands to {self.name} are early; ask again").problem)
 
     async def _carry_out(self, query: CommandQuery) -> Any:
         """What is answered, or a Future of it."""
@@ -317,18 +319,10 @@ class ResourceController:
             log.exception("%s: a command failed", self.name)
             query.refuse(Refused("failed", f"{self.name} could not do it; see the log of its node").problem)
 
-    # Commands under a grant that this RC does not know yet
-
     def _is_early(self, query: CommandQuery) -> bool:
+        """Whether a command comes under a grant that this RC does not know yet."""
         problem = self._refusal(query)
         return problem is not None and problem.code == "not_yet" and not self._is_stale(query)
-
-    def _set_aside(self, query: CommandQuery) -> None:
-        """Keeps a command until `rcm/state` has been read. Nothing else waits for that."""
-        if self.queue.set_aside(query, self.mesh.keys.sender_of(query.key).host):
-            self._read_state()
-        else:
-            query.refuse(Refused("busy", f"too many commands to {self.name} are early; ask again").problem)
 
     # Holds
 

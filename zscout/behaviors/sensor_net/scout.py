@@ -1,8 +1,7 @@
 """What one robot of a sensor net does with what it sees. Pure: time and pictures in, wheels and words out.
 
-A scout has two tasks. It *hides* until it stands in the dark and faces the light, and then *watches* for
-motion. It does either only while it is held, and lives on in between; `PlaceRobot` puts it on the mesh, the
-studies and tests run it under virtual time.
+A scout has two tasks, each only while it is held: it *hides* until it stands in the dark and faces the light,
+and then *watches* for motion.
 """
 
 from __future__ import annotations
@@ -41,10 +40,9 @@ class Step:
     """What follows from one look."""
 
     left: float
-    """Wheels: -1 to 1 of top speed."""
     right: float
     lasts: float
-    """Seconds that they may turn without a newer command."""
+    """Wheels: -1 to 1 of top speed, for so many seconds without a newer command."""
     doing: str
     detail: str
     boxes: tuple[Box, ...] = ()
