@@ -175,7 +175,7 @@ def test_how_one_ended_is_told_as_it_was(tmp_path: Path) -> None:
 
             bad = await hosts.start("a", "bad", "spin", {"cpu": "much"})
             assert (bad.ended, bad.tail) == ("failed", "")
-            assert 'parameters are no good: params: cpu: is the text "much"; write a number' in bad.reason
+            assert 'parameters are no good: cpu: is the text "much"; write a number' in bad.reason
             for kind, words in (("no-component", "no subclass of"), ("missing", "can't be imported")):
                 wrong = await hosts.start("a", kind, kind)
                 assert (wrong.phase, wrong.ended) == ("ended", "failed")

@@ -82,9 +82,7 @@ class Where(NamedTuple):
         key = self.key
         if self.item_name and self.path[-1] != "name":
             key += f" ({_short(self.item_name)})"
-        return BadInput(
-            f"{self.source}: {key}: {what}; {remedy}" if key else f"{self.source}: {what}; {remedy}"
-        )
+        return BadInput(": ".join(filter(None, (self.source, key, f"{what}; {remedy}"))))
 
 
 def quoted(text: str) -> str:

@@ -49,7 +49,7 @@ SHARED: list[tuple[dict[str, Any], str]] = [
         "watch_priorty: unknown key; did you mean watch_priority, watch_slot or hide_priority?",
     ),
 ]
-"""Wrong for both, with the words after `params`."""
+"""Wrong for both, with the words."""
 
 OF_ONE: list[tuple[dict[str, Any], str]] = [
     ({}, "robot: is missing; add one, as in robot/scout33"),
@@ -116,7 +116,7 @@ def test_what_is_wrong_is_told_in_one_line(
     with pytest.raises(ValueError) as told:  # noqa: PT011 - the words are what is tested
         kind(params)
     line = str(told.value)
-    assert line == f"params: {words}"
+    assert line == words
     assert "\n" not in line
     assert len(line) < 300
 

@@ -17,7 +17,7 @@ from zscout.keyexpr import check_need
 
 T = TypeVar("T", bound=Struct)
 
-PARAMS: Final = Where("params")
+PARAMS: Final = Where("")
 SLICE: Final = 0.02
 """Seconds of a turn of `spin`: in between the event loop has its own."""
 MEGABYTE: Final = 1_000_000
