@@ -1,4 +1,4 @@
-"""A framegrabber: pictures of an OpenCV source, published as JPEG while somebody holds it and somebody looks.
+"""A framegrabber: pictures of an OpenCV source, published as JPEG while it is held and has subscribers.
 
 It is tuned to the video RC that stands in the gang of its holder. Three things happen side by side: a capture
 reads the source (`capture.py`), a pump encodes and publishes in a thread of its own, and the event loop
@@ -69,6 +69,7 @@ class FramegrabberDriver(Driver):
         if not sources or not 0 < rate < math.inf or not 1 <= quality <= 100:
             raise ValueError("a framegrabber has a source, a rate above 0 and a quality of 1 to 100")
         self._sources = dict(sources)
+        self._receives = ", ".join(sorted(sources))
         self._rate = rate
         self._quality = quality
         self._meter = FrameMeter()
@@ -160,17 +161,17 @@ class FramegrabberDriver(Driver):
         if known:
             return known[0], ""
         if videos:
-            return None, f"it does not receive {', '.join(videos)}; it receives {self._receives()}"
+            return None, f"it does not receive {', '.join(videos)}; it receives {self._receives}"
         if len(self._sources) == 1:
             return next(iter(self._sources)), ""
-        return None, f"no video RC is in its gang; tune it to one of {self._receives()}"
+        return None, f"no video RC is in its gang; tune it to one of {self._receives}"
 
     def _wanted(self, holder: Holder, to: object) -> str:
         if "" in self._sources:
             raise Refused("bad_command", f"{self._rc.name} has one source only; there is nothing to tune")
         if not isinstance(to, str) or to not in self._sources:
             raise Refused(
-                "bad_command", f"{self._rc.name} receives {self._receives()}; set `to` to one of them"
+                "bad_command", f"{self._rc.name} receives {self._receives}; set `to` to one of them"
             )
         videos = [rc for rc in holder.rcs if rc.startswith("video/")]
         if videos and to not in videos:
@@ -178,9 +179,6 @@ class FramegrabberDriver(Driver):
                 "bad_command", f"your ARC holds {', '.join(videos)}, not {to}; ask the RCM for {to} also"
             )
         return to
-
-    def _receives(self) -> str:
-        return ", ".join(sorted(self._sources))
 
     def _tune(self, source: str, holder: Holder) -> None:
         """Publishes pictures of this source from now on, under the grant of `holder`."""
@@ -222,7 +220,7 @@ class FramegrabberDriver(Driver):
             self._pump = None
 
     def _close_unless_needed(self) -> None:
-        """A source stays open while somebody holds the framegrabber, and afterwards while somebody looks: the
+        """A source stays open while the framegrabber is held, and afterwards while it has subscribers: the
         next holder has its picture at once. A lost one stays open to be found again."""
         if self._holder is None and not self._publisher.watched and not self._lost:
             self._let_go()

@@ -36,7 +36,7 @@ LONGEST_SLEEP: Final = 60.0
 
 
 class RadioDriver(Driver):
-    """The RC of a radio. It carries what stops robots for everybody, and the rest for its holders."""
+    """The RC of a radio. It carries stops and halts for the node of any robot, the rest for its holders."""
 
     sharable = True
     relays = True
@@ -145,7 +145,7 @@ class RadioDriver(Driver):
         directory = self._rc.directory
         if order.rc is None or directory is None or not directory.is_node_of(sender, order.rc):
             raise Refused("no_grant", f"{sender} does not offer {order.rc}, the robot that it speaks for")
-        # A halt does no harm, whoever else claims the robot; but the claim of who is there stands.
+        # A halt does no harm, but the robot stays with the first RC that claimed it, while that one is there.
         owner = self._robots.get(order.robot)
         if owner is None or not self._is_offered(owner):
             self._robots[order.robot] = order.rc

@@ -44,7 +44,7 @@ COUNTED: Final = ("commands", "refused", "halts", "dead_man_stops")
 
 @dataclass(slots=True)
 class _Waiting:
-    """A command that the radio has not been asked to send yet."""
+    """A command that was not passed to the radio yet."""
 
     order: RadioDrive | RadioCamera | RadioStop
     radio: str
@@ -52,7 +52,7 @@ class _Waiting:
     answer: asyncio.Future[Any]
 
     def resolve(self, outcome: Any) -> None:
-        """Answers the command, unless nobody waits any more; a Refused refuses it."""
+        """Answers the command, once; a Refused refuses it."""
         if self.answer.done():
             return
         if isinstance(outcome, Refused):
@@ -76,7 +76,7 @@ class RobotDriver(Driver):
         self._waiting: deque[_Waiting] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._standing_at: Ns | None = 0
-        """When the wheels stand by themselves; None: a drive command is under way, and nobody knows."""
+        """When the wheels stand by themselves; None: unknown, a drive command is under way."""
         self._unsure = asyncio.Event()
         self._unsure.set()
         self._wake = asyncio.Event()
@@ -240,7 +240,7 @@ class RobotDriver(Driver):
         return False
 
     def _set_unsure(self, why: str) -> None:
-        """The robot can't be stopped for now: nobody may drive it."""
+        """The robot can't be stopped for now, so that it must not be driven either."""
         if self._rc.health != why:
             self._rc.fail(why)
         self._unsure.set()
