@@ -221,6 +221,7 @@ def test_limits_hold_and_silent_hosts_make_room(monkeypatch: pytest.MonkeyPatch)
         ("load_average", (math.inf, 0.0, 0.0)),
         ("memory_available", -1),
         ("memory_available", 2**64),
+        ("cores", 1e-300),
         ("load_average", (math.nan, 0.0, 0.0)),
     ],
 )

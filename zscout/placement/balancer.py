@@ -56,6 +56,8 @@ MAX_KINDS: Final = 10_000
 MAX_PLACED: Final = 100_000
 LARGEST: Final = 2**63
 """No load and no bytes of memory that a report may have are more."""
+SMALLEST: Final = 0.001
+"""Cores: what is divided by."""
 
 _Found: TypeAlias = tuple[float, HostName]
 """A host's score, negated: so the best comes first, and of equals the first by name."""
@@ -96,8 +98,9 @@ class Balancer:
         """A load report came. One with an older number than the last is dropped. Raises ValueError for
         figures that no host can have."""
         load, memory = report.load_average[0], report.memory_available
-        if not (0 <= load <= LARGEST and 0 <= memory <= LARGEST):
-            raise ValueError(f"load_average {load} or memory_available {memory}: no host has that")
+        if not (0 <= load <= LARGEST and 0 <= memory <= LARGEST and report.cores >= SMALLEST):
+            figures = f"load_average {load}, memory_available {memory} and cores {report.cores}"
+            raise ValueError(f"{figures}: no host has that")
         last = self.reports.get(report.host)
         if last is not None and report.number <= last[1].number and now - last[0] < STALE:
             return
