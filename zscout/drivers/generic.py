@@ -47,8 +47,7 @@ class VideoDriver(Driver):
 
     sharable = True
 
-    def __init__(self) -> None:
-        self._rc: RcHandle | None = None
+    _rc: RcHandle
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc
@@ -57,9 +56,11 @@ class VideoDriver(Driver):
         transmitting: list[ProposedHolder] = []
         for holder in holders:
             try:
-                count = _transmitters(holder.params)
+                count = exact(holder.params.get("transmitters", Decimal(1)), "transmitters")
             except ValueError as error:
                 return f"{holder.arc}: {error}"
+            if count.denominator != 1:
+                return f"{holder.arc}: transmitters is {float(count):g}; write 1, or 0 to listen only"
             if count > 1:
                 return f"{holder.arc} would transmit {count} times on it; one frequency carries one picture"
             if count:
@@ -82,12 +83,4 @@ class VideoDriver(Driver):
         return {"transmitters": float(len(held) - silent), "listeners": float(silent)}
 
     def _holders(self) -> list[Holder]:
-        return [] if self._rc is None else [held.holder for held in self._rc.holds.held.values()]
-
-
-def _transmitters(params: Mapping[str, Decimal]) -> int:
-    """How many transmitters a holder has on the channel. Raises ValueError with a reason in words."""
-    count = exact(params.get("transmitters", Decimal(1)), "transmitters")
-    if count.denominator != 1:
-        raise ValueError(f"transmitters is {float(count):g}; write 1, or 0 to listen only")
-    return int(count)
+        return [held.holder for held in self._rc.holds.held.values()]
