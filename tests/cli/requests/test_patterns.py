@@ -14,8 +14,8 @@ from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, events, out_of, read_until, zscout_here
 from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
-from zscout.cli.requests.contention import contention_of
 from zscout.cli.requests.options import HoldOptions
+from zscout.cli.requests.waiting import contention_of
 from zscout.messages import HoldView, RcmState, RcView
 from zscout.types import NO_TERM, Grant, Place
 

@@ -13,9 +13,9 @@ import click
 from zscout.behaviors.client.client import Client
 from zscout.cli import common
 from zscout.cli.common import Failed
-from zscout.cli.requests.contention import contention_of, hold_json, hold_text
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, Need, gather, hold_options
 from zscout.cli.requests.request import carry_out
+from zscout.cli.requests.waiting import contention_of, hold_json, hold_text
 from zscout.messages import HoldView, RcmState
 from zscout.terminal import clean, print_json, print_line
 

@@ -10,7 +10,7 @@ from msgspec import structs
 from zscout import terminal
 from zscout.behaviors.client.client import TRY_AGAIN, Client
 from zscout.cli import common
-from zscout.cli.requests.contention import NeedContention, contention_of, hold_json
+from zscout.cli.requests.waiting import NeedContention, contention_of, hold_json
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import check_name, client_of
 from zscout.messages import Cancel, HoldView, Notice, RcAsk, RcmState, RcState, Release, WaitView

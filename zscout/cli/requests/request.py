@@ -14,10 +14,9 @@ from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common
 from zscout.cli.common import Failed
-from zscout.cli.requests.contention import held_text
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, Need, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
-from zscout.cli.requests.waiting import Report
+from zscout.cli.requests.waiting import Report, held_text
 from zscout.messages import Foresight
 from zscout.terminal import clean, print_json, print_line, span
 

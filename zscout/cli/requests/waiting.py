@@ -1,10 +1,13 @@
-"""The progress of a request: a live line at a terminal, plain lines in a pipe, or JSON lines."""
+"""What a request waits for: each need, the RCs that would meet it, and who holds them, as the RCM sees it.
+
+And the report of its progress: a live line at a terminal, plain lines in a pipe, or JSON lines."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Mapping
 from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from typing import IO, Any, Final
 
 from msgspec.structs import replace
@@ -12,13 +15,124 @@ from msgspec.structs import replace
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
 from zscout.cli import common
-from zscout.cli.requests.contention import contention_of, held_text
-from zscout.messages import RcmState
-from zscout.terminal import LiveLine, print_json, span
+from zscout.keyexpr import is_pattern, matcher
+from zscout.messages import HoldView, RcmState
+from zscout.terminal import LiveLine, clean, print_json, span
 from zscout.types import SECOND, Ns
 
 REFRESH: Final = 1.0
 """Seconds between two looks at who holds what, at least; and where somebody watches, between two pictures."""
+
+
+# Who is in the way
+
+
+@dataclass(frozen=True, slots=True)
+class RcContention:
+    """One RC, and the holds of others on it."""
+
+    rc: str
+    present: bool
+    sharable: bool
+    holds: list[HoldView]
+
+    @property
+    def free(self) -> bool:
+        return self.present and not self.holds
+
+    def text(self) -> str:
+        """Who has it and since when, in words."""
+        return f"{self.rc}: " + "; ".join(hold_text(hold) for hold in self.holds)
+
+
+@dataclass(slots=True)
+class NeedContention:
+    """One need, and the RCs that would meet it: the one that it names, or those that match."""
+
+    need: str
+    rcs: list[RcContention]
+    rivals: int = field(default=0, init=False)
+    """How many of the request's other patterns some of these RCs would meet as well."""
+
+    @property
+    def rc(self) -> str | None:
+        """The RC that it names."""
+        return None if is_pattern(self.need) else self.need
+
+    @property
+    def present(self) -> bool:
+        """Whether there is anything on the mesh that would meet it."""
+        return any(rc.present for rc in self.rcs)
+
+    @property
+    def sharable(self) -> bool:
+        return bool(self.rcs) and all(rc.sharable for rc in self.rcs)
+
+    @property
+    def free(self) -> list[str]:
+        """The RCs that nobody else holds."""
+        return [rc.rc for rc in self.rcs if rc.free]
+
+    @property
+    def met(self) -> bool:
+        """Whether there is a free one for it, whatever the other needs are met by."""
+        return len(self.free) > self.rivals
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs; `rc` is null for a pattern."""
+        return {
+            "need": self.need,
+            "rc": self.rc,
+            "present": self.present,
+            "sharable": self.sharable,
+            "free": self.free,
+            "holders": [hold_json(hold) | {"rc": rc.rc} for rc in self.rcs for hold in rc.holds],
+        }
+
+
+def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> list[NeedContention]:
+    """How each need stands, holds of the ARC `own` (`<host>/<client>/<id>`) left out. What one need names
+    does not meet another."""
+    holds = [hold for hold in state.holds if f"{hold.client}/{hold.id}" != own]
+    views = {view.rc: view for view in state.rcs}
+
+    def seen(rc: str) -> RcContention:
+        view = views.get(rc)
+        theirs = [hold for hold in holds if rc in hold.needs]
+        return RcContention(rc, view is not None and view.present, view is not None and view.sharable, theirs)
+
+    found = []
+    for need in sorted(needs):
+        meets = matcher(need)
+        matching = sorted(rc for rc in views if rc not in needs and meets(rc)) if is_pattern(need) else [need]
+        # What matches and has gone says nothing: another will do.
+        rcs = [seen(rc) for rc in matching if not is_pattern(need) or views[rc].present]
+        found.append(NeedContention(need, rcs))
+    for one in found:
+        own_rcs = {rc.rc for rc in one.rcs}
+        one.rivals = sum(1 for other in found if other is not one and own_rcs & {rc.rc for rc in other.rcs})
+    return found
+
+
+def hold_text(hold: HoldView) -> str:
+    """Whose hold it is and since when, in words."""
+    left = "kept" if hold.keep else f"{span(hold.remaining)} left"
+    return clean(f"{hold.arc} (priority {hold.priority}, {hold.client}) for {span(hold.held)}, {left}")
+
+
+def hold_json(hold: HoldView) -> dict[str, Any]:
+    """The same for programs."""
+    said = {name: getattr(hold, name) for name in ("arc", "id", "client", "priority", "keep")}
+    return said | {"held": round(hold.held, 3), "remaining": round(hold.remaining, 3)}
+
+
+def held_text(rcs: Collection[str], bound: dict[str, str]) -> str:
+    """What is held, and for which pattern: `framegrabber/fgrab1 for framegrabber/*, robot/a`."""
+    met = {rc: need for need, rc in bound.items()}
+    return ", ".join(f"{rc} for {met[rc]}" if rc in met else rc for rc in sorted(rcs))
+
+
+# The report
 
 
 class Report(LiveLine):
