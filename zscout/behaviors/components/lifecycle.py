@@ -50,10 +50,10 @@ class _Unusable(Exception):
 
 
 class ComponentLifecycle:
-    """Runs the component of `job`. `tell` sends a word to the node, waited for or not."""
+    """Runs the component of `job`. `report` sends one to the node, waited for or not."""
 
-    def __init__(self, job: ComponentJob, tell: Callable[[ComponentReport], asyncio.Future[None]]) -> None:
-        self._job, self._tell = job, tell
+    def __init__(self, job: ComponentJob, report: Callable[[ComponentReport], asyncio.Future[None]]) -> None:
+        self._job, self._report = job, report
         self._story: asyncio.Task[EndReport] | None = None
         self._wanted: EndReport | None = None
         """How it is to end, once something wants it to."""
@@ -76,7 +76,7 @@ class ComponentLifecycle:
 
     async def run(self) -> EndReport:
         """Returns how it ended, when all that it held has been given back, or handed over."""
-        story = self._story = asyncio.create_task(self._tell_story())
+        story = self._story = asyncio.create_task(self._run_story())
         if self._wanted is not None:
             story.cancel()
         left = asyncio.create_task(self._left.wait())
@@ -112,8 +112,8 @@ class ComponentLifecycle:
                 self._supervisor.spawn(self._or_decline(order.number, self._take_in(order)))
 
     def end(self, ends: EndReport) -> None:
-        """Has it end; of several ends that are wanted the first is told. A move that has begun is called off;
-        if it is committed, another one goes on and this one is over anyhow."""
+        """Has it end; of several ends the first is reported. A move that has begun is called off; if it is
+        committed, another one goes on and this one is over anyhow."""
         if self._wanted is not None:
             return
         self._wanted = ends
@@ -124,7 +124,7 @@ class ComponentLifecycle:
 
     # What happens to it
 
-    async def _tell_story(self) -> EndReport:
+    async def _run_story(self) -> EndReport:
         job = self._job
         connecting = asyncio.create_task(Client.connect(job.client, fleet=job.fleet, host=job.host))
         # It joins the mesh in a thread: what follows is done meanwhile.
@@ -142,7 +142,7 @@ class ComponentLifecycle:
         try:
             if job.start.standby:
                 await _finds(client, Role.RCM, [lambda _: True], LINKED)
-                await self._tell(PhaseReport("standby", movable))
+                await self._report(PhaseReport("standby", movable))
                 if not await self._called(client):
                     return EndReport(
                         "stopped", f"it stood by for {STAND_BY:g} s and nothing was handed to it"
@@ -183,7 +183,7 @@ class ComponentLifecycle:
         self._running = True
         try:
             # Not waited for: nothing comes between this and its first step.
-            self._tell(PhaseReport("running", movable))
+            self._report(PhaseReport("running", movable))
             await component.run(ComponentContext(client, start.component, start.incarnation, self._gate))
         except asyncio.CancelledError:
             if self._wanted is None:
@@ -214,7 +214,7 @@ class ComponentLifecycle:
         try:
             await carried_out
         except NotMoved as refused:
-            await self._tell(OrderAnswer(number, problem=Problem(refused.code, str(refused))))
+            await self._report(OrderAnswer(number, problem=Problem(refused.code, str(refused))))
 
     def _movable(self, *, standby: bool = False) -> tuple[Component, Client]:
         """Raises NotMoved where it does not run, or stand by, or can't be moved at all."""
@@ -235,7 +235,7 @@ class ComponentLifecycle:
                 state = state_of(component)
             finally:
                 self._gate.release()
-        await self._tell(OrderAnswer(order.number, state))
+        await self._report(OrderAnswer(order.number, state))
 
     async def _move_away(self, order: channel.MoveOrder) -> None:
         component, client = self._movable()
@@ -253,7 +253,7 @@ class ComponentLifecycle:
                 traceback.print_exc()
                 raise NotMoved("move_failed", _words(error)) from None
             self._away = EndReport("moved")
-            await self._tell(OrderAnswer(order.number, dead=dead))
+            await self._report(OrderAnswer(order.number, dead=dead))
             self._left.set()
 
     async def _take_in(self, order: channel.RestoreOrder) -> None:
@@ -274,7 +274,7 @@ class ComponentLifecycle:
         except (BadName, ValueError) as error:
             raise NotMoved("bad_request", _words(error, named=False)) from None
         self._restored.set()
-        await self._tell(OrderAnswer(order.number))
+        await self._report(OrderAnswer(order.number))
 
     def _on_component(self, token: Token, alive: bool) -> None:
         if not alive or token.name != self._job.start.component:

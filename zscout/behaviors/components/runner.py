@@ -33,8 +33,8 @@ from zscout.behaviors.components.lifecycle import ComponentLifecycle
 from zscout.behaviors.components.processes import kill_family
 
 _PR_SET_PDEATHSIG: Final = 1
-SAY_LAST: Final = 2.0
-"""Seconds for the last word to the node."""
+REPORT_LAST: Final = 2.0
+"""Seconds for the last report to the node."""
 
 
 def main() -> None:
@@ -62,10 +62,10 @@ async def _live(job: ComponentJob, connection: socket.socket, orders: BinaryIO) 
     # In a thread: a node that stands still must not hold up the component. In one, so that frames stay whole.
     speaker = ThreadPoolExecutor(1)
 
-    def tell(telling: ComponentReport) -> asyncio.Future[None]:
-        return loop.run_in_executor(speaker, _send, connection, channel.pack(telling))
+    def report(one: ComponentReport) -> asyncio.Future[None]:
+        return loop.run_in_executor(speaker, _send, connection, channel.pack(one))
 
-    life = ComponentLifecycle(job, tell)
+    life = ComponentLifecycle(job, report)
 
     def deliver(order: Order) -> None:
         loop.call_soon_threadsafe(life.order, order)
@@ -74,8 +74,8 @@ async def _live(job: ComponentJob, connection: socket.socket, orders: BinaryIO) 
     loop.add_signal_handler(signal.SIGTERM, life.end, EndReport("failed", "ended by SIGTERM"))
     ends = await life.run()
     with suppress(TimeoutError):
-        async with asyncio.timeout(SAY_LAST):
-            await tell(ends)
+        async with asyncio.timeout(REPORT_LAST):
+            await report(ends)
     if ends.how in ("moved", "superseded"):
         # Nothing that is left here may unwind: another one runs.
         sys.stdout.flush()

@@ -292,15 +292,15 @@ class ComponentProcess:
     async def _receive(self, stream: asyncio.StreamReader) -> None:
         try:
             while True:
-                telling: ComponentReport | None = await channel.read(stream, ComponentReport)
-                if telling is None:
+                report: ComponentReport | None = await channel.read(stream, ComponentReport)
+                if report is None:
                     return
-                self._on_message(telling)
+                self._on_message(report)
         except BadFrame as error:
             self._kill(EndReport("failed", f"it was killed: what it sent to its node is no message: {error}"))
 
-    def _on_message(self, telling: ComponentReport) -> None:
-        match telling:
+    def _on_message(self, report: ComponentReport) -> None:
+        match report:
             case PhaseReport(phase=phase, movable=movable):
                 self.movable = movable
                 if self.phase != "stopping":
@@ -311,12 +311,12 @@ class ComponentProcess:
                 if phase == "running":
                     self.running.set()
             case EndReport():
-                self._end_report = telling
-                self._supervisor.call_later(LINGER, self._kill, telling)
+                self._end_report = report
+                self._supervisor.call_later(LINGER, self._kill, report)
             case _:
-                waiting = self._waiting.get(telling.number)
+                waiting = self._waiting.get(report.number)
                 if waiting is not None and not waiting.done():
-                    waiting.set_result(telling)
+                    waiting.set_result(report)
 
     def _late(self) -> None:
         if not self.settled.is_set():
