@@ -181,7 +181,7 @@ class Twins:
                 assert status.reason == two.queued[arc.id].reason
         for client in {arc.request.client for arc in one.running.values()}:
             theirs: list[Arc] = [*one.queued.values(), *one.running.values()]
-            assert one.arcs_of(client) == [arc for arc in theirs if arc.request.client == client]
+            assert self.indexed.arcs_of(client) == [arc.id for arc in theirs if arc.request.client == client]
 
 
 def decisions(effects: list[Effect]) -> list[Effect]:

@@ -81,9 +81,9 @@ class _Search:
             self._call_next_watcher(rc, rank)
 
     def _call_next_watcher(self, rc: Rc, rank: Rank | None) -> None:
-        following = self.state.index.next_watcher(rc, rank)
+        following = self.state.next_watcher(rc, rank)
         if following is not None:
-            heapq.heappush(self._heap, (following, rc.bit, self.state.queued[following[3]], rc))
+            heapq.heappush(self._heap, following)
 
     def _might_start(self, arc: Arc) -> bool:
         if arc.mask & ~self.state.present or arc.unbound:
@@ -302,8 +302,7 @@ class ConflictGroup:
         return ranked, accepted
 
     def _accepted(self, rc: Rc, holders: HolderSet) -> bool:
-        answer = self.votes.known(rc.name, holders)
-        return holders <= rc.holders.keys() or (answer is not None and answer.accept)
+        return holders <= rc.holders.keys() or self.votes.accepts(rc.name, holders)
 
     def _holders(self, rc: Rc, chosen: int) -> Iterator[ArcId]:
         """Who would hold `rc`."""

@@ -210,6 +210,10 @@ class Rc:
     watchers: list[Rank] = field(default_factory=list)
     """Ranks of the queued ARCs that watch this RC (`QueueIndex`), best first."""
 
+    def firm(self, arc: Arc, now: Ns) -> list[Arc]:
+        """Its holders that are not preempted for `arc`."""
+        return [holder for holder in self.holders.values() if not holder.preemptible_by(arc, now)]
+
 
 # Events: each carries everything the core may know about it
 

@@ -72,7 +72,7 @@ class Binder:
     def _fitness(self, arc: Arc, rc: Rc) -> tuple[int, float]:
         """How well `rc` would do, and what decides between equals."""
         demand = float(rc.demand)
-        firm = [holder for holder in rc.holders.values() if not holder.preemptible_by(arc, self._state.now)]
+        firm = rc.firm(arc, self._state.now)
         if rc.sharable:
             answer = self._votes.known(rc.name, frozenset((*(holder.id for holder in firm), arc.id)))
             if answer is None and rc.name in self._votes.silent:

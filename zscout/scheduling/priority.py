@@ -182,8 +182,7 @@ class AdmissionCheck:
 
     def _firm_holders(self, rc: Rc) -> HolderSet:
         """The ARC beside those who would stay."""
-        stay = [name for name, holder in rc.holders.items() if not holder.preemptible_by(self.arc, self.now)]
-        return frozenset((*stay, self.arc.id))
+        return frozenset((*(holder.id for holder in rc.firm(self.arc, self.now)), self.arc.id))
 
     def _candidates(self) -> list[Arc]:
         """In rank order, those who may be preempted and hold a sharable RC that it needs."""
@@ -444,11 +443,11 @@ class Pass:
 
     def _call_next_watcher(self, rc: Rc, rank: Rank | None) -> None:
         """The next watcher of `rc` below `rank` comes."""
-        following = self.index.next_watcher(rc, rank)
+        following = self.state.next_watcher(rc, rank)
         if following is None:
             del self._reports_left[rc.bit]
         else:
-            heapq.heappush(self._heap, (following, rc.bit, self.state.queued[following[3]], rc))
+            heapq.heappush(self._heap, following)
 
     def _needs_check(self, rc: Rc, arc: Arc) -> bool:
         """False ends it: `rc` has a holder again that is preempted for nobody from `arc` downwards."""

@@ -111,10 +111,10 @@ class Reservations:
 
     def _free_from(self, rc: Rc, arc: Arc) -> float:
         """When `rc` has room for `arc` at the latest; infinite where that is not known."""
-        firm = [holder for holder in rc.holders.values() if not holder.preemptible_by(arc, self._state.now)]
+        firm = rc.firm(arc, self._state.now)
         if rc.sharable:
             sharing = (reservation.arc.id for reservation in self.by_rc.get(rc.bit, ()))
-            if self._accepts(rc, frozenset((*(holder.id for holder in firm), *sharing, arc.id))):
+            if self._votes.accepts(rc.name, frozenset((*(holder.id for holder in firm), *sharing, arc.id))):
                 return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
             if rc.name in self._votes.silent or (alone is not None and not alone.accept):
@@ -154,7 +154,7 @@ class Reservations:
             if not rc.sharable:
                 return ReservationConflict(rc, reason)
             together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
-            if not self._accepts(rc, together):
+            if not self._votes.accepts(rc.name, together):
                 known = self._votes.known(rc.name, together)
                 asked = known is None and rc.name not in self._votes.silent
                 return ReservationConflict(rc, reason, together if asked else None)
@@ -180,10 +180,6 @@ class Reservations:
             if self.by_rc.get(bit) != earlier.by_rc.get(bit):
                 bits |= bit
         return bits
-
-    def _accepts(self, rc: Rc, holders: HolderSet) -> bool:
-        answer = self._votes.known(rc.name, holders)
-        return answer is not None and answer.accept
 
 
 def _end(holder: Arc, arc: Arc) -> float:

@@ -87,11 +87,6 @@ class QueueIndex:
         """How many of the queued rank above `arc`."""
         return bisect_left(self.ranks, arc.rank)
 
-    def next_watcher(self, rc: Rc, rank: Rank | None) -> Rank | None:
-        """The best of the watchers of `rc` below `rank`; of all of them without a rank."""
-        at = 0 if rank is None else bisect_right(rc.watchers, rank)
-        return rc.watchers[at] if at < len(rc.watchers) else None
-
     def watch(self, arc: Arc, rc: Rc) -> None:
         """`rc` alone keeps `arc` out."""
         if arc.watched is not rc:
@@ -229,6 +224,13 @@ class SchedulerState:
             low = mask & -mask
             yield self._by_bit[low.bit_length() - 1]
             mask ^= low
+
+    def next_watcher(self, rc: Rc, rank: Rank | None) -> tuple[Rank, int, Arc, Rc] | None:
+        """The best of the watchers of `rc` below `rank`, of all of them without a rank: for a heap."""
+        at = 0 if rank is None else bisect_right(rc.watchers, rank)
+        if at == len(rc.watchers):
+            return None
+        return rc.watchers[at], rc.bit, self.queued[rc.watchers[at][3]], rc
 
     def arc(self, arc: ArcId) -> Arc | None:
         return self.running.get(arc) or self.queued.get(arc)

@@ -146,6 +146,11 @@ class Votes:
         """The answer that stands for exactly this set, by itself or by what it implies; None if unknown."""
         return self._ballots[rc].known(holders)
 
+    def accepts(self, rc: RcName, holders: HolderSet) -> bool:
+        """Whether it is known that an RC accepts this set."""
+        answer = self.known(rc, holders)
+        return answer is not None and answer.accept
+
     def vetoed(self, rc: RcName) -> list[HolderSet]:
         """The sets that an RC has vetoed; each rules out every larger one as well."""
         return list(self._ballots[rc].vetoed)
