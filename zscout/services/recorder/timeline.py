@@ -147,8 +147,9 @@ class Timeline(Drawing):
     def arrange(self) -> None:
         """Lays the viewer out anew if there is something new to show: a fleet without robots or components
         has no use for empty panes."""
-        robots = self.robots.shown if self.robots.shown.any else NO_ROBOTS
-        now = self.hosts.placing, robots._replace(behavior_rows=min(robots.behavior_rows, 1))
+        robots = self.robots.shown
+        robots = robots._replace(behavior_rows=min(robots.behavior_rows, 1)) if robots.any else NO_ROBOTS
+        now = self.hosts.placing, robots
         if now != self._arranged and not self.closed:
             self._arranged = now
             self.recording.send_blueprint(self._layout(live=True))

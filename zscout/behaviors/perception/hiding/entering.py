@@ -10,8 +10,15 @@ import msgspec
 import numpy as np
 
 from zscout.behaviors.perception.darkness import DarkPlace, View
-from zscout.behaviors.perception.hiding.controller import FULL_TURN, HOP, HidingController, Step
-from zscout.behaviors.perception.hiding.state import Opening, distance, wrapped
+from zscout.behaviors.perception.hiding.state import (
+    FULL_TURN,
+    HOP,
+    HidingState,
+    Opening,
+    Step,
+    distance,
+    wrapped,
+)
 from zscout.behaviors.perception.lens import COLUMNS
 
 AT_EDGE: Final = 0.17
@@ -53,11 +60,7 @@ SEES_OUT: Final = 0.45
 """Share of columns that must show lit floor."""
 
 
-def begin_approach(robot: HidingController) -> None:
-    robot.seen_target = robot.clock
-
-
-def approach(robot: HidingController, view: View) -> Step:
+def approach(robot: HidingState, view: View) -> Step:
     """Keeps the place ahead and drives; re-centred at every picture."""
     target = robot.target
     if target is None:
@@ -115,19 +118,19 @@ def aim_at(place: DarkPlace, expected: float) -> float:
     return kept + TO_MIDDLE * (place.bearing - kept)
 
 
-def begin_enter(robot: HidingController) -> None:
+def begin_enter(robot: HidingState) -> None:
     ahead = robot.target.distance if robot.target is not None else AT_EDGE
     robot.left_to_go, robot.faces = min(ahead, 0.8) + DEEP, 0
 
 
-def enter(robot: HidingController, view: View) -> Step:
+def enter(robot: HidingState, view: View) -> Step:
     """Straight on into the dark: a few lengths of the body from where the floor ahead is dark."""
     if robot.cruised(robot.left_to_go):
         return enter_stuck(robot, view)
     return robot.cruise(robot.pace, 0.0, "drives in")
 
 
-def enter_stuck(robot: HidingController, view: View) -> Step:
+def enter_stuck(robot: HidingState, view: View) -> Step:
     if view.near > OUTSIDE * view.middling:
         # The floor just ahead is lit and all the rest dark: it is in front of the dark, not in it.
         robot.note, robot.at_edge = "bumped at the edge of the dark", True
@@ -135,13 +138,13 @@ def enter_stuck(robot: HidingController, view: View) -> Step:
     return "face"
 
 
-def begin_face(robot: HidingController) -> None:
+def begin_face(robot: HidingState) -> None:
     robot.turned, robot.opened = 0.0, 1.0
     robot.openings = []
     robot.faces += 1
 
 
-def face(robot: HidingController, view: View) -> Step:
+def face(robot: HidingState, view: View) -> Step:
     """A full turn in the dark; then to the side that shows most lit floor."""
     robot.sight(view)
     if abs(robot.turned) < FULL_TURN and robot.hops < MOST_HOPS:
@@ -149,7 +152,7 @@ def face(robot: HidingController, view: View) -> Step:
     return to_light(robot)
 
 
-def to_light(robot: HidingController) -> Step:
+def to_light(robot: HidingState) -> Step:
     """Turns to the lightest side of the full turn just made."""
     robot.goal, robot.next_phase = lightest(robot.openings).heading, "settle"
     robot.note = "turns to the light"
@@ -180,11 +183,7 @@ def lightest(openings: list[Opening]) -> Opening:
     return max(openings, key=value)
 
 
-def begin_settle(robot: HidingController) -> None:
-    robot.shifted = False
-
-
-def settle(robot: HidingController, view: View) -> Step:
+def settle(robot: HidingState, view: View) -> Step:
     """Turned to the light: is it dark here, and lit there?"""
     if robot.shifted:
         # It came nearer to the light, or went further in: how is it here?
@@ -210,16 +209,16 @@ def settle(robot: HidingController, view: View) -> Step:
     return "leave"
 
 
-def hidden(robot: HidingController, _: View) -> Step:
+def hidden(robot: HidingState, _: View) -> Step:
     """Keeps still."""
     return robot.stand(robot.note)
 
 
-def begin_check(robot: HidingController) -> None:
+def begin_check(robot: HidingState) -> None:
     robot.openings = []
 
 
-def check(robot: HidingController, view: View) -> Step:
+def check(robot: HidingState, view: View) -> Step:
     """Back after a loss of the hold: is it still hidden? By what it sees as it stands, and not as strictly as
     when it hid: nothing moves unless the place is another one."""
     robot.openings = [*robot.openings, robot.opening(view)]

@@ -22,21 +22,27 @@ from zscout.behaviors.perception.darkness import View, analyse
 from zscout.behaviors.perception.garble import garbled
 from zscout.behaviors.perception.hiding import entering, searching
 from zscout.behaviors.perception.hiding.compass import BANDS, strip_and_tones
-from zscout.behaviors.perception.hiding.controller import HidingController, Step, thumb_of
-from zscout.behaviors.perception.hiding.state import FORM, MAX_CHECKPOINT, Phase, Thumb, WheelCommand
+from zscout.behaviors.perception.hiding.state import (
+    FORM,
+    MAX_CHECKPOINT,
+    HidingState,
+    Phase,
+    Step,
+    WheelCommand,
+)
 from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture
 
 
 class PhaseCode(NamedTuple):
-    """The functions of one phase of hiding. They keep nothing of their own: all is in the controller."""
+    """The functions of one phase of hiding. They keep nothing of their own: all is in the state."""
 
-    step: Callable[[HidingController, View], Step]
+    step: Callable[[HidingState, View], Step]
     """What to do on this picture. After a hop it is called when that is over and measured."""
-    begin: Callable[[HidingController], None] = lambda _: None
+    begin: Callable[[HidingState], None] = lambda _: None
     """The phase begins; nothing is commanded yet."""
     cruises: bool = False
     """It drives without waiting for a still picture."""
-    stuck: Callable[[HidingController, View], Step] = searching.stuck
+    stuck: Callable[[HidingState, View], Step] = searching.stuck
     """It drove, and nothing moved."""
 
 
@@ -44,10 +50,10 @@ PHASES: Final[dict[Phase, PhaseCode]] = {
     "scan": PhaseCode(searching.scan, searching.begin_scan),
     "aim": PhaseCode(searching.aim),
     "roam": PhaseCode(searching.roam, searching.begin_roam, True, searching.roam_stuck),
-    "approach": PhaseCode(entering.approach, entering.begin_approach, True),
+    "approach": PhaseCode(entering.approach, cruises=True),
     "enter": PhaseCode(entering.enter, entering.begin_enter, True, entering.enter_stuck),
     "face": PhaseCode(entering.face, entering.begin_face),
-    "settle": PhaseCode(entering.settle, entering.begin_settle),
+    "settle": PhaseCode(entering.settle),
     "back": PhaseCode(searching.back, searching.begin_back),
     "dodge": PhaseCode(searching.dodge),
     "leave": PhaseCode(searching.leave, searching.begin_leave, True),
@@ -73,7 +79,7 @@ class Hider:
     """Hides one robot."""
 
     def __init__(self, *, seed: int = 0) -> None:
-        self._robot = HidingController(dice=seed & 0xFFFFFFFFFFFFFFFF)
+        self._robot = HidingState(dice=seed & 0xFFFFFFFFFFFFFFFF)
 
     @property
     def state(self) -> str:
@@ -109,9 +115,7 @@ class Hider:
         strip, tones = strip_and_tones(picture)
         over, waits = True, robot.phase != "hidden" and robot.hopping
         if waits:
-            thumb = thumb_of(picture)
-            over = robot.settled(strip, tones, thumb)
-            robot.thumbs = [Thumb(robot.clock, thumb.tobytes())]
+            over = robot.settled(strip, tones, picture)
         elif phase.cruises:
             robot.advanced(passed, strip)
         robot.previous, robot.tones = strip.tobytes(), tones.tobytes()
@@ -189,7 +193,7 @@ class Hider:
         if len(data) > MAX_CHECKPOINT:
             raise BadCheckpoint(f"a checkpoint of {len(data)} bytes is more than {MAX_CHECKPOINT}")
         try:
-            robot = msgspec.msgpack.decode(data, type=HidingController)
+            robot = msgspec.msgpack.decode(data, type=HidingState)
         except (msgspec.MsgspecError, UnicodeDecodeError) as problem:
             raise BadCheckpoint(f"is no checkpoint of a hider: {problem}") from problem
         if robot.form != FORM:

@@ -6,14 +6,16 @@ import math
 from typing import Final
 
 from zscout.behaviors.perception.darkness import View
-from zscout.behaviors.perception.hiding.controller import FULL_TURN, HOP, HidingController, Step
 from zscout.behaviors.perception.hiding.entering import sheltered, to_light
 from zscout.behaviors.perception.hiding.state import (
+    FULL_TURN,
+    HOP,
     MAX_SIGHTINGS,
     HidingState,
     Opening,
     Sighting,
     Spot,
+    Step,
     distance,
     wrapped,
 )
@@ -32,7 +34,7 @@ MOST_BLOCKED: Final = 4
 """Sides of a scan that may be tried."""
 
 
-def begin_scan(robot: HidingController) -> None:
+def begin_scan(robot: HidingState) -> None:
     robot.turned, robot.opened, robot.faces = 0.0, 1.0, 0
     robot.sightings, robot.openings = [], []
     robot.scans += 1
@@ -42,7 +44,7 @@ def begin_scan(robot: HidingController) -> None:
     robot.tries, robot.target, robot.blocked = 0, None, []
 
 
-def scan(robot: HidingController, view: View) -> Step:
+def scan(robot: HidingState, view: View) -> Step:
     """A full turn in steps; at its end the best dark place is chosen."""
     robot.sight(view)
     robot.sightings = robot.sightings[-MAX_SIGHTINGS:]
@@ -55,7 +57,7 @@ def scan(robot: HidingController, view: View) -> Step:
     target = best(robot)
     if target is None:
         return "roam"
-    robot.target, robot.seen_target = target, robot.clock
+    robot.target = target
     robot.goal, robot.next_phase = target.heading, "approach"
     left = math.degrees(wrapped(target.heading - robot.heading))
     side = "left" if left > 0 else "right"
@@ -87,7 +89,7 @@ def best(memory: HidingState) -> Sighting | None:
     return chosen
 
 
-def aim(robot: HidingController, _: View) -> Step:
+def aim(robot: HidingState, _: View) -> Step:
     """Turns to `goal` in measured hops, then goes on to `next_phase`."""
     off = wrapped(robot.goal - robot.heading)
     if abs(off) > AIMED and robot.hops < 10:
@@ -95,7 +97,7 @@ def aim(robot: HidingController, _: View) -> Step:
     return robot.next_phase
 
 
-def begin_roam(robot: HidingController) -> None:
+def begin_roam(robot: HidingState) -> None:
     if robot.next_phase == "roam":
         robot.next_phase = "scan"
         return
@@ -105,7 +107,7 @@ def begin_roam(robot: HidingController) -> None:
     robot.note = f"no dark place in view, drives {robot.left_to_go:.1f} m to where it is open"
 
 
-def roam(robot: HidingController, _: View) -> Step:
+def roam(robot: HidingState, _: View) -> Step:
     """No dark place in view: drives to the most open side. Where that is blocked, to the next."""
     if robot.next_phase == "roam":
         return "aim"
@@ -114,13 +116,13 @@ def roam(robot: HidingController, _: View) -> Step:
     return robot.cruise(robot.pace, 0.0, robot.note)
 
 
-def roam_stuck(robot: HidingController, _: View) -> Step:
+def roam_stuck(robot: HidingState, _: View) -> Step:
     robot.blocked = [*robot.blocked, robot.heading]
     robot.note = "bumped on the way to where it is open"
     return "back"
 
 
-def most_open(robot: HidingController) -> Opening:
+def most_open(robot: HidingState) -> Opening:
     """One of the scan's sides, none near one that was blocked, by a little luck."""
     best, most = Opening(robot.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -99.0
     for one in robot.openings:
@@ -140,17 +142,17 @@ def most_open(robot: HidingController) -> Opening:
 # Out of a bump, and out of a place that is no good
 
 
-def stuck(robot: HidingController, _: View) -> Step:
+def stuck(robot: HidingState, _: View) -> Step:
     """It drove, and nothing moved."""
     robot.note, robot.at_edge = "bumped", False
     return "back"
 
 
-def begin_back(robot: HidingController) -> None:
+def begin_back(robot: HidingState) -> None:
     robot.bumps += 1
 
 
-def back(robot: HidingController, _: View) -> Step:
+def back(robot: HidingState, _: View) -> Step:
     """Backs off from what it pushed against, then turns aside."""
     if robot.hops == 0:
         return robot.step_straight(-0.14, f"{robot.note or 'bumped'}: backs off")
@@ -160,7 +162,7 @@ def back(robot: HidingController, _: View) -> Step:
     return "dodge"
 
 
-def dodge(robot: HidingController, view: View) -> Step:
+def dodge(robot: HidingState, view: View) -> Step:
     """Turns aside and looks around anew."""
     target = robot.target
     if robot.hops == 0:
@@ -180,7 +182,7 @@ def dodge(robot: HidingController, view: View) -> Step:
     return "scan"
 
 
-def side_of(robot: HidingController, view: View) -> int:
+def side_of(robot: HidingState, view: View) -> int:
     """1 left, -1 right: at the edge of the dark where it goes on, else by turns."""
     left, right = view.sides
     if robot.at_edge and max(left, right) > 1.5 * min(left, right):
@@ -188,11 +190,11 @@ def side_of(robot: HidingController, view: View) -> int:
     return 1 if robot.bumps % 2 else -1
 
 
-def begin_leave(robot: HidingController) -> None:
+def begin_leave(robot: HidingState) -> None:
     robot.left_to_go = 0.6
 
 
-def leave(robot: HidingController, _: View) -> Step:
+def leave(robot: HidingState, _: View) -> Step:
     """Out of a place that is no hiding place, towards the light."""
     if robot.cruised(robot.left_to_go):
         return "scan"

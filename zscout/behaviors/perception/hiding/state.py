@@ -1,17 +1,37 @@
-"""All that a hider remembers, in one structure: a checkpoint is this, as MessagePack. And what it commands.
+"""All that a hider remembers, in one structure: a checkpoint is this, as MessagePack. And the moves that all
+phases share: turns that are measured, drives that are watched, what was seen where. Pure.
 
 Times are seconds of the hider's own clock, which begins at 0 and counts only what passed between pictures:
 after a move to another host, whose clock reads otherwise, it goes on. Places are dead-reckoned from where
 the hider began: metres, x along its first heading.
+
+A *hop* is a short turn on the spot, after which the robot waits until the picture stands still and measures
+how far it truly turned. A *cruise* is a drive with short commands, each with a time to live, one at every
+picture.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
+import cv2
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from zscout.behaviors.perception.darkness import View
+from zscout.behaviors.perception.hiding.compass import (
+    BANDS,
+    SCALE,
+    Strip,
+    Tones,
+    brighter,
+    floor_strip,
+    turned,
+)
+from zscout.behaviors.perception.lens import COLUMNS, Picture
 
 MAX_CHECKPOINT: Final = 64_000
 """Bytes; a hider's own is below 20,000."""
@@ -19,10 +39,51 @@ MAX_SIGHTINGS: Final = 120
 MAX_BAD: Final = 24
 FORM: Final = 1
 """Of the checkpoint; one of another form is refused."""
+WHEEL_BASE: Final = 0.11
+"""Metres between a Scout's two wheels."""
+TOP_SPEED: Final = 0.30
+"""Metres per second, of each wheel."""
+TOP_SPIN: Final = 2 * TOP_SPEED / WHEEL_BASE
+"""Radians per second with the wheels at full speed against each other."""
+STRAIGHT: Final = 0.7
+"""Share of top speed of a straight step."""
+HOP: Final = math.radians(36)
+LONGEST_HOP: Final = math.radians(44)
+FULL_TURN: Final = math.tau - math.radians(20)
+"""Radians of hops that show all sides."""
+SETTLES: Final = 0.15
+"""Seconds after a hop before its picture may count: the motors' lag."""
+LAGS: Final = 0.33
+"""Seconds after a hop when a turn that shows as expected is taken to be over."""
+SETTLED: Final = 1.0
+"""Seconds after a hop when its picture counts even if it still seems to move."""
+SURE: Final = 0.35
+"""Likeness below which a measured turn is not believed."""
+WATCHED: Final = 0.5
+"""Seconds of driving after which the near floor is another one."""
+SAME_FLOOR: Final = 0.5
+"""Likeness of the floor now and then from which on it is the same: 0.6 to 0.95 when stuck, below 0.35
+else."""
+BRIGHTER: Final = 4.0
+"""How many times brighter than here the floor of a column that sees out is."""
 
 Phase = Literal[
     "scan", "aim", "roam", "approach", "enter", "face", "settle", "back", "dodge", "leave", "hidden", "check"
 ]
+WORDS: Final[dict[Phase, str]] = {
+    "scan": "search",
+    "aim": "search",
+    "roam": "search",
+    "approach": "approach",
+    "enter": "enter",
+    "face": "turn",
+    "settle": "turn",
+    "back": "unstick",
+    "dodge": "unstick",
+    "leave": "unstick",
+    "hidden": "hidden",
+    "check": "hidden",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +104,10 @@ class WheelCommand:
     @property
     def moves(self) -> bool:
         return self.left != 0 or self.right != 0
+
+
+Step: TypeAlias = WheelCommand | Phase
+"""What a phase does on a picture: a command, or the phase that goes on with the same picture."""
 
 
 class Sighting(msgspec.Struct, frozen=True):
@@ -149,7 +214,7 @@ class HidingState(msgspec.Struct):
     openings: list[Opening] = msgspec.field(default_factory=list)
     target: Sighting | None = None
     seen_target: float = 0.0
-    """When the target was last seen."""
+    """When the target was last seen, in this phase."""
     goal: float = 0.0
     """Heading to turn to, or metres to go, as the phase has it."""
     left_to_go: float = 0.0
@@ -175,6 +240,176 @@ class HidingState(msgspec.Struct):
     why: str = ""
     """As last reported."""
 
+    def go(self, phase: Phase) -> None:
+        """Changes the phase."""
+        self.phase, self.began = phase, self.clock
+        self.hopping, self.hops, self.shifted, self.seen_target = False, 0, False, self.clock
+        self.thumbs, self.floors, self.halted = [], [], 0
+
+    def act(self, left: float, right: float, lasts: float, why: str) -> WheelCommand:
+        if left == 0 and right == 0:
+            lasts = 0.0
+        self.left, self.right, self.ends = left, right, self.clock + lasts
+        self.why = why
+        return WheelCommand(left, right, lasts, self.word, why, self.phase == "hidden")
+
+    @property
+    def word(self) -> str:
+        """What it is doing, for people."""
+        # To aim is part of what follows.
+        facing = self.phase == "aim" and self.next_phase == "settle"
+        return WORDS["settle" if facing else self.phase]
+
+    def stand(self, why: str) -> WheelCommand:
+        return self.act(0.0, 0.0, 0.0, why)
+
+    def rest(self, why: str) -> WheelCommand:
+        """Nothing new: what was commanded runs out by itself."""
+        lasts = self.ends - self.clock
+        if lasts > 0.01:
+            return WheelCommand(self.left, self.right, lasts, self.word, why)
+        return WheelCommand(0.0, 0.0, 0.0, self.word, why)
+
+    @property
+    def here_for(self) -> float:
+        """Seconds in this phase."""
+        return self.clock - self.began
+
+    def roll(self) -> float:
+        """0 to 1, from the seed: a step of splitmix64."""
+        self.dice = (self.dice + 0x9E3779B97F4A7C15) & 0xFFFFFFFFFFFFFFFF
+        mixed = self.dice
+        mixed = ((mixed ^ (mixed >> 30)) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF
+        mixed = ((mixed ^ (mixed >> 27)) * 0x94D049BB133111EB) & 0xFFFFFFFFFFFFFFFF
+        return float((mixed ^ (mixed >> 31)) >> 11) / float(1 << 53)
+
+    def point(self, heading: float, distance: float) -> tuple[float, float]:
+        """Where one is so far from here in this direction."""
+        return self.x + distance * math.cos(heading), self.y + distance * math.sin(heading)
+
+    # Hops
+
+    def hop(self, angle: float, why: str) -> WheelCommand:
+        """Turns on the spot by `angle` (at most `LONGEST_HOP`, the rest is for the next hop)."""
+        angle = max(-LONGEST_HOP, min(LONGEST_HOP, angle))
+        speed = 0.5 if abs(angle) > 0.25 else 0.3
+        wheel = math.copysign(speed, angle)
+        self._measure(angle, 0.0)
+        return self.act(-wheel, wheel, abs(angle) / (TOP_SPIN * speed), why)
+
+    def step_straight(self, distance: float, why: str) -> WheelCommand:
+        """Drives straight by `distance` metres (negative: back) and waits for a still picture."""
+        wheel = math.copysign(STRAIGHT, distance)
+        self._measure(0.0, distance)
+        return self.act(wheel, wheel, abs(distance) / (TOP_SPEED * STRAIGHT), why)
+
+    def _measure(self, angle: float, distance: float) -> None:
+        self.hopping, self.expected, self.hop_length = True, angle, distance
+        self.anchor, self.anchor_tones = self.previous, self.tones
+
+    def settled(self, strip: Strip, tones: Tones, picture: Picture) -> bool:
+        """Whether the hop is over and measured. Until then the caller stands, or lets the wheels turn."""
+        thumb = cv2.resize(picture, (40, 30), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        moved = difference(self.thumbs[-1].data, thumb) if self.thumbs else 255.0
+        self.thumbs = [Thumb(self.clock, thumb.tobytes())]
+        over = self.clock - self.ends
+        if over < SETTLES:
+            return False
+        turn = turned(unpack(self.anchor), strip, self.expected)
+        still = moved <= 1.6 * self.noise + 0.4
+        # A turn that has come as far as it was to go needs no second look.
+        done = over >= LAGS and self.expected and turn.likeness >= 0.5
+        done = done and abs(turn.angle / self.expected - 1) < 0.2
+        if not still and not done and over < SETTLED:
+            return False
+        if moved <= 3 * self.noise + 0.5:
+            # Nothing moves: what differs is noise.
+            self.noise = max(0.3, 0.7 * self.noise + 0.3 * moved)
+        self.hopping = False
+        angle = turn.angle if turn.likeness >= SURE or self.hop_length else self.expected
+        if turn.likeness >= SURE and self.anchor_tones:
+            old = np.frombuffer(self.anchor_tones, np.uint8).reshape(tones.shape)
+            self.opened *= brighter(old, tones, angle)
+        self.heading += angle
+        self.turned += angle
+        self.x, self.y = self.point(self.heading, self.hop_length)
+        self.hops += 1
+        return True
+
+    # Cruises
+
+    def cruise(self, speed: float, spin: float, why: str) -> WheelCommand:
+        """Drives on at `speed` (m/s, ahead positive) and `spin` (rad/s, left positive) until the next
+        picture."""
+        half = spin * WHEEL_BASE / 2
+        left, right = (speed - half) / TOP_SPEED, (speed + half) / TOP_SPEED
+        most = max(1.0, abs(left), abs(right))
+        lasts = min(1.0, max(0.3, 2.2 * self.interval))
+        return self.act(left / most, right / most, lasts, why)
+
+    @property
+    def pace(self) -> float:
+        """Metres per second that suit the rate of pictures."""
+        return min(0.24, 0.07 / self.interval)
+
+    def cruised(self, least: float) -> bool:
+        """Whether this phase has driven so many metres."""
+        return self.pace * self.here_for >= least
+
+    def advanced(self, seconds: float, strip: Strip) -> None:
+        """Dead reckoning over the time since the last picture, while cruising."""
+        ran = min(seconds, max(0.0, self.ends - (self.clock - seconds)))
+        if ran <= 0:
+            return
+        self.x, self.y = self.point(self.heading, (self.left + self.right) / 2 * TOP_SPEED * ran)
+        if self.previous and not self.hopping:
+            spin = (self.right - self.left) * TOP_SPEED / WHEEL_BASE
+            turn = turned(unpack(self.previous), strip, spin * ran, math.radians(15))
+            self.heading += turn.angle if turn.likeness >= SURE else spin * ran
+
+    def blocked_by(self, picture: Picture) -> bool:
+        """Whether the robot has driven for a while over the same floor: it pushes against something."""
+        floor = floor_strip(picture)
+        since = self.clock - max(WATCHED, 1.5 * self.interval)
+        old = [one for one in self.floors if one.at <= since]
+        kept = [*old[-1:], *(one for one in self.floors if one.at > since)]
+        self.floors = [*kept[-11:], Thumb(self.clock, floor.tobytes())]
+        same = bool(old) and turned(unpack(old[-1].data), floor, 0.0, 0.3).likeness >= SAME_FLOOR
+        self.halted = self.halted + 1 if same else 0
+        return self.halted >= 2
+
+    # What was seen where
+
+    def sight(self, view: View) -> None:
+        """Adds what this picture shows to the scan's findings."""
+        for place in view.places:
+            heading = self.heading + place.bearing
+            x, y = self.point(heading, place.distance)
+            self.sightings.append(
+                Sighting(heading, place.distance, place.width, place.height, place.darkness, x, y)
+            )
+        self.openings.append(self.opening(view))
+
+    def opening(self, view: View) -> Opening:
+        """What this picture shows of its direction.
+
+        The farther one sees, the more there is around the horizon. In the simulated building 2 grey levels of
+        structure up to 0.7 m, 5 at 1 m, 8 beyond 1.5 m."""
+        middle = unpack(self.previous)[9:15, COLUMNS // 4 : -COLUMNS // 4].astype(np.float32)
+        return Opening(
+            heading=self.heading,
+            open_for=float(np.abs(middle).mean()) / SCALE / 5,
+            bright=float(view.contrast.mean()),
+            near=view.near / self.opened,
+            outside=view.outside / self.opened,
+            above=view.above / self.opened,
+            sees_out=float((view.contrast >= BRIGHTER).mean()),
+        )
+
+    def note_bad(self, x: float, y: float) -> None:
+        """This place is not tried again."""
+        self.bad = [*self.bad, Spot(x, y)][-MAX_BAD:]
+
 
 def distance(one: Spot | Sighting | HidingState, other: Spot | Sighting | HidingState) -> float:
     """Metres from one to the other."""
@@ -184,3 +419,17 @@ def distance(one: Spot | Sighting | HidingState, other: Spot | Sighting | Hiding
 def wrapped(angle: float) -> float:
     """The same angle within -pi to pi."""
     return math.remainder(angle, math.tau)
+
+
+def difference(grey: bytes, thumb: NDArray[np.uint8]) -> float:
+    """Mean difference in grey levels, whatever the exposure did in between."""
+    old = np.frombuffer(grey, np.uint8).astype(np.float32)
+    new = thumb.ravel().astype(np.float32)
+    gain = (float(old @ new) + 1) / (float(old @ old) + 1)
+    return float(np.abs(new - gain * old).mean())
+
+
+def unpack(strip: bytes) -> Strip:
+    if len(strip) != BANDS * COLUMNS:
+        return np.zeros((BANDS, COLUMNS), np.int8)
+    return np.frombuffer(strip, np.int8).reshape(BANDS, COLUMNS)
