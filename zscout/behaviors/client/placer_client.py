@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection
+from collections.abc import Awaitable, Callable, Collection
 from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Final, Self, TypeVar
@@ -81,37 +81,38 @@ class PlacerClient:
     async def request(self, operation: PlacerOperation, kind: type[R]) -> R:
         """Repeats the operation, which must be idempotent, until a placer answers. Raises RequestRefused,
         PlacerSilent."""
-        deadline = self._deadline()
-        while True:
-            answer = await self._ask(operation, kind)
-            if answer is not None:
-                return answer
-            if self.mesh.now() > deadline:
-                raise PlacerSilent(
-                    f"the component placer of fleet {self.mesh.keys.fleet} did not answer for "
-                    f"{self._patience:.0f} s; see zscout status, and the log of zscout-node where it leads"
-                )
-            await asyncio.sleep(AGAIN)
+        return await self._until(
+            lambda: self._ask(operation, kind),
+            f"the component placer of fleet {self.mesh.keys.fleet} did not answer for "
+            f"{self._patience:.0f} s; see zscout status, and the log of zscout-node where it leads",
+        )
 
     async def request_once(
         self, operation: PlacementOperation, done: Callable[[Placement], bool]
     ) -> Placement:
         """Does not repeat the operation where `done(placement)` says that it was done though its answer is
         missing. Raises RequestRefused, PlacerSilent."""
-        deadline = self._deadline()
-        while True:
+
+        async def attempt() -> Placement | None:
             answer = await self._ask(operation, Placement)
             if answer is not None:
                 self.take(answer)
                 return answer
             await self.refresh()
             placement = self.placements.get(operation.component)
-            if placement is not None and done(placement):
-                return placement
+            return placement if placement is not None and done(placement) else None
+
+        silent = "the component placer did not answer: it may be done or not; see zscout components"
+        return await self._until(attempt, silent)
+
+    async def _until(self, attempt: Callable[[], Awaitable[R | None]], silent: str) -> R:
+        deadline = self.mesh.now() + round(self._patience * SECOND)
+        while True:
+            answer = await attempt()
+            if answer is not None:
+                return answer
             if self.mesh.now() > deadline:
-                raise PlacerSilent(
-                    "the component placer did not answer: it may be done or not; see zscout components"
-                )
+                raise PlacerSilent(silent)
             await asyncio.sleep(AGAIN)
 
     # Placements
@@ -142,9 +143,6 @@ class PlacerClient:
             if self.only is None or placement.component in self.only:
                 self.placements[placement.component] = placement
         self.changed.set()
-
-    def _deadline(self) -> int:
-        return self.mesh.now() + round(self._patience * SECOND)
 
     async def _ask(self, operation: PlacerOperation, kind: type[R]) -> R | None:
         """One query; None: no answer, or the placer can't answer now. Raises RequestRefused."""
