@@ -64,10 +64,6 @@ class Core:
         self._run_again = False
         """Whether the strategy asked for another pass at once."""
 
-    @property
-    def _now(self) -> Ns:
-        return self._state.now
-
     def handle(self, now: Ns, *events: on.Event) -> list[Effect]:
         """Applies one instant's events and runs a pass. Raises ValueError where `now` goes backwards.
 
@@ -75,8 +71,8 @@ class Core:
         2. Apply the events, in the order given.
         3. Run a pass of the strategy, if anybody is queued (its steps: `priority.py`, `adaptive.py`).
         4. Say when to wake."""
-        if now < self._now:
-            raise ValueError(f"time went backwards: {now} after {self._now}")
+        if now < self._state.now:
+            raise ValueError(f"time went backwards: {now} after {self._state.now}")
         self._state.now = now
         self.batches += 1
         self._effects = []
@@ -189,7 +185,7 @@ class Core:
             case on.Vote(proposal, accept, reason):
                 self._votes.answer(proposal, accept=accept, reason=reason)
             case on.VoteOverdue(proposal):
-                self._votes.overdue(proposal, self._now)
+                self._votes.overdue(proposal, self._state.now)
             case on.RcJoined(rc, sharable):
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
@@ -218,7 +214,7 @@ class Core:
     def _ask(self, request: ArcRequest, place: Place | None, since: Ns | None) -> None:
         if self._state.arc(request.arc) is not None:
             return
-        since = self._now if since is None else min(since, self._now)
+        since = self._state.now if since is None else min(since, self._state.now)
         self._state.enqueue(self._new_arc(request, place), since)
 
     def _new_arc(self, request: ArcRequest, place: Place | None) -> Arc:
@@ -239,7 +235,7 @@ class Core:
         if arc is None:
             return
         if arc.hold is not None:
-            if outcome is Outcome.RELEASED and arc.past_min_runtime(self._now):
+            if outcome is Outcome.RELEASED and arc.past_min_runtime(self._state.now):
                 outcome = Outcome.COMPLETED
             self._end_hold(arc, outcome, reason, requeue=False)
             return
@@ -299,9 +295,9 @@ class Core:
             hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc))
             absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
             taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
-            over = held.end <= self._now
+            over = held.end <= self._state.now
             if not over or not (absent or taken):
-                self._state.enqueue(arc, self._now)
+                self._state.enqueue(arc, self._state.now)
             if absent or taken:
                 code = ReasonCode.RC_LOST if absent else ReasonCode.SUPERSEDED
                 reason = Reason(code, (*absent, *taken)[:1])
@@ -324,12 +320,17 @@ class Core:
 
     def start(self, arc: Arc) -> None:
         grant = self._next_grant()
-        hold = Hold(grant, self._now, self._now + arc.request.min_runtime, self._state.protected_below(arc))
+        hold = Hold(
+            grant,
+            self._state.now,
+            self._state.now + arc.request.min_runtime,
+            self._state.protected_below(arc),
+        )
         self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold))
 
     def preempt(self, arc: Arc, by: Arc) -> bool:
-        done = arc.past_min_runtime(self._now)
+        done = arc.past_min_runtime(self._state.now)
         outcome = Outcome.COMPLETED if done else Outcome.PREEMPTED
         reason = Reason(ReasonCode.DISPLACED if done else ReasonCode.PREEMPTED, by=(by.party,))
         self._end_hold(arc, outcome, reason)
@@ -343,7 +344,7 @@ class Core:
         self._effects.append(Queued(arc.id, arc.request.client, reason, settled))
 
     def propose(self, rc: Rc, holders: HolderSet) -> None:
-        number = self._votes.open_question(rc.name, holders, self._now)
+        number = self._votes.open_question(rc.name, holders, self._state.now)
         if number is None:
             return
         arcs = (self._state.arc(holder) for holder in sorted(holders))
@@ -357,12 +358,12 @@ class Core:
 
     def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
         """Ends a hold. What has had its minimum runtime is not queued again."""
-        requeue = requeue and not arc.past_min_runtime(self._now)
+        requeue = requeue and not arc.past_min_runtime(self._state.now)
         hold = self._state.stop(arc)
         self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))
         if requeue:
             arc.preemptions += outcome is Outcome.PREEMPTED
-            self._state.enqueue(arc, self._now)
+            self._state.enqueue(arc, self._state.now)
         else:
             self._forget(arc)
 
@@ -395,9 +396,9 @@ class Core:
     def _set_wake(self) -> None:
         at = self._state.next_end()
         if self._state.queued:
-            at = min(self._now + QUANTUM, at) if at is not None else self._now + QUANTUM
+            at = min(self._state.now + QUANTUM, at) if at is not None else self._state.now + QUANTUM
         if self._run_again:
-            at = self._now
+            at = self._state.now
         if at != self._wake or self._run_again:
             self._wake = at
             self._effects.append(WakeAt(at))
