@@ -41,7 +41,7 @@ BURST = 256
 OVERHEARD = 32
 """Publications that `overhear` keeps."""
 FINAL_SLACK = 0.5
-"""Seconds after its timeout at which a query is over though the transport has not said so."""
+"""Seconds after its timeout at which a query is over though the transport has not reported that."""
 
 OnReply: TypeAlias = Callable[[str, bytes, bool], bool]
 """Called with a reply's key, payload, and whether it is a message; returns whether that is enough."""

@@ -107,7 +107,7 @@ class ReasonInfo(Message, frozen=True):
     detail: str = ""
     count: int = 0
     pattern: str | None = None
-    """The pattern of its needs that is not met; the rest is said of one of the RCs that would meet it."""
+    """The pattern of its needs that is not met; the rest is about one of the RCs that would meet it."""
 
 
 class Notice(Message, frozen=True):

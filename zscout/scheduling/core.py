@@ -149,7 +149,7 @@ class Core:
         return joined, on.LeadTaken(term, standing, waiting)
 
     def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
-        """Whether an RC would accept these holders, by the votes that it has given; True if none tells."""
+        """Whether an RC would accept these holders, by the votes that it has given; True if unknown."""
         answer = self._votes.known(rc, holders)
         return answer is None or answer.accept
 

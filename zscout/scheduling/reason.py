@@ -77,7 +77,7 @@ class Reason(NamedTuple):
     detail: str = ""
     number: int = 0
     pattern: Need | None = None
-    """Which pattern of its needs keeps the ARC out; the rest is said of one of the RCs that meet it."""
+    """Which pattern of its needs keeps the ARC out; the rest is about one of the RCs that meet it."""
 
     def __str__(self) -> str:
         text = _TEXTS[self.code](self)

@@ -68,7 +68,7 @@ class Held:
 
     @property
     def active(self) -> bool:
-        """Whether the hold still stands, as far as this client has heard."""
+        """Whether the hold still stands, as far as this client knows."""
         return self.arc.grant == self.grant
 
     @property
@@ -91,7 +91,7 @@ class Held:
         return await self._client.command(rc, self.grant, do, ttl=ttl)
 
     async def resumed(self) -> None:
-        """Waits while the client is paused: whatever becomes of the hold meanwhile is told then."""
+        """Waits while the client is paused: what becomes of the hold meanwhile counts from then on."""
         await self._client.resumed()
 
     async def over(self) -> None:

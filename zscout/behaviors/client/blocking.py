@@ -64,7 +64,7 @@ class BlockingHeld:
         return list(self._held.rcs)
 
     def rc(self, need: str) -> str:
-        """The RC that meets a need, as `arc.Held.rc` tells. Raises KeyError."""
+        """The RC that meets a need, as `arc.Held.rc` has it. Raises KeyError."""
         return self._held.rc(need)
 
     def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Any:

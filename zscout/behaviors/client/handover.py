@@ -167,7 +167,7 @@ class Handover:
                 continue
             problem = reply.problem if reply is not None else None
             if problem is not None and problem.code == "not_running":
-                # It is over, or an RCM that has just taken the lead has not heard of it: this settles which.
+                # It is over, or an RCM that has just taken the lead does not know it: this settles which.
                 await self.rcm.ask(first)
             elif problem is not None and problem.code == "unknown_client" and self.mesh.now() < known_by:
                 # It sees the RCM; the RCM may not have seen its token yet.

@@ -60,7 +60,7 @@ class OpenArc:
     state: str = "asking"
     reason: str = ""
     why: ReasonInfo | None = None
-    """What `reason` says, as data, where the RCM said so."""
+    """What `reason` says, as data, where the RCM gave that."""
     outcome: str | None = None
     by: str | None = None
     place: Place | None = None
