@@ -6,7 +6,7 @@ it, is decided by the strategy's pass (`priority.py` has its steps), ARC by ARC,
 rule of `Arc.preemptible_by`; what RCs voted stands in `votes.py`, who holds what in `state.py`. The RCM
 service, `zscout replay`, the study and the forecast drive this one class:
 
-    effects = core.handle(now, Asked(request), ...)
+    effects = core.handle(now, Requested(request), ...)
 
 A batch of events is one instant: holds whose time is over end first, then the events are applied in the
 order given, then one pass runs. The caller carries the effects out in their order and comes back with what
@@ -316,7 +316,7 @@ class Core:
             else:
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.EXPIRED), requeue=False)
 
-    # What a strategy may do (strategy.Actions)
+    # What a strategy may do (state.Actions)
 
     def start(self, arc: Arc) -> None:
         grant = self._next_grant()

@@ -20,6 +20,7 @@ from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import ZenohMesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import Grants
+from zscout.services.rcm import request_handler
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import SECOND
 
@@ -165,6 +166,30 @@ def test_a_bad_request_is_refused_and_forgotten() -> None:
                 await one.request("bad", {RC: {}}, priority=10**9)
             assert refused.value.code == "bad_request"
             assert one.open_requests() == []
+
+    run(test())
+
+
+def test_a_queued_request_that_the_next_leader_refuses_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test() -> None:
+        async with small_fleet("one", "two") as (fleet, (one, two)):
+            fleet.candidate("h1")
+            await one.granted(await one.request("first", {RC: {}}, priority=5, min_runtime=600))
+            waits = await two.request("second", {RC: {}}, priority=5, min_runtime=600)
+            monkeypatch.setattr(request_handler, "MAX_PRIORITY", 4)
+            fleet.network.kill(fleet.leader())
+            del fleet.candidates["h0"]
+            # The new leader does not hear of it while it takes the lead.
+            link = fleet.network.link(two.mesh, fleet.candidates["h1"].mesh)
+            link.loss = 1.0
+            await until(lambda: one.leader == "h1")
+            await asyncio.sleep(1)
+            link.loss = 0.0
+            await until(lambda: waits.state == "ended", within=20)
+            assert waits.outcome == "lost"
+            assert waits.reason == "the RCM refuses it: priority must lie between -4 and 4"
+            assert await two.granted(waits) is None
+            assert two.open_requests() == []
 
     run(test())
 

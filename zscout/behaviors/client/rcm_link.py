@@ -160,7 +160,13 @@ class RcmLink:
             await self.leader_within(ASK_AGAIN * random.uniform(0.8, 1.2))  # noqa: S311
             for arc in self.store.open:
                 if arc.open and self.store.resumed.is_set():
-                    await self.ask(arc)
+                    problem = await self.ask(arc)
+                    if problem is not None and problem.code not in TRY_AGAIN and arc.state == "queued":
+                        # It will be refused each time, though an earlier RCM took it.
+                        self.store.withdrawn[arc.id] = Cancel(id=arc.id)
+                        arc.finish("lost", f"the RCM refuses it: {problem.message}", self.mesh.now())
+                        self.store.notify(arc)
+                        self.store.forget(arc)
             for request_id in list(self.store.withdrawn):
                 if not await self._withdraw(request_id):
                     break
