@@ -16,7 +16,7 @@ from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, events, gone, out_of, read_until
 from tests.hang import HANG
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
-from zscout.cli.requests.waiting import REFRESH, Report
+from zscout.cli.requests.request import REFRESH, Report
 from zscout.mesh import clock
 from zscout.messages import RcmState
 from zscout.types import SECOND

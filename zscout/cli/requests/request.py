@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Iterator
-from typing import Any, Final
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager
+from typing import IO, Any, Final
 
 import click
+from msgspec.structs import replace
 
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import Client, CommandRefused
@@ -16,9 +18,10 @@ from zscout.cli import common
 from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, Need, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
-from zscout.cli.requests.waiting import Report, held_text
-from zscout.messages import Foresight
-from zscout.terminal import clean, print_json, print_line, span
+from zscout.cli.requests.waiting import NeedContention, contention_of
+from zscout.messages import Foresight, RcmState
+from zscout.terminal import LiveLine, clean, print_json, print_line, span
+from zscout.types import SECOND, Ns
 
 TAKEN_AWAY: Final = 75
 """EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""
@@ -27,6 +30,8 @@ TIME_OVER: Final = 124
 MAX_PRIORITY: Final = 1_000_000
 LAST_WORD: Final = 0.5
 """Seconds in which the RCM's word about a hold whose time is over arrives."""
+REFRESH: Final = 1.0
+"""Seconds between two looks at who holds what, at least; and where somebody watches, between two pictures."""
 
 
 @click.command(cls=CommandAfterDashes)
@@ -110,7 +115,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
                 if not wanted.again:
                     lost = TAKEN_AWAY if wanted.command else 1
                     raise Failed(f"{wanted.name}: {refused}; try again", lost) from None
-                report.event("lost", f"{wanted.name}: {refused}; asking again", {"reason": str(refused)})
+                report.event("lost", f"{wanted.name}: {refused}; asking again", reason=str(refused))
                 arc = None
                 continue
             if code is not None:
@@ -129,15 +134,15 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
         if arc is not None:
             await client.end(arc)
         line = f"{wanted.name} was not granted within {span(wanted.timeout or 0)}, and is cancelled"
-        report.event("ended", "", {"outcome": "timeout", "reason": why})
+        report.event("ended", "", outcome="timeout", reason=why)
         raise Failed(clean(f"{line}: {why}" if why else line)) from None
     except asyncio.CancelledError:
         if arc is not None:
             await client.end(arc)
-        report.event("ended", f"{wanted.name} is cancelled", {"outcome": "cancelled"})
+        report.event("ended", f"{wanted.name} is cancelled", outcome="cancelled")
         raise
     if grant is None:
-        report.event("ended", "", {"outcome": arc.outcome, "reason": arc.reason})
+        report.event("ended", "", outcome=arc.outcome, reason=arc.reason)
         raise Failed(clean(f"{wanted.name} was not granted: {arc.reason or arc.outcome}"))
     return arc
 
@@ -148,11 +153,12 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     if grant is None:  # taken away since the RCs confirmed it
         return await _taken(client, wanted, report, arc)
     held = Held(client, arc, grant)
-    rcs = held_text(held.rcs, held.bound)
-    length = "until it is needed elsewhere" if arc.keep else f"for {span(held.remaining)}"
-    details = {"id": arc.id, "grant": grant, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
-    details["remaining"] = round(held.remaining, 3)
-    report.event("granted", f"{arc.name} holds {rcs} {length}", details)
+    rcs, left = _held_text(held), held.remaining
+    length = "until it is needed elsewhere" if arc.keep else f"for {span(left)}"
+    details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
+    report.event(
+        "granted", f"{arc.name} holds {rcs} {length}", **details, grant=grant, remaining=round(left, 3)
+    )
     try:
         code = None
         if wanted.command:
@@ -162,18 +168,18 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
                 await held.over()
     except BaseException:
         await client.end(arc)
-        report.event("ended", f"{arc.name} gave back {rcs}", {"outcome": "released"})
+        report.event("ended", f"{arc.name} gave back {rcs}", outcome="released")
         raise
     if code is not None:
         await client.end(arc)
-        report.event("ended", f"{arc.name} gave back {rcs}", {"outcome": "released", "code": code})
+        report.event("ended", f"{arc.name} gave back {rcs}", outcome="released", code=code)
         return code
     if held.active:
         # By our clock its time is over; the RCM's own word is on its way.
         await report.within(LAST_WORD, lambda: not held.active)
     if held.active or _ending(arc).outcome == "completed":
         arc.finish("completed", "its time is over", client.mesh.now())
-        report.event("ended", f"the time of {arc.name} is over", {"outcome": "completed"})
+        report.event("ended", f"the time of {arc.name} is over", outcome="completed")
         return TIME_OVER if wanted.command else 0
     return await _taken(client, wanted, report, arc)
 
@@ -188,7 +194,7 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
                 await client.end(held.arc)
             return await command.wait()
         why = "its time is over" if held.active else _ending(held.arc).reason or "the grant is gone"
-        report.event("stopping", f"{wanted.command[0]} is stopped: {why}", {"reason": why})
+        report.event("stopping", f"{wanted.command[0]} is stopped: {why}", reason=why)
         await command.end()
     return None
 
@@ -199,9 +205,9 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
     line = f"{arc.name} lost its grant: {ending.reason or ending.outcome}"
     details = {"outcome": ending.outcome, "reason": ending.reason, "by": ending.by, "again": again}
     if again:
-        report.event("taken", f"{line}; waiting again", details)
+        report.event("taken", f"{line}; waiting again", **details)
         return None
-    report.event("taken", line if wanted.command else "", details)
+    report.event("taken", line if wanted.command else "", **details)
     if arc.open:
         await client.end(arc)
     if wanted.command:
@@ -243,3 +249,138 @@ def _words(foretold: Foresight) -> Iterator[str]:
         yield f"{foretold.arc} would start at once"
     if foretold.preempts:
         yield f"it would preempt {', '.join(foretold.preempts)}"
+
+
+# The report
+
+
+class Report(LiveLine):
+    """Reports one request of a client on `stream`: a live line at a terminal, plain lines in a pipe, or JSON
+    lines. A context manager: the live line is gone afterwards."""
+
+    def __init__(self, name: str, client: Client, *, as_json: bool, stream: IO[str]) -> None:
+        super().__init__(stream, shown=not as_json)
+        self._name, self._client, self._as_json = name, client, as_json
+        self._mesh = client.mesh
+        self._arc: OpenArc | None = None
+        self._changed = asyncio.Event()
+        self._printed: object = None
+        """How it waited by the last line that stays."""
+        self._state: RcmState | None = None
+        """As it was `_looked` at, when `_seen` was the newest notice."""
+        self._looked: Ns | None = None
+        self._seen: object = None
+
+    def event(self, kind: str, text: str, /, **details: Any) -> None:
+        """Reports one event: `text` for people (empty: nothing), the rest for programs."""
+        if self._as_json:
+            who = {"event": kind, "arc": self._name, "client": str(self._mesh.me)}
+            print_json(who | details, self._stream)
+        elif text:
+            self.print(text)
+
+    def news(self, arc: OpenArc) -> None:
+        """A watcher for the client."""
+        self._arc = arc
+        self._changed.set()
+
+    @asynccontextmanager
+    async def telling(self, follow: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+        """Runs `follow_wait` or `follow_hold` for as long as the context lasts."""
+        try:
+            async with common.beside(follow):
+                yield
+        finally:
+            self.hide()
+
+    async def follow_wait(self) -> None:
+        """Shows how the request waits, until cancelled."""
+        while True:
+            if self._looked is not None and self._arc is not None and self._arc.state == "queued":
+                # One look per REFRESH: news may come in a crowd.
+                await asyncio.sleep(REFRESH - (self._mesh.now() - self._looked) / SECOND)
+            self._changed.clear()
+            arc = self._arc
+            if arc is None:
+                self.draw(f"{self._name}: asking the RCM")
+            elif arc.state in ("asking", "queued") and arc.reason:
+                news = arc.last != self._seen if self.watched else _how(arc) != self._printed
+                if arc.state == "queued" and news:
+                    self._looked, self._seen = self._mesh.now(), arc.last
+                    self._state = await self._client.state()
+                if arc.state in ("asking", "queued"):
+                    self._show_wait(arc)
+            await self._news_or_a_second()
+
+    async def follow_hold(self, arc: OpenArc) -> None:
+        """Shows how long a hold without a command goes on, until cancelled."""
+        while True:
+            self._changed.clear()
+            left = (arc.end - self._mesh.now()) / SECOND
+            rest = f"held for {span(self._since(arc))}, kept" if arc.keep else f"{span(left)} left"
+            self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}; Ctrl-C gives back")
+            await self._news_or_a_second()
+
+    async def within(self, seconds: float, true: Callable[[], bool]) -> None:
+        """Waits for news until `true`, at most so long."""
+        deadline = self._mesh.now() + round(seconds * SECOND)
+        while not true() and (left := deadline - self._mesh.now()) > 0:
+            self._changed.clear()
+            await common.within(left / SECOND, self._changed)
+
+    def _show_wait(self, arc: OpenArc) -> None:
+        now, start, starts_in = self._mesh.now(), "", None
+        needs: list[NeedContention] = []
+        if arc.start is not None:
+            starts_in = round(max(0, arc.start - now) / SECOND, 3)
+        if arc.state == "queued":
+            start = "no start can be foretold" if starts_in is None else f"starts in {span(starts_in)}"
+            if self._state is not None and self._looked is not None:
+                aged = _aged(self._state, (now - self._looked) / SECOND)
+                needs = contention_of(aged, arc.needs, f"{self._mesh.me}/{arc.id}")
+        # A sharable RC has holders who are in nobody's way, unless the reason names it. Two patterns may be
+        # met by one RC: it is listed once.
+        met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
+        in_way = [rc.text() for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
+        ahead = f", {arc.ahead} ahead" if arc.ahead else ""
+        waits = (
+            f"{arc.name} waits {span(self._since(arc))}{ahead}{f', {start}' if start else ''}: {arc.reason}"
+        )
+        self.draw("\n  ".join([waits, *in_way]))
+        # Without the estimate: it changes all the time.
+        if self.watched or self._printed == _how(arc):
+            return
+        self._printed = _how(arc)
+        self.event(
+            "waits",
+            "; ".join(filter(None, (f"{arc.name} waits{ahead}: {arc.reason}", start, *in_way))),
+            id=arc.id,
+            reason=arc.reason,
+            ahead=arc.ahead,
+            starts_in=starts_in,
+            needs=[need.as_json() for need in needs],
+        )
+
+    def _since(self, arc: OpenArc) -> float:
+        return (self._mesh.now() - arc.since) / SECOND
+
+    async def _news_or_a_second(self) -> None:
+        await common.within(REFRESH if self.watched else None, self._changed)
+
+
+def _how(arc: OpenArc) -> object:
+    return arc.state, arc.reason, arc.ahead
+
+
+def _aged(state: RcmState, seconds: float) -> RcmState:
+    """The state as it is so much later, if nothing has happened."""
+    holds = [
+        replace(hold, held=hold.held + seconds, remaining=hold.remaining - seconds) for hold in state.holds
+    ]
+    return replace(state, holds=holds)
+
+
+def _held_text(held: OpenArc | Held) -> str:
+    """What is held, and for which pattern: `framegrabber/fgrab1 for framegrabber/*, robot/a`."""
+    met = {rc: need for need, rc in held.bound.items()}
+    return ", ".join(f"{rc} for {met[rc]}" if rc in met else rc for rc in sorted(held.rcs))
