@@ -20,11 +20,18 @@ from zscout.behaviors.components.channel import (
     EndReport,
     Order,
     PhaseReport,
-    RestoreOrder,
-    StopOrder,
 )
 from zscout.config.fleet import default_fleet
-from zscout.messages import MAX_CHECKPOINT, ComponentSpec, OpenRequest, StartComponent
+from zscout.messages import (
+    MAX_CHECKPOINT,
+    ComponentSpec,
+    OpenRequest,
+    RestoreComponent,
+    StartComponent,
+    StopComponent,
+)
+
+STOP = Order(0, StopComponent("c"))
 
 
 @pytest.fixture
@@ -39,7 +46,7 @@ def test_messages_arrive_in_order_and_the_end_is_seen(pair: tuple[socket.socket,
     request = OpenRequest("1", "survey", {"robot/a": {"rate": Decimal("0.1")}}, 3, Decimal("2.5"))
     start = StartComponent("c", 7, ComponentSpec("counter", {"a": [1, None]}))
     job = ComponentJob(start, "m:C", "h", default_fleet(), "tag", memory=5)
-    orders = [StopOrder(), RestoreOrder(1, b"\x00\xff", [request])]
+    orders = [STOP, Order(1, RestoreComponent("c", 8, b"\x00\xff", [request]))]
     ours.sendall(b"".join(map(channel.pack, [job, *orders])))
     ours.close()
     assert channel.receive(theirs, ComponentJob) == job
@@ -50,12 +57,13 @@ def test_messages_arrive_in_order_and_the_end_is_seen(pair: tuple[socket.socket,
 def test_the_largest_checkpoint_goes_through(pair: tuple[socket.socket, BinaryIO]) -> None:
     ours, theirs = pair
     state = bytes(range(256)) * (MAX_CHECKPOINT // 256)
-    sender = threading.Thread(target=ours.sendall, args=(channel.pack(RestoreOrder(1, state, [])),))
+    frame = channel.pack(Order(1, RestoreComponent("c", 8, state)))
+    sender = threading.Thread(target=ours.sendall, args=(frame,))
     sender.start()
     order = channel.receive(theirs, Order)
     sender.join()
-    assert isinstance(order, RestoreOrder)
-    assert order.state == state
+    assert isinstance(order.operation, RestoreComponent)
+    assert order.operation.state == state
 
 
 HOSTILE = {
@@ -65,7 +73,7 @@ HOSTILE = {
     "no message": b"{}\n",
     "of another sort": channel.pack(PhaseReport("running", movable=True)),
     "deep": b"[" * 200_000 + b"\n",
-    "wrong type": b'{"type":"restore","number":"x"}\n',
+    "wrong type": b'{"type":"order","number":"x","operation":{"op":"stop","component":"c"}}\n',
 }
 
 
@@ -79,7 +87,7 @@ def test_what_is_no_frame_is_refused(pair: tuple[socket.socket, BinaryIO], raw: 
     sender.join()
 
 
-HALVES = {"body": channel.pack(StopOrder())[:-1], "nothing": b""}
+HALVES = {"body": channel.pack(STOP)[:-1], "nothing": b""}
 
 
 @pytest.mark.parametrize("raw", HALVES.values(), ids=HALVES)
@@ -101,7 +109,7 @@ def test_a_stream_is_read_alike() -> None:
     ends = EndReport("failed", "why")
     assert asyncio.run(read(channel.pack(ends))) == ends
     assert asyncio.run(read(channel.pack(ends)[:-1])) is None
-    for raw in (HOSTILE["garbage"], HOSTILE["too long"], HOSTILE["no JSON"], channel.pack(StopOrder())):
+    for raw in (HOSTILE["garbage"], HOSTILE["too long"], HOSTILE["no JSON"], channel.pack(STOP)):
         with pytest.raises(BadFrame):
             asyncio.run(read(raw))
 
@@ -112,5 +120,5 @@ def test_nothing_too_long_is_sent() -> None:
 
 
 def test_a_move_as_large_as_the_mesh_takes_fits() -> None:
-    order = RestoreOrder(1, b"x" * MAX_CHECKPOINT, [])
+    order = Order(1, RestoreComponent("c", 8, b"x" * MAX_CHECKPOINT))
     assert len(msgspec.json.encode(order)) < channel.MAX_FRAME

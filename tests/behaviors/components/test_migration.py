@@ -14,7 +14,7 @@ from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Sender
 from zscout.lab.faults.memory import MemoryNetwork
-from zscout.messages import ComponentOperation, ComponentSpec, ComponentView
+from zscout.messages import ComponentOperation, ComponentSpec, ComponentView, MoveComponent
 from zscout.types import SECOND
 
 STANDS_BY = ComponentView("c", 2, "b", ComponentSpec("counter"), "standby")
@@ -25,7 +25,7 @@ def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
         network = MemoryNetwork()
         client = Client(network.open("f", Sender("a", "c.1")), default_fleet())
         node = network.open("f", Sender("b", "node"))
-        move = OutgoingMove(client, Counter({}), SafePointGate(), "c", "b", 2)
+        move = OutgoingMove(client, Counter({}), SafePointGate(), MoveComponent("c", 1, "b", 2))
         began = client.mesh.now()
         with pytest.raises(NotMoved, match="b did not answer"):
             await move._give(b"", [])

@@ -10,11 +10,14 @@ from typing import Any, BinaryIO, Final, Literal, TypeAlias
 
 import msgspec
 
+from zscout import messages
 from zscout.config.fleet import Fleet
-from zscout.messages import MAX_MOVE, HowEnded, OpenRequest, Problem, StartComponent
+from zscout.messages import MAX_MOVE, HowEnded, Problem, StartComponent
 
 MAX_FRAME: Final = MAX_MOVE + 65_536
 """Bytes."""
+PATIENCE: Final = 5.0
+"""Seconds that a component has to come to a safe point for a checkpoint."""
 
 
 class BadFrame(Exception):
@@ -40,39 +43,21 @@ class ComponentJob(msgspec.Struct, frozen=True, tag="job"):
         return f"{self.start.component}.{self.start.incarnation}"
 
 
-class StopOrder(msgspec.Struct, frozen=True, tag="stop"):
-    """End by yourself."""
+Operation: TypeAlias = (
+    messages.StopComponent
+    | messages.CheckpointComponent
+    | messages.MoveComponent
+    | messages.RestoreComponent
+    | messages.ActivateComponent
+)
 
 
-class CheckpointOrder(msgspec.Struct, frozen=True, tag="checkpoint"):
-    """Answered with the state."""
-
-    number: int
-    patience: float
-
-
-class MoveOrder(msgspec.Struct, frozen=True, tag="move"):
-    """Answered once it goes on elsewhere; then it ends here."""
-
-    number: int
-    to: str
-    incarnation: int
-    patience: float
-
-
-class RestoreOrder(msgspec.Struct, frozen=True, tag="restore"):
-    """Take this in; answered."""
+class Order(msgspec.Struct, frozen=True, tag="order"):
+    """What the node was asked, as it was asked. Answered with an OrderAnswer of this number; a stop and an
+    activation are not, but reports follow."""
 
     number: int
-    state: bytes
-    requests: list[OpenRequest]
-
-
-class ActivateOrder(msgspec.Struct, frozen=True, tag="activate"):
-    """It is not answered, but PhaseReport follows when it runs."""
-
-
-Order: TypeAlias = StopOrder | CheckpointOrder | MoveOrder | RestoreOrder | ActivateOrder
+    operation: Operation
 
 
 class PhaseReport(msgspec.Struct, frozen=True, tag="stands"):

@@ -8,9 +8,10 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import Final
 
+from zscout import messages
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import (
+    PATIENCE,
     ComponentJob,
     ComponentReport,
     EndReport,
@@ -31,7 +32,7 @@ from zscout.behaviors.components.processes import limit_allocations
 from zscout.keyexpr import BadName, Role, Token, incarnation_of, matcher, new_instance
 from zscout.mesh import Declaration, MeshError
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import MAX_ERROR, Problem
+from zscout.messages import MAX_ERROR, MoveComponent, Problem, RestoreComponent
 
 STAND_BY: Final = 30.0
 """Seconds that one stands by without being restored or activated, and then again until it is activated."""
@@ -99,17 +100,17 @@ class ComponentLifecycle:
 
     def order(self, order: Order) -> None:
         """Carries out an order of the node."""
-        match order:
-            case channel.StopOrder():
+        match order.operation:
+            case messages.StopComponent():
                 self.end(EndReport("stopped"))
-            case channel.ActivateOrder():
+            case messages.ActivateComponent():
                 self._activated.set()
-            case channel.CheckpointOrder():
-                self._supervisor.spawn(self._or_decline(order.number, self._take_checkpoint(order)))
-            case channel.MoveOrder():
-                self._supervisor.spawn(self._or_decline(order.number, self._move_away(order)))
-            case channel.RestoreOrder():
-                self._supervisor.spawn(self._or_decline(order.number, self._take_in(order)))
+            case messages.CheckpointComponent():
+                self._supervisor.spawn(self._or_decline(order.number, self._take_checkpoint(order.number)))
+            case MoveComponent() as move:
+                self._supervisor.spawn(self._or_decline(order.number, self._move_away(order.number, move)))
+            case RestoreComponent() as restore:
+                self._supervisor.spawn(self._or_decline(order.number, self._take_in(order.number, restore)))
 
     def end(self, ends: EndReport) -> None:
         """Has it end; of several ends the first is reported. A move that has begun is called off; if it is
@@ -226,24 +227,23 @@ class ComponentLifecycle:
             raise NotMoved("not_movable", "it can't be moved: its kind has no checkpoint() and restore()")
         return component, client
 
-    async def _take_checkpoint(self, order: channel.CheckpointOrder) -> None:
+    async def _take_checkpoint(self, number: int) -> None:
         component, _ = self._movable()
         async with self._holding:
-            if not await self._gate.hold(order.patience):
-                raise NotMoved("not_safe", f"it came to no safe point within {order.patience:g} s")
+            if not await self._gate.hold(PATIENCE):
+                raise NotMoved("not_safe", f"it came to no safe point within {PATIENCE:g} s")
             try:
                 state = state_of(component)
             finally:
                 self._gate.release()
-        await self._report(OrderAnswer(order.number, state))
+        await self._report(OrderAnswer(number, state))
 
-    async def _move_away(self, order: channel.MoveOrder) -> None:
+    async def _move_away(self, number: int, move: MoveComponent) -> None:
         component, client = self._movable()
-        name = self._job.start.component
         async with self._holding:
-            self._move = OutgoingMove(client, component, self._gate, name, order.to, order.incarnation)
+            self._move = OutgoingMove(client, component, self._gate, move)
             try:
-                dead = await self._move.carry_out(order.patience)
+                dead = await self._move.carry_out()
             except BaseException as error:
                 self._move = None
                 if self._wanted is not None and self._story is not None:
@@ -253,28 +253,28 @@ class ComponentLifecycle:
                 traceback.print_exc()
                 raise NotMoved("move_failed", _words(error)) from None
             self._away = EndReport("moved")
-            await self._report(OrderAnswer(order.number, dead=dead))
+            await self._report(OrderAnswer(number, dead=dead))
             self._left.set()
 
-    async def _take_in(self, order: channel.RestoreOrder) -> None:
+    async def _take_in(self, number: int, handed: RestoreComponent) -> None:
         component, client = self._movable(standby=True)
-        held = [need for request in order.requests if request.grant is not None for need in request.needs]
+        held = [need for request in handed.requests if request.grant is not None for need in request.needs]
         if not await _finds(client, Role.RC, [matcher(need) for need in held], REACHED):
             words = f"{self._job.host} does not reach {', '.join(held)}, or not all of them"
             raise NotMoved("start_failed", words)
         try:
-            component.restore(order.state)
+            component.restore(handed.state)
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
             words = f"restore() failed: {_words(error)}"
             self.end(EndReport("failed", words))
             raise NotMoved("start_failed", words) from None
         try:
-            client.expect(order.requests)
+            client.expect(handed.requests)
         except (BadName, ValueError) as error:
             raise NotMoved("bad_request", _words(error, named=False)) from None
         self._restored.set()
-        await self._report(OrderAnswer(order.number))
+        await self._report(OrderAnswer(number))
 
     def _on_component(self, token: Token, alive: bool) -> None:
         if not alive or token.name != self._job.start.component:

@@ -21,6 +21,7 @@ from zscout.messages import (
     ComponentList,
     ComponentView,
     ListComponents,
+    MoveComponent,
     OpenRequest,
     Problem,
     RestoreComponent,
@@ -62,13 +63,14 @@ def state_of(component: Component) -> bytes:
 
 
 class OutgoingMove:
-    """One move of `component` to `incarnation` on host `to`."""
+    """One move of `component`, as it was ordered."""
 
     def __init__(
-        self, client: Client, component: Component, gate: SafePointGate, name: str, to: str, incarnation: int
+        self, client: Client, component: Component, gate: SafePointGate, order: MoveComponent
     ) -> None:
         self._client, self._component, self._gate = client, component, gate
-        self._name, self.to, self.incarnation = name, to, incarnation
+        self._name, self.to, self.incarnation = order.component, order.to, order.to_incarnation
+        self._patience = order.patience
         self.successor_runs = asyncio.Event()
         """To be set when the token of the other incarnation is seen: it runs, whatever else is known."""
         self.began = False
@@ -76,11 +78,11 @@ class OutgoingMove:
         self.called_off = ""
         """Why it must not be, as long as it is not committed."""
 
-    async def carry_out(self, patience: float) -> float:
+    async def carry_out(self) -> float:
         """Returns how long (s) the component did not run, once the other one does: this process is to end
         then, and to give up nothing. Raises NotMoved where it goes on here."""
-        if not await self._gate.hold(patience):
-            raise NotMoved("not_safe", f"it came to no safe point within {patience:g} s")
+        if not await self._gate.hold(self._patience):
+            raise NotMoved("not_safe", f"it came to no safe point within {self._patience:g} s")
         began, self.began = self._client.mesh.now(), True
         self._client.pause()
         try:

@@ -150,7 +150,7 @@ class ComponentHost:
                 return process.view()
             case ActivateComponent():
                 process = self._find(operation.component, operation.incarnation)
-                await process.activate()
+                await process.activate(operation)
                 return process.view()
 
     async def _start(self, start: StartComponent) -> msgspec.Struct:

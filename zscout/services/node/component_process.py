@@ -11,16 +11,20 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
+from zscout import messages
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import (
+    PATIENCE,
     BadFrame,
     ComponentJob,
     ComponentReport,
     EndReport,
+    Operation,
+    Order,
     OrderAnswer,
     PhaseReport,
 )
@@ -45,10 +49,8 @@ log = logging.getLogger("zscout.components")
 
 LINGER: Final = 2.0
 """Seconds from a process's last word to its end."""
-PATIENCE: Final = 5.0
-"""Seconds that a component has to come to a safe point for a checkpoint."""
 SLACK: Final = 5.0
-"""Seconds beyond that for its answer."""
+"""Seconds for its answer to an order, beyond those that it has to carry it out."""
 
 
 class ComponentProcess:
@@ -132,7 +134,7 @@ class ComponentProcess:
         """Returns when it has ended: by itself within `grace` seconds, or killed."""
         if self.phase != "ended":
             self.phase = "stopping"
-            self._send(channel.StopOrder())
+            self._order(messages.StopComponent(self.start.component))
         try:
             async with asyncio.timeout(grace):
                 await self.over.wait()
@@ -144,7 +146,8 @@ class ComponentProcess:
 
     async def checkpoint(self) -> bytes:
         self._check_runs()
-        return (await self._ask(channel.CheckpointOrder(self._next(), PATIENCE), PATIENCE + SLACK)).state
+        answer = await self._ask(messages.CheckpointComponent(self.start.component), PATIENCE + SLACK)
+        return answer.state
 
     async def move(self, order: MoveComponent) -> Moved:
         """Asked again for the same move it answers with the outcome of that one."""
@@ -160,8 +163,7 @@ class ComponentProcess:
 
     async def _move(self, order: MoveComponent) -> Moved:
         # Without an end: once it is committed it may last until the other node is known to be gone.
-        move = channel.MoveOrder(self._next(), order.to, order.to_incarnation, order.patience)
-        answer = await self._ask(move, None)
+        answer = await self._ask(order, None)
         if self.phase == "running":
             self.phase = "stopping"
         self.moved = Moved(order.component, order.to, order.to_incarnation, answer.dead)
@@ -170,39 +172,40 @@ class ComponentProcess:
     async def restore(self, order: RestoreComponent) -> None:
         if self.phase != "standby":
             raise Refused("move_failed", f"it is {self.phase} here; only one that stands by is restored")
-        await self._ask(channel.RestoreOrder(self._next(), order.state, order.requests), SLACK)
+        await self._ask(order, SLACK)
 
-    async def activate(self) -> None:
+    async def activate(self, order: messages.ActivateComponent) -> None:
         """Returns when it runs, or has ended."""
-        self._send(channel.ActivateOrder())
+        self._order(order)
         await self.running.wait()
 
     def _check_runs(self) -> None:
         if self.phase != "running":
             raise Refused("bad_request", f"{self.start.component} is {self.phase} here; it must run for that")
 
-    async def _ask(self, order: Any, timeout: float | None) -> OrderAnswer:
+    async def _ask(self, operation: Operation, timeout: float | None) -> OrderAnswer:
+        self._number += 1
+        number = self._number
         answered: asyncio.Future[OrderAnswer] = asyncio.get_running_loop().create_future()
-        self._waiting[order.number] = answered
+        self._waiting[number] = answered
         try:
-            self._send(order)
+            self._order(operation, number)
             async with asyncio.timeout(timeout):
                 answer = await answered
         except TimeoutError:
             raise Refused("not_safe", f"it did not answer within {timeout:g} s") from None
         finally:
-            self._waiting.pop(order.number, None)
+            self._waiting.pop(number, None)
         if answer.problem is not None:
             raise Refused(answer.problem.code, answer.problem.message)
         return answer
 
-    def _send(self, order: msgspec.Struct) -> None:
-        if self._writer is not None and not self._writer.is_closing():
-            self._writer.write(channel.pack(order))
+    def _order(self, operation: Operation, number: int = 0) -> None:
+        self._send(Order(number, operation))
 
-    def _next(self) -> int:
-        self._number += 1
-        return self._number
+    def _send(self, message: msgspec.Struct) -> None:
+        if self._writer is not None and not self._writer.is_closing():
+            self._writer.write(channel.pack(message))
 
     # Its life
 
@@ -258,7 +261,7 @@ class ComponentProcess:
         each = self._group.each
         self._send(ComponentJob(self.start, self._where, self._host, self._fleet, self._tag, each))
         if self.phase == "stopping":
-            self._send(channel.StopOrder())
+            self._order(messages.StopComponent(self.start.component))
         if self._verdict is not None:
             self._kill(self._verdict)
         gone = asyncio.Event()
