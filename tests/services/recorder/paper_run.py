@@ -13,7 +13,8 @@ from zscout.scheduling.model import ArcRequest, Effect, Granted, HoldEnded, Outc
 from zscout.scheduling.replay import Replay, replay
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.services.recorder.blueprint import TIME
-from zscout.services.recorder.timeline import OPERATOR_MARK, HolderRow, Timeline
+from zscout.services.recorder.drawing import HolderRow
+from zscout.services.recorder.timeline import OPERATOR_MARK, Timeline
 from zscout.types import SECOND, Ns
 
 _spec = find_spec("rerun_cli")

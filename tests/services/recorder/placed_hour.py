@@ -8,9 +8,10 @@ from typing import Final
 import msgspec
 
 from zscout.messages import ComponentUse, LoadReport, Placement, Placements
+from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.hosts import Use
 from zscout.services.recorder.placement_tracker import PlacementTracker
-from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.services.recorder.timeline import Timeline
 from zscout.types import Term
 
 HOUR: Final = 3600

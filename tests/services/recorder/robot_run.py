@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from tests.services.recorder.paper_run import rows
 from zscout.keyexpr import Sender
 from zscout.messages import BehaviorSaid, BuildingPlan, BuildingPoses, FrameHead, Placed, RcState
-from zscout.services.recorder.robot_tracker import RobotTracker
-from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.services.recorder.drawing import HolderRow
+from zscout.services.recorder.robots import RobotTracker
+from zscout.services.recorder.timeline import Timeline
 from zscout.types import Grant, Term
 
 SECONDS: Final = 60
@@ -120,7 +121,7 @@ def jpeg(at: float, robot: str, box: tuple[int, int, int, int] | None) -> bytes:
 
 def play(timeline: Timeline, until: int = SECONDS) -> None:
     """The run, as the recorder would write it; its first `until` seconds."""
-    tracker = RobotTracker(timeline)
+    tracker = timeline.robots
     grants: dict[tuple[int, float], Grant] = {}
     happens: list[tuple[float, Any]] = []
     for robot, turns in TURNS.items():
@@ -260,10 +261,12 @@ def _building(tracker: RobotTracker, at: float, tenth: int) -> None:
     begin, end = PERSON
     there = begin <= at < end
     people = [{"name": "walker", "x": 5.6 - 0.6 * (at - begin), "y": 1.2}] if there else []
-    tracker.poses(at, BUILDING, told(BuildingPoses, time=at * 2, speed=2.0, robots=robots, people=people))
-    if tracker.wants_plan(at) is not None:
+    tracker.floor.poses(
+        at, BUILDING, told(BuildingPoses, time=at * 2, speed=2.0, robots=robots, people=people)
+    )
+    if tracker.floor.wants_plan(at) is not None:
         plan = BuildingPlan("living_room", WIDTH, DEPTH, png())
-        tracker.plan(at, BUILDING, msgspec.json.decode(msgspec.json.encode(plan), type=BuildingPlan))
+        tracker.floor.plan(at, BUILDING, msgspec.json.decode(msgspec.json.encode(plan), type=BuildingPlan))
 
 
 def _on(way: tuple[tuple[float, float, float], ...], at: float) -> tuple[float, float, float]:

@@ -12,17 +12,16 @@ from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.robot_run import NET, say
 from zscout.keyexpr import Sender
 from zscout.messages import BehaviorSaid, RcState
-from zscout.services.recorder import robot_tracker
-from zscout.services.recorder import robots as robot_panes
+from zscout.services.recorder import robots
 from zscout.services.recorder.colours import DOING, OTHER
-from zscout.services.recorder.robot_tracker import MAX_WAITING, RATE, RateLimiter, RobotTracker
+from zscout.services.recorder.robots import MAX_WAITING, RATE, RateLimiter
 from zscout.services.recorder.timeline import Timeline
 
 
 def test_a_sender_s_last_word_comes_through_whatever_it_says(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
+        tracker = timeline.robots
         for number in range(1000):
             say(
                 tracker,
@@ -88,7 +87,7 @@ def test_behaviors_end_with_their_client_unless_they_moved(tmp_path: Path) -> No
     path = tmp_path / "run.rrd"
     heir = Sender("basil", "net")
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
+        tracker = timeline.robots
         say(tracker, 0, "net/a", "search")
         say(tracker, 0, "net/b", "watch")
         say(tracker, 1, "net/a", "approach", heir)
@@ -102,18 +101,18 @@ def test_behaviors_end_with_their_client_unless_they_moved(tmp_path: Path) -> No
 
 
 def test_lanes_are_bounded_and_keep_their_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot_panes, "MAX_LANES", 2)
-    monkeypatch.setattr(robot_panes, "DETAILS", 5)
+    monkeypatch.setattr(robots, "MAX_LANES", 2)
+    monkeypatch.setattr(robots, "DETAILS", 5)
     path = tmp_path / "run.rrd"
     deep = "/".join("abcdefghijk")
     with Timeline("lab", path=path) as timeline:
-        robots = timeline.robots
+        tracker = timeline.robots
         for number in range(20):
-            robots.behavior(number, deep, "search", f"{number}")
-        robots.behavior(20, deep, "alert", "more\n\x1b[31m")
-        robots.behavior(21, "../x y", "dances")
-        robots.behavior(22, "third", "search")
-        robots.behavior(22, "ended", "")
+            say(tracker, number, deep, "search", detail=f"{number}")
+        say(tracker, 20, deep, "alert", detail="more\n\x1b[31m")
+        say(tracker, 21, "../x y", "dances")
+        say(tracker, 22, "third", "search")
+        say(tracker, 22, "ended", "")
     assert set(lanes(path, "/behavior/**")) == {"/behavior/a/b/c/d/e/f/g/h", "/behavior/../x_y"}
     texts = [states[0] for _, states in lanes(path, "/behavior/a/**")["/behavior/a/b/c/d/e/f/g/h"]]
     assert texts == [*(f"search · {number}" for number in range(5)), "search", "alert"]
@@ -127,7 +126,7 @@ def test_lanes_are_bounded_and_keep_their_colours(tmp_path: Path, monkeypatch: p
 def test_alerts_in_words(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
+        tracker = timeline.robots
         say(tracker, 0, "net/a", "alert", alert=True, robot="robot/scout33", detail="motion (3)")
         say(tracker, 1, "net/a", "alert", alert=True)
         say(tracker, 2, "net/b", "blind", alert=True, robot="scout35", detail="snow")
@@ -138,15 +137,15 @@ def test_alerts_in_words(tmp_path: Path) -> None:
 
 
 def test_devices_figures_and_health(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot_panes, "MAX_SERIES", 3)
-    monkeypatch.setattr(robot_tracker, "MAX_FOLLOWED", 2)
+    monkeypatch.setattr(robots, "MAX_SERIES", 3)
+    monkeypatch.setattr(robots, "MAX_FOLLOWED", 2)
     path = tmp_path / "run.rrd"
 
     def state(at: float, rc: str, health: str = "ok", figures: dict[str, float] | None = None) -> None:
         tracker.state(at, RcState(rc, "cart", "i", sharable=False, health=health, figures=figures or {}))
 
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
+        tracker = timeline.robots
         state(0, "robot/a", figures={"rate": 1.0, "drops": math.inf})
         state(0.1, "robot/a", figures={"rate": 2.0})
         for at in (1, 2, 30, 31, 32):

@@ -14,9 +14,8 @@ from tests.services.recorder.paper_run import events, rows
 from tests.services.recorder.robot_run import CAMERA, GRANT, NET, captions, head, jpeg, png, say
 from zscout.drivers.image_size import jpeg_size, png_size
 from zscout.services.recorder import robots
-from zscout.services.recorder.colours import PALE
-from zscout.services.recorder.robot_tracker import RobotTracker
-from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.services.recorder.drawing import HolderRow
+from zscout.services.recorder.timeline import Timeline
 from zscout.types import Grant, Term
 
 
@@ -24,7 +23,7 @@ def test_a_picture_that_is_old_says_so(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     picture = jpeg(0, "scout33", None)
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
+        tracker = timeline.robots
         tracker.no_frame(0, CAMERA)
         tracker.holds[CAMERA] = {GRANT: HolderRow("hide", robots=("robot/scout33",))}
         tracker.frame(1, CAMERA, head(1), picture)
@@ -59,7 +58,7 @@ def test_boxes_end_with_what_they_mark(tmp_path: Path) -> None:
         next_grant: HolderRow("b", robots=("robot/b",)),
     }
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
+        tracker = timeline.robots
         tracker.holds[CAMERA] = holds
         say(tracker, 0, "net/a", "alert", camera=CAMERA, boxes=[box])  # no picture to draw on yet
         tracker.frame(1, CAMERA, head(1), picture)
@@ -90,9 +89,9 @@ def test_what_is_no_picture_is_left_out(tmp_path: Path, monkeypatch: pytest.Monk
             good[:size],
             good[:size] + b"\xff\xff\xff\xff" + good[size + 4 :],
         ):
-            timeline.robots.picture(0, "bad", bad, "", PALE)
+            timeline.robots.frame(0, "framegrabber/bad", head(1), bad)
         for number in range(4):
-            timeline.robots.picture(1, f"cam{number}", good, "", PALE)
+            timeline.robots.frame(1, f"framegrabber/cam{number}", head(1), good)
     assert {entity for entity, _, _ in rows(path, "/camera/**", "EncodedImage:blob")} == {
         "/camera/cam0",
         "/camera/cam1",

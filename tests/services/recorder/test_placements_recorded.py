@@ -17,10 +17,11 @@ from zscout.keyexpr import Sender
 from zscout.mesh import IncomingQuery, ZenohMesh
 from zscout.messages import ListPlacements, Placement, Placements, PlacerOperation
 from zscout.services.recorder import hosts as module
+from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.hosts import Running, Use
 from zscout.services.recorder.placement_tracker import PlacementTracker
 from zscout.services.recorder.recorder import Recorder
-from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.services.recorder.timeline import Timeline
 from zscout.types import Term
 
 SCALARS = "Scalars:scalars"

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tests.services.recorder.robot_run import jpeg, png, record
+from tests.services.recorder.robot_run import BUILDING, GRANT, head, jpeg, png, poses, record, say
 from tests.services.recorder.test_viewer_picture import DIMMED, WIDTH, Rgb, rgb, settled_picture, viewer
+from zscout.messages import BuildingPlan, RcState
 from zscout.services.recorder.blueprint import FLOOR_WORDS
-from zscout.services.recorder.colours import ALERT, DOING, HIDDEN, IN_THE_OPEN, OPERATOR, PALE, PERSON
+from zscout.services.recorder.colours import ALERT, DOING, HIDDEN, IN_THE_OPEN, OPERATOR, PERSON
+from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
 
 HEIGHT = 900
@@ -83,15 +85,18 @@ def test_garbled_pictures_and_words_do_not_end_the_viewer(tmp_path: Path) -> Non
     words = "日本 \U0001f916 ✖ عربى"
     with Timeline("lab", path=path) as timeline:
         robots = timeline.robots
-        robots.behavior(0, f"net/{words}", "search", words)
-        robots.picture(0, "half", good[: len(good) // 2], words, PALE)
-        robots.picture(0, "torn", bytes(torn), words, PALE)
-        robots.picture(0, words, good, words, PALE)
-        assert robots.plan(0, 6, 4.5, bytes(plan)) == ""
-        robots.figures(0, words, {words: 1.0})
-        robots.old_picture(1, "half", words, PALE)
+        say(robots, 0, f"net/{words}", "search", detail=words)
+        for name, picture in (("half", good[: len(good) // 2]), ("torn", bytes(torn)), (words, good)):
+            camera = f"framegrabber/{name}"
+            robots.holds[camera] = {GRANT: HolderRow("hide", robots=(f"robot/{words}",))}
+            robots.frame(0, camera, head(1), picture)
+        robots.floor.poses(0, BUILDING, poses([]))
+        robots.floor.plan(0, BUILDING, BuildingPlan(words, 6, 4.5, bytes(plan)))
+        robots.state(0, RcState(words, "cart", "i", sharable=False, figures={words: 1.0}))
+        robots.no_frame(1, "framegrabber/half")
         for number in range(4):
-            robots.picture(1, f"fgrab{number}", good, "", PALE)
+            robots.frame(1, f"framegrabber/fgrab{number}", head(1), good)
+        assert robots.floor.size is not None
         timeline.recording.flush(timeout_sec=10)
         live.write_bytes(path.read_bytes())
     # Seven cameras on two pages, and each of the other panes.

@@ -14,7 +14,6 @@ from tests.services.recorder.test_timeline import lab_of
 from zscout.keyexpr import Sender
 from zscout.messages import BuildingPlan, Placed
 from zscout.services.recorder.colours import DOING, HIDDEN, IN_THE_OPEN, OPERATOR, PERSON, bright
-from zscout.services.recorder.robot_tracker import RobotTracker
 from zscout.services.recorder.timeline import Timeline
 
 
@@ -84,16 +83,16 @@ def test_places_on_the_floor_are_pixels_of_its_plan(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     far = [Placed("lost", 1e9, 0), Placed("porch", 3.0, -0.3)]
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
-        tracker.poses(0, BUILDING, poses([Placed("early", 1, 1)]))
-        assert tracker.wants_plan(0) == BUILDING
-        tracker.plan(0.1, BUILDING, BuildingPlan("room", 6.0, 4.5, png()))
-        tracker.poses(
+        tracker = timeline.robots
+        tracker.floor.poses(0, BUILDING, poses([Placed("early", 1, 1)]))
+        assert tracker.floor.wants_plan(0) == BUILDING
+        tracker.floor.plan(0.1, BUILDING, BuildingPlan("room", 6.0, 4.5, png()))
+        tracker.floor.poses(
             1, BUILDING, poses([Placed("a", 0, 4.5, math.pi / 2), Placed("b", 6, 0), *far[:1]], far)
         )
         # Too soon after the last, and then nothing new.
-        tracker.poses(1.01, BUILDING, poses([Placed("a", 3, 3)]))
-        tracker.poses(2, BUILDING, poses([Placed("a", 0, 4.5, math.pi / 2), Placed("b", 6, 0)], far))
+        tracker.floor.poses(1.01, BUILDING, poses([Placed("a", 3, 3)]))
+        tracker.floor.poses(2, BUILDING, poses([Placed("a", 0, 4.5, math.pi / 2), Placed("b", 6, 0)], far))
     spots = [(at, value) for _, at, value in rows(path, "/floor/robots", "Points2D:positions")]
     assert spots == [(1, [[0, 0], [900, 675]])]
     ((_, _, vectors),) = rows(path, "/floor/headings", "Arrows2D:vectors")
@@ -106,13 +105,13 @@ def test_places_on_the_floor_are_pixels_of_its_plan(tmp_path: Path) -> None:
 def test_trails_are_of_the_last_minute(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
-        tracker.poses(0, BUILDING, poses([]))
-        tracker.plan(0, BUILDING, BuildingPlan("room", 6.0, 4.5, png()))
+        tracker = timeline.robots
+        tracker.floor.poses(0, BUILDING, poses([]))
+        tracker.floor.plan(0, BUILDING, BuildingPlan("room", 6.0, 4.5, png()))
         for half in range(1, 161):
-            tracker.poses(half / 2, BUILDING, poses([Placed("a", half / 40, 2)]))
+            tracker.floor.poses(half / 2, BUILDING, poses([Placed("a", half / 40, 2)]))
         for second in range(81, 150):
-            tracker.poses(second, BUILDING, poses([Placed("a", 4, 2)]))
+            tracker.floor.poses(second, BUILDING, poses([Placed("a", 4, 2)]))
     trails = {at: value for _, at, value in rows(path, "/floor/trails", "LineStrips2D:strips")}
     first, last = trails[80][0][0], trails[80][0][-1]
     assert (last[0] - first[0]) / 150 == pytest.approx(3.0, abs=0.05)
@@ -136,11 +135,11 @@ def test_trails_are_of_the_last_minute(tmp_path: Path) -> None:
 def test_a_plan_that_can_t_be_shown_is_told_once(tmp_path: Path, plan: BuildingPlan, why: str) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
+        tracker = timeline.robots
         for at in range(20):
-            tracker.poses(at, BUILDING, poses([Placed("a", 1, 1)]))
-            if tracker.wants_plan(at):
-                tracker.plan(at, BUILDING, plan)
+            tracker.floor.poses(at, BUILDING, poses([Placed("a", 1, 1)]))
+            if tracker.floor.wants_plan(at):
+                tracker.floor.plan(at, BUILDING, plan)
         assert not timeline.robots.shown.any
     assert events(path) == [f"building room of anvil/living_room can't be shown: {why}"]
     assert list(rows(path, "/floor/**", "Points2D:positions")) == []
@@ -150,22 +149,22 @@ def test_one_building_is_shown_until_it_is_silent(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     other = Sender("basil", "office")
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
-        tracker.poses(0, BUILDING, poses([]))
-        assert tracker.wants_plan(0) == BUILDING
+        tracker = timeline.robots
+        tracker.floor.poses(0, BUILDING, poses([]))
+        assert tracker.floor.wants_plan(0) == BUILDING
         # No answer: it is asked again, but not at once.
-        assert [at for at in range(1, 8) if tracker.wants_plan(at)] == [5]
-        tracker.plan(6, other, BuildingPlan("forged", 6.0, 4.5, png()))
-        tracker.plan(6, BUILDING, BuildingPlan("room", 6.0, 4.5, png()))
+        assert [at for at in range(1, 8) if tracker.floor.wants_plan(at)] == [5]
+        tracker.floor.plan(6, other, BuildingPlan("forged", 6.0, 4.5, png()))
+        tracker.floor.plan(6, BUILDING, BuildingPlan("room", 6.0, 4.5, png()))
         for at in range(7, 10):
-            tracker.poses(at, BUILDING, poses([Placed("a", 1, 1)]))
-            tracker.poses(at, other, poses([Placed("b", 2, 2)]))
+            tracker.floor.poses(at, BUILDING, poses([Placed("a", 1, 1)]))
+            tracker.floor.poses(at, other, poses([Placed("b", 2, 2)]))
         for at in range(10, 22):
             tracker.tick(at)
-        tracker.poses(22, other, poses([Placed("b", 2, 2)]))
-        assert tracker.wants_plan(22) == other
-        tracker.plan(22, other, BuildingPlan("office", 6.0, 4.5, png()))
-        tracker.poses(23, other, poses([Placed("b", 2, 2)]))
+        tracker.floor.poses(22, other, poses([Placed("b", 2, 2)]))
+        assert tracker.floor.wants_plan(22) == other
+        tracker.floor.plan(22, other, BuildingPlan("office", 6.0, 4.5, png()))
+        tracker.floor.poses(23, other, poses([Placed("b", 2, 2)]))
     assert events(path) == [
         "a second building, of basil/office, is not shown: that of anvil/living_room is",
         "building room is silent: who is where is not known any more",
@@ -178,12 +177,12 @@ def test_one_building_is_shown_until_it_is_silent(tmp_path: Path) -> None:
 def test_a_building_that_begins_anew_is_asked_for_its_plan(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        tracker = RobotTracker(timeline)
+        tracker = timeline.robots
         for at, time, metres in ((0, 50.0, (6.0, 4.5)), (3, 0.0, (12.0, 9.0))):
-            tracker.poses(at, BUILDING, poses([], time=time))
-            assert tracker.wants_plan(at) == BUILDING
-            tracker.plan(at, BUILDING, BuildingPlan("room", *metres, png()))
-            tracker.poses(at + 1, BUILDING, poses([Placed("a", 1, 1)], time=time + 1))
-            assert tracker.wants_plan(at + 1) is None
+            tracker.floor.poses(at, BUILDING, poses([], time=time))
+            assert tracker.floor.wants_plan(at) == BUILDING
+            tracker.floor.plan(at, BUILDING, BuildingPlan("room", *metres, png()))
+            tracker.floor.poses(at + 1, BUILDING, poses([Placed("a", 1, 1)], time=time + 1))
+            assert tracker.floor.wants_plan(at + 1) is None
     spots = [value for _, _, value in rows(path, "/floor/robots", "Points2D:positions")]
     assert spots == [[[150, 525]], [[75, 600]]]

@@ -30,7 +30,8 @@ from tests.services.recorder.paper_run import (
 from zscout.services.recorder import drawing, hosts
 from zscout.services.recorder import timeline as module
 from zscout.services.recorder.colours import LINES, OPERATOR, PALETTE, STATES
-from zscout.services.recorder.timeline import OPERATOR_MARK, HolderRow, Timeline, TimelineError
+from zscout.services.recorder.drawing import HolderRow
+from zscout.services.recorder.timeline import OPERATOR_MARK, Timeline, TimelineError
 
 
 def test_table_1_recorded_reads_as_table_2(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ from zscout.config.strict import BadInput
 from zscout.scheduling.model import Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.replay import HoldRecord, Replay
 from zscout.scheduling.workload import Workload
-from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.services.recorder.drawing import HolderRow
+from zscout.services.recorder.timeline import Timeline
 from zscout.types import SECOND, ArcId, Ns, RcName
 
 MAX_DRAWN: Final = 1_000_000_000 * SECOND

@@ -11,7 +11,7 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sized
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -109,6 +109,14 @@ class Drawing:
         thread = threading.Thread(target=self.recording.disconnect, name="rerun-disconnect", daemon=True)
         thread.start()
         thread.join(seconds)
+
+
+class HolderRow(NamedTuple):
+    """An ARC that holds an RC; `operator` if its priority is an operator's; and the robots of its gang."""
+
+    arc: str
+    operator: bool = False
+    robots: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)

@@ -8,11 +8,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import rerun as rr
 
 from zscout.drivers.image_size import png_size
+from zscout.keyexpr import Sender
+from zscout.messages import BuildingPlan, BuildingPoses, Placed
 from zscout.services.recorder.colours import ALERT, CAMERA, HIDDEN, IN_THE_OPEN, PALE, PERSON, bright, faded
 from zscout.services.recorder.drawing import Drawing, clean_text
 
@@ -29,8 +32,18 @@ TRAIL_STEP: Final = 0.5
 """Seconds between two points of it."""
 MOVED: Final = 0.02
 """Metres; who moved less stands still."""
-MAX_NAMED: Final = 12
+IN_FULL: Final = 12
 """Robots up to which each has its doing beside its name."""
+MAX_NAME: Final = 24
+"""Characters of a name on floor and pictures."""
+MAX_OTHERS: Final = 2_000
+POSE_SPACING: Final = 0.09
+"""Seconds between two records of where all are."""
+SILENCE: Final = 10.0
+"""Seconds without a message from a building after which it is not known who is where, and another may be
+shown."""
+PLAN_AGAIN: Final = 5.0
+"""Seconds until a plan that did not come is asked for again."""
 MAX_TRAILS: Final = 256
 ARROW: Final = 0.055
 """Length of a heading's arrow, as part of the building's longer side."""
@@ -74,83 +87,130 @@ LAYERS: Final = {
 """By entity below `floor`."""
 
 
-class RobotMark(NamedTuple):
-    """A robot in the building: metres, radians; its colour says how it is, `words` what it does."""
+class Look(NamedTuple):
+    """How a robot is drawn beside where it is: what it does in words, and its colour (RGBA) where its being
+    hidden or not does not decide it."""
 
-    name: str
-    x: float
-    y: float
-    heading: float
-    camera: bool = False
-    hidden: bool = False
-    colour: int | None = None
-    """RGBA, where its being hidden or not does not decide it."""
     words: str = ""
+    colour: int | None = None
     alert: bool = False
 
-    @property
-    def shade(self) -> int:
-        if self.colour is not None:
-            return self.colour
-        return HIDDEN if self.hidden else IN_THE_OPEN
 
-
-class PersonMark(NamedTuple):
-    name: str
-    x: float
-    y: float
+@dataclass(slots=True)
+class _Building:
+    sender: Sender
+    seen_at: float
+    time: float = 0.0
+    """Its own."""
+    asked: float = -PLAN_AGAIN
+    name: str = ""
+    planned: bool = False
+    refused: bool = False
 
 
 class FloorPlan:
-    """One building at a time."""
+    """One building at a time; `look` says of a robot's name how that robot is drawn."""
 
-    def __init__(self, drawing: Drawing) -> None:
-        self._drawing = drawing
+    def __init__(self, drawing: Drawing, look: Callable[[str], Look]) -> None:
+        self._drawing, self._look = drawing, look
         self.size: tuple[int, int] | None = None
         """Of the plan's picture, in pixels; None before there is one."""
         self._metres = (1.0, 1.0)
         self._longer = 1.0
         self._trails: dict[str, deque[tuple[float, Spot]]] = {}
         """Seconds and place, by robot."""
+        self._building: _Building | None = None
+        self._others: set[Sender] = set()
 
-    def plan(self, at: float, width: float, depth: float, png: bytes) -> str:
-        """Takes the plan of a building of `width` by `depth` metres; returns why not, or an empty text."""
+    def poses(self, at: float, sender: Sender, poses: BuildingPoses) -> None:
+        """Who is where in a building."""
+        building = self._building
+        if building is not None and building.sender != sender and at - building.seen_at <= SILENCE:
+            if sender not in self._others and len(self._others) < MAX_OTHERS:
+                self._others.add(sender)
+                self._warn(at, f"a second building, of {sender}, is not shown: that of {building.sender} is")
+            return
+        if building is None or building.sender != sender or poses.time < building.time - 1:
+            # Its time goes back: it is another building that the same client simulates now.
+            self._building = building = _Building(sender, at)
+            self._others.discard(sender)
+        elif building.planned and at - building.seen_at < POSE_SPACING:
+            return
+        building.seen_at, building.time = at, poses.time
+        if building.planned:
+            minutes, seconds = divmod(max(0, int(poses.time)), 60)
+            speed = "" if poses.speed == 1 else f" · {poses.speed:g} times as fast"
+            self._show(at, poses, f"{building.name} · {minutes}:{seconds:02}{speed}")
+
+    def tick(self, at: float) -> None:
+        building = self._building
+        if building is not None and building.planned and at - building.seen_at > SILENCE:
+            building.planned = False
+            self._clear(at)
+            self._warn(at, f"building {building.name} is silent: who is where is not known any more")
+
+    def wants_plan(self, at: float) -> Sender | None:
+        """The client to ask for its building's plan now, if any."""
+        building = self._building
+        if building is None or building.planned or building.refused:
+            return None
+        if at - building.seen_at > SILENCE or at - building.asked < PLAN_AGAIN:
+            return None
+        building.asked = at
+        return building.sender
+
+    def plan(self, at: float, sender: Sender, plan: BuildingPlan) -> None:
+        """A building's plan."""
+        building = self._building
+        if building is None or building.sender != sender or building.planned:
+            return
+        building.name = clean_text(plan.name, MAX_NAME)
+        width, depth, size = plan.width, plan.depth, png_size(plan.picture)
+        why = ""
         if not (MIN_METRES <= width <= MAX_METRES and MIN_METRES <= depth <= MAX_METRES):
-            return f"it is {width:g} by {depth:g} m; a building has {MIN_METRES:g} to {MAX_METRES:g} m"
-        size = png_size(png)
-        if size is None:
-            return "its plan is not a PNG picture"
-        if max(size) > MAX_SIDE:
-            return f"its plan is {size[0]} by {size[1]} pixels; {MAX_SIDE} a side are shown at most"
-        self.clear(at)
-        self.size, self._longer = size, float(max(size))
-        self._metres = width, depth
+            why = f"it is {width:g} by {depth:g} m; a building has {MIN_METRES:g} to {MAX_METRES:g} m"
+        elif size is None:
+            why = "its plan is not a PNG picture"
+        elif max(size) > MAX_SIDE:
+            why = f"its plan is {size[0]} by {size[1]} pixels; {MAX_SIDE} a side are shown at most"
+        if why or size is None:
+            building.refused = True
+            self._warn(at, f"building {building.name} of {sender} can't be shown: {why}")
+            return
+        building.planned = True
+        self._clear(at)
+        self.size, self._longer, self._metres = size, float(max(size)), (width, depth)
         # For all times: a server that forgets its oldest data for want of memory must keep the plan.
-        image = rr.EncodedImage(contents=png, media_type="image/png", draw_order=-20.0)
+        image = rr.EncodedImage(contents=plan.picture, media_type="image/png", draw_order=-20.0)
         self._drawing.log(None, "/floor/plan", image)
-        return ""
+        self._drawing.arrange()
 
-    def clear(self, at: float) -> None:
+    def _warn(self, at: float, text: str) -> None:
+        self._drawing.event(at, text, "WARN")
+
+    def _clear(self, at: float) -> None:
         """From `at` on, it is not known where anybody is; the plan stays."""
         for layer in LAYERS:
             self._draw(at, layer, [], [])
         self._trails.clear()
 
-    def show(
-        self, at: float, robots: Sequence[RobotMark], people: Sequence[PersonMark], caption: str
-    ) -> None:
-        """Where all are from `at` on; nothing before there is a plan. Who is far outside is left out."""
-        if self.size is None:
-            return
-        robots = [robot for robot in robots if self._is_near(robot)]
-        people = [person for person in people if self._is_near(person)]
-        spots = [self._pixel(robot) for robot in robots]
-        walkers = [self._pixel(person) for person in people]
-        shades = [robot.shade for robot in robots]
-        self._draw_trails(at, robots, spots)
+    def _show(self, at: float, poses: BuildingPoses, caption: str) -> None:
+        """Where all are from `at` on. Who is far outside is left out."""
+        robots = [one for one in poses.robots if self._is_near(one)]
+        people = [one for one in poses.people if self._is_near(one)]
+        looks = [self._look(one.name) for one in robots]
+        names = [clean_text(one.name, MAX_NAME) for one in robots]
+        spots = [self._pixel(one) for one in robots]
+        walkers = [self._pixel(one) for one in people]
+        shades = [
+            look.colour or (HIDDEN if one.hidden else IN_THE_OPEN)
+            for one, look in zip(robots, looks, strict=True)
+        ]
+        self._draw_trails(at, names, spots, shades)
         self._draw(at, "robots", spots, shades)
-        vectors = [self._vector(robot.heading, ARROW) for robot in robots]
-        self._draw(at, "headings", vectors, shades, origins=spots)
+        self._draw(
+            at, "headings", [self._vector(one.heading, ARROW) for one in robots], shades, origins=spots
+        )
         seen = [
             [spot, *(self._beside(spot, one.heading + turn * VIEW / 8, SIGHT) for turn in range(-4, 5)), spot]
             for one, spot in zip(robots, spots, strict=True)
@@ -159,21 +219,21 @@ class FloorPlan:
         self._draw(at, "views", seen, [faded(CAMERA, 0.8)])
         rings = [
             [self._beside(spot, math.tau * corner / RING, ARROW) for corner in range(RING + 1)]
-            for one, spot in zip(robots, spots, strict=True)
-            if one.alert
+            for look, spot in zip(looks, spots, strict=True)
+            if look.alert
         ]
         self._draw(at, "alerts", rings, [ALERT])
         self._draw(at, "people", walkers, [PERSON])
         # Names stand apart from the points: a text must be brighter.
-        in_full = len(robots) <= MAX_NAMED
-        names = [f"{one.name} · {one.words}" if one.words and in_full else one.name for one in robots]
-        texts = [clean_text(name) for name in (*names, *(person.name for person in people))]
+        if len(robots) <= IN_FULL:
+            pairs = zip(names, looks, strict=True)
+            names = [f"{name} · {look.words}" if look.words else name for name, look in pairs]
+        texts = [*map(clean_text, names), *(clean_text(one.name, MAX_NAME) for one in people)]
         colours = [bright(colour) for colour in (*shades, *(PERSON for _ in people))]
         places = self._places([*spots, *walkers])
         self._draw(at, "names", places, colours, labels=texts, show_labels=True)
-        words = clean_text(caption)
-        middle = [(self.size[0] / 2, 0.0)] if words else []
-        self._draw(at, "caption", middle, [PALE], labels=[words], show_labels=True)
+        middle = [(self.size[0] / 2, 0.0)] if self.size is not None else []
+        self._draw(at, "caption", middle, [PALE], labels=[clean_text(caption)], show_labels=True)
 
     def _draw(self, at: float, layer: str, what: Sequence[Any], colours: list[int], **more: Any) -> None:
         shape, field, radius, order = LAYERS[layer]
@@ -192,13 +252,14 @@ class FloorPlan:
             places.append((x, round(y, 1)))
         return places
 
-    def _draw_trails(self, at: float, robots: Sequence[RobotMark], spots: Sequence[Spot]) -> None:
-        assert self.size is not None  # noqa: S101
-        step = MOVED * self.size[0] / self._metres[0]
-        for robot, spot in zip(robots, spots, strict=True):
-            if robot.name not in self._trails and len(self._trails) >= MAX_TRAILS:
+    def _draw_trails(
+        self, at: float, names: Sequence[str], spots: Sequence[Spot], shades: Sequence[int]
+    ) -> None:
+        step = MOVED * (self.size or (1, 1))[0] / self._metres[0]
+        for name, spot in zip(names, spots, strict=True):
+            if name not in self._trails and len(self._trails) >= MAX_TRAILS:
                 continue
-            trail = self._trails.setdefault(robot.name, deque(maxlen=round(TRAIL / TRAIL_STEP)))
+            trail = self._trails.setdefault(name, deque(maxlen=round(TRAIL / TRAIL_STEP)))
             if not trail or (at - trail[-1][0] >= TRAIL_STEP and math.dist(trail[-1][1], spot) >= step):
                 trail.append((at, spot))
         for name, trail in list(self._trails.items()):
@@ -206,24 +267,23 @@ class FloorPlan:
                 trail.popleft()
             if not trail:
                 del self._trails[name]
-        colours = {robot.name: robot.shade for robot in robots}
+        colours = dict(zip(names, shades, strict=True))
         shown = [name for name, trail in self._trails.items() if len(trail) > 1 and name in colours]
         strips = [[spot for _, spot in self._trails[name]] for name in shown]
         self._draw(at, "trails", strips, [faded(colours[name], 0.55) for name in shown])
 
     # From metres to pixels
 
-    def _is_near(self, one: RobotMark | PersonMark) -> bool:
+    def _is_near(self, one: Placed) -> bool:
         width, depth = self._metres
         return (
             -MARGIN * width <= one.x <= (1 + MARGIN) * width
             and -MARGIN * depth <= one.y <= (1 + MARGIN) * depth
         )
 
-    def _pixel(self, one: RobotMark | PersonMark) -> Spot:
+    def _pixel(self, one: Placed) -> Spot:
         """The plan's rows begin at the largest y."""
-        assert self.size is not None  # noqa: S101
-        (width, height), (metres_x, metres_y) = self.size, self._metres
+        (width, height), (metres_x, metres_y) = self.size or (1, 1), self._metres
         return round(one.x * width / metres_x, 1), round((metres_y - one.y) * height / metres_y, 1)
 
     def _vector(self, heading: float, part: float) -> Spot:

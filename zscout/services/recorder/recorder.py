@@ -36,7 +36,6 @@ from zscout.messages import (
 from zscout.services.recorder.hosts import Use
 from zscout.services.recorder.placement_tracker import MAX_FOLLOWED, PlacementTracker
 from zscout.services.recorder.request_tracker import RequestTracker
-from zscout.services.recorder.robot_tracker import RobotTracker
 from zscout.services.recorder.robots import MAX_CAMERAS
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import SECOND
@@ -91,8 +90,8 @@ class Recorder:
         self._over = asyncio.Event()
         self._supervisor = Supervisor("the recorder", lambda _: self._over.set())
         self._placements = PlacementTracker(timeline)
-        self._robots = RobotTracker(timeline)
-        self._requests = RequestTracker(timeline, self._robots, fleet.operator_priority)
+        self._robots = timeline.robots
+        self._requests = RequestTracker(timeline, fleet.operator_priority)
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
         self._leaders: set[Token] = set()
         self._declared: list[Declaration] = []
@@ -282,9 +281,9 @@ class Recorder:
 
     def _on_poses(self, key: str, poses: BuildingPoses) -> None:
         at = self._now()
-        self._robots.poses(at, self.mesh.keys.sender_of(key), poses)
+        self._robots.floor.poses(at, self.mesh.keys.sender_of(key), poses)
         if self._asking is None or self._asking.done():
-            sender = self._robots.wants_plan(at)
+            sender = self._robots.floor.wants_plan(at)
             if sender is not None:
                 self._asking = self._supervisor.spawn(self._ask_plan(sender))
 
@@ -295,4 +294,4 @@ class Recorder:
         )
         for reply in replies:
             if reply.message is not None:
-                self._robots.plan(self._now(), sender, reply.message)
+                self._robots.floor.plan(self._now(), sender, reply.message)

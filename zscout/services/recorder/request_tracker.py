@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, Revocation, absurd
-from zscout.services.recorder.robot_tracker import RobotTracker
-from zscout.services.recorder.timeline import HolderRow, Timeline
+from zscout.services.recorder.drawing import HolderRow
+from zscout.services.recorder.timeline import Timeline
 from zscout.types import NO_TERM, Grant, Term
 
 MAX_OPEN: Final = 20_000
@@ -33,16 +33,16 @@ class _Request:
 
 
 class RequestTracker:
-    """Writes to `timeline` who holds what and what each ARC is doing; `robots` reads the holds as well."""
+    """Writes to `timeline` who holds what and what each ARC is doing."""
 
-    def __init__(self, timeline: Timeline, robots: RobotTracker, operator_priority: int) -> None:
+    def __init__(self, timeline: Timeline, operator_priority: int) -> None:
         self.timeline, self.operator_priority = timeline, operator_priority
         self.term: Term = NO_TERM
         self.seq = 0
         """The newest publication; older ones are ignored."""
         self._requests: dict[Key, _Request] = {}
         self._labels: set[str] = set()
-        self._rcs = robots.holds
+        self._rcs = timeline.robots.holds
 
     def grants(self, at: float, grants: Grants) -> bool:
         """What the RCM publishes; returns whether something before it was missed."""

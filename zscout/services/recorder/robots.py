@@ -1,150 +1,340 @@
-"""The robots' part of the timeline: cameras, the floor, what each behavior does, and figures of devices.
-
-A camera is the name of its framegrabber.
-"""
+"""The robots' part of the timeline: what each behavior does, who looks through which camera, what devices
+report of themselves, and the floor. Times are passed in."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Final
 
 import rerun as rr
 
+from zscout.drivers.airtime import Bucket
 from zscout.drivers.image_size import jpeg_size
-from zscout.messages import Box
+from zscout.keyexpr import Sender
+from zscout.messages import BehaviorSaid, Box, FrameHead, RcState
 from zscout.services.recorder.blueprint import RobotLayout
-from zscout.services.recorder.colours import ALERT, DOING, LINES, OTHER, PALE, bright
-from zscout.services.recorder.drawing import Drawing, Lanes, clean_path, clean_text, with_detail
-from zscout.services.recorder.floor_plan import FloorPlan
+from zscout.services.recorder.colours import ALERT, DOING, LINES, OPERATOR, OTHER, PALE, bright
+from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_path, clean_text, with_detail
+from zscout.services.recorder.floor_plan import MAX_NAME, FloorPlan, Look
+from zscout.types import SECOND, Grant
 
-MAX_CAMERAS: Final = 32
-MAX_SIDE: Final = 4_096
-"""Pixels of a picture's longer side."""
-DIM: Final = 0.25
-"""Opacity of a picture that is an old one."""
-MAX_CAPTION: Final = 48
-"""Characters."""
+RATE: Final = 20
+"""Reports of one sender recorded in a second, and at once."""
+MAX_WAITING: Final = 256
+"""Paths of one sender whose newest report waits for its turn."""
+MAX_SENDERS: Final = 1_000
+DROPS_EVERY: Final = 10.0
+"""Seconds between two figures of what was dropped of one sender."""
+MAX_FOLLOWED: Final = 2_000
+"""Behaviors, and RCs, that are followed at one time."""
 MAX_LANES: Final = 500
 MAX_DEPTH: Final = 8
 """Behaviors above each other that have parts of an entity of their own."""
 DETAILS: Final = 200
 """Distinct texts of one lane with their details; from then on it shows the words alone."""
+MAX_CAMERAS: Final = 32
+MAX_SIDE: Final = 4_096
+"""Pixels of a picture's longer side."""
+MAX_BOXES: Final = 32
+"""Over one picture, whoever drew them."""
+DIM: Final = 0.25
+"""Opacity of a picture that is an old one."""
+MAX_CAPTION: Final = 48
+"""Characters."""
+HEALTH_SPACING: Final = 1.0
+"""Seconds between two events about the health of one RC."""
 MAX_SERIES: Final = 200
 SPACING: Final = 0.5
 """Seconds between two points; devices report once a second at most."""
 AGAIN: Final = 30.0
 """Seconds after which a figure that has not changed is drawn again."""
 
+BehaviorKey = tuple[Sender, str]
+"""A behavior: its client, and its path."""
+NO_HOLD: Final = HolderRow("")
+
+
+@dataclass(slots=True)
+class _Sender:
+    bucket: Bucket
+    waiting: dict[str, BehaviorSaid] = field(default_factory=dict)
+    """The newest report of each path that came too fast, oldest first."""
+    dropped: int = 0
+    counted_at: float = -DROPS_EVERY
+
+
+class RateLimiter:
+    """Passes on the reports of each sender, at most `RATE` a second. What comes faster waits, and of each
+    path only the newest is kept: however much was dropped, what is passed on last is how it is."""
+
+    def __init__(self) -> None:
+        self._senders: dict[Sender, _Sender] = {}
+
+    def offer(self, at: float, sender: Sender, report: BehaviorSaid) -> BehaviorSaid | None:
+        """The report itself if it is to be recorded now."""
+        state = self._senders.pop(sender, None)
+        if state is None:
+            if len(self._senders) >= MAX_SENDERS:
+                del self._senders[next(iter(self._senders))]
+            state = _Sender(Bucket(Fraction(RATE), Fraction(RATE), round(at * SECOND)))
+        self._senders[sender] = state
+        if not state.waiting and state.bucket.admits(1, round(at * SECOND)):
+            return report
+        state.dropped += state.waiting.pop(report.path, None) is not None
+        if len(state.waiting) < MAX_WAITING:
+            state.waiting[report.path] = report
+        else:
+            state.dropped += 1
+        return None
+
+    def due(self, at: float) -> Iterator[tuple[Sender, BehaviorSaid]]:
+        """What has waited and is to be recorded now."""
+        for sender, state in self._senders.items():
+            while state.waiting and state.bucket.admits(1, round(at * SECOND)):
+                yield sender, state.waiting.pop(next(iter(state.waiting)))
+
+    def dropped(self, at: float) -> Iterator[tuple[Sender, int]]:
+        """Senders of which reports were dropped, and how many since the last figure."""
+        for sender, state in self._senders.items():
+            if state.dropped and at - state.counted_at >= DROPS_EVERY:
+                state.counted_at, count, state.dropped = at, state.dropped, 0
+                yield sender, count
+
+    def forget(self, sender: Sender) -> None:
+        self._senders.pop(sender, None)
+
+
+@dataclass(slots=True)
+class _Health:
+    words: str = "ok"
+    """As it is."""
+    shown: str = "ok"
+    """As it was shown last."""
+    at: float = -HEALTH_SPACING
+
 
 @dataclass(slots=True)
 class _Camera:
+    name: str
     entity: str
-    size: tuple[int, int] = (0, 0)
+    hold: HolderRow = NO_HOLD
+    boxes: dict[BehaviorKey, list[Box]] = field(default_factory=dict)
+    size: tuple[int, int] | None = None
+    """Of its last picture, in pixels; None before it has a pane."""
     old: bool = False
 
+    @property
+    def robots(self) -> str:
+        return ", ".join(_name(robot) for robot in self.hold.robots)
 
-class RobotPanes:
-    """Draws what robots do and see."""
+
+class RobotTracker:
+    """Draws what is published of robots."""
 
     def __init__(self, drawing: Drawing) -> None:
         self._drawing = drawing
-        self.floor = FloorPlan(drawing)
-        self._cameras: dict[str, _Camera] = {}
+        self.floor = FloorPlan(drawing, self._look)
+        self.holds: dict[str, dict[Grant, HolderRow]] = {}
+        """By RC."""
+        self._limiter = RateLimiter()
+        self._reports: dict[BehaviorKey, BehaviorSaid] = {}
+        """What each behavior does, the one that reported longest ago first."""
         others = "behaviors: the others have no lane"
         self._behaviors = Lanes(drawing, "behavior", MAX_LANES, others, depth=MAX_DEPTH)
+        self._cameras: dict[str, _Camera] = {}
+        self._health: dict[str, _Health] = {}
         self._figures: dict[tuple[str, str], tuple[float, float]] = {}
         """When and what was drawn last, by RC and figure."""
 
     @property
     def shown(self) -> RobotLayout:
-        cameras = tuple(
-            (camera.entity, clean_text(name, MAX_CAPTION)) for name, camera in sorted(self._cameras.items())
-        )
-        return RobotLayout(cameras, self.floor.size, self._behaviors.rows, bool(self._figures))
+        cameras = [(one.entity, clean_text(one.name, MAX_CAPTION)) for one in self._with_pane()]
+        return RobotLayout(tuple(cameras), self.floor.size, self._behaviors.rows, bool(self._figures))
 
-    def picture(self, at: float, name: str, jpeg: bytes, caption: str, colour: int = PALE) -> None:
-        """A camera's newest picture, and what is seen through it in words."""
-        size = jpeg_size(jpeg)
-        if size is None or max(size) > MAX_SIDE:
-            self._drawing.note(
-                at, f"{name} sends what is no JPEG of at most {MAX_SIDE} pixels a side: left out"
-            )
+    def tick(self, at: float) -> None:
+        """What time alone brings: call it some times a second."""
+        for sender, report in list(self._limiter.due(at)):
+            self._take(at, sender, report)
+        for sender, count in self._limiter.dropped(at):
+            self._warn(at, f"behaviors of {sender} say too much: {count} sayings were left out")
+        for rc, health in self._health.items():
+            self._show_health(at, rc, health)
+        self.floor.tick(at)
+
+    def _warn(self, at: float, text: str) -> None:
+        self._drawing.event(at, text, "WARN")
+
+    # Behaviors
+
+    def behavior(self, at: float, sender: Sender, report: BehaviorSaid) -> None:
+        """What a behavior reports, as it comes."""
+        kept = self._limiter.offer(at, sender, report)
+        if kept is not None:
+            self._take(at, sender, kept)
+
+    def left(self, at: float, sender: Sender) -> None:
+        """A client is gone, and its behaviors with it."""
+        for path in [path for client, path in self._reports if client == sender]:
+            self._take(at, sender, BehaviorSaid(path, ""))
+        self._limiter.forget(sender)
+
+    def _take(self, at: float, sender: Sender, report: BehaviorSaid) -> None:
+        key = sender, report.path
+        before = self._reports.pop(key, None)
+        if report.doing and len(self._reports) < MAX_FOLLOWED:
+            self._reports[key] = report
+        # A behavior that has moved to another client is over in the old one only.
+        if report.doing or all(path != report.path for _, path in self._reports):
+            self._show_behavior(at, report)
+        if report.alert:
+            self._warn(at, _alert(report))
+        for camera in {report.camera, before.camera if before is not None else ""} & self._cameras.keys():
+            seen = self._cameras[camera]
+            if camera == report.camera and report.doing and report.boxes:
+                seen.boxes[key] = report.boxes
+            else:
+                seen.boxes.pop(key, None)
+            self._draw_boxes(at, seen)
+
+    def _show_behavior(self, at: float, report: BehaviorSaid) -> None:
+        doing = "alert" if report.alert else report.doing
+        known = self._behaviors.texts(report.path)
+        if not doing and known is None:
             return
-        camera = self._cameras.get(name)
-        if camera is None:
-            others = "cameras: the pictures of the others are not shown"
-            if not self._drawing.room(at, self._cameras, MAX_CAMERAS, others):
-                return
-            camera = self._cameras[name] = _Camera(clean_path("camera", name.replace("/", "_")))
-        camera.size, camera.old = size, False
-        image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg", opacity=1.0)
-        self._drawing.log(at, camera.entity, image)
-        self._write(at, camera, caption, colour)
+        word = clean_text(doing)
+        text = with_detail(doing, _detail(report))
+        # A text that had lost its colour would get any; the word alone says as much in the right one.
+        if known is not None and len(known) >= DETAILS and text not in known:
+            text = word
+        self._behaviors.show(at, report.path, {text: (text, DOING.get(word, OTHER))})
         self._drawing.arrange()
 
-    def old_picture(self, at: float, name: str, caption: str, colour: int = PALE) -> None:
-        """From `at` on, the camera's last picture is not how it is now: it is dimmed until the next one."""
-        camera = self._cameras.get(name)
-        if camera is None:
-            return
-        if not camera.old:
-            camera.old = True
-            self._drawing.log(at, camera.entity, rr.EncodedImage.from_fields(opacity=DIM))
-        self._write(at, camera, caption, colour)
+    def _doing(self, robot: str) -> BehaviorSaid | None:
+        """The newest report about a robot."""
+        names = robot, f"robot/{robot}"
+        return next((report for report in reversed(self._reports.values()) if report.robot in names), None)
 
-    def boxes(self, at: float, name: str, boxes: Sequence[Box]) -> None:
-        """From `at` on, exactly these are drawn over the camera's pictures, in their pixels."""
-        camera = self._cameras.get(name)
-        if camera is None:
-            return
-        self._drawing.show(
-            at,
-            f"{camera.entity}/boxes",
-            rr.Boxes2D,
-            array=[box for box in boxes if _is_inside(box, *camera.size)],
-            array_format=rr.Box2DFormat.XYWH,
-            colors=[ALERT],
-            radii=[-1.5],
-        )
+    def _look(self, robot: str) -> Look:
+        if any(hold.operator for hold in self.holds.get(f"robot/{robot}", {}).values()):
+            return Look("operator", OPERATOR)
+        report = self._doing(robot)
+        if report is None:
+            return Look()
+        return Look(report.doing, alert=report.alert or report.doing == "alert")
 
-    def _write(self, at: float, camera: _Camera, caption: str, colour: int) -> None:
+    # Cameras
+
+    def frame(self, at: float, camera: str, head: FrameHead, jpeg: bytes) -> None:
+        """A picture of the framegrabber `camera`."""
+        seen = self._cameras.get(camera)
+        if seen is None:
+            if len(self._cameras) >= MAX_FOLLOWED:
+                return
+            name = camera.partition("/")[2] or camera
+            seen = self._cameras[camera] = _Camera(name, clean_path("camera", name.replace("/", "_")))
+        holds = self.holds.get(camera, {})
+        hold = holds.get(head.grant, NO_HOLD) if head.grant is not None else NO_HOLD
+        if hold.robots != seen.hold.robots:
+            seen.boxes.clear()
+            self._draw_boxes(at, seen)
+        seen.hold = hold
+        size = jpeg_size(jpeg)
+        if size is None or max(size) > MAX_SIDE:
+            what = f"no JPEG of at most {MAX_SIDE} pixels a side"
+            self._drawing.note(at, f"{seen.name} sends what is {what}: left out")
+            return
+        others = "cameras: the pictures of the others are not shown"
+        if seen.size is None and not self._drawing.room(at, self._with_pane(), MAX_CAMERAS, others):
+            return
+        seen.size, seen.old = size, False
+        image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg", opacity=1.0)
+        self._drawing.log(at, seen.entity, image)
+        self._write(at, seen, *self._caption(seen))
+        self._drawing.arrange()
+
+    def no_frame(self, at: float, camera: str) -> None:
+        """No picture has come for a while: the last one is an old one, dimmed until the next."""
+        seen = self._cameras.get(camera)
+        if seen is None:
+            return
+        seen.boxes.clear()
+        self._draw_boxes(at, seen)
+        if not seen.old and seen.size is not None:
+            seen.old = True
+            self._drawing.log(at, seen.entity, rr.EncodedImage.from_fields(opacity=DIM))
+        words = "not held"
+        if self.holds.get(camera):
+            words = " · ".join(filter(None, (seen.robots, "no picture")))
+        self._write(at, seen, words, PALE)
+
+    def _with_pane(self) -> list[_Camera]:
+        return [camera for _, camera in sorted(self._cameras.items()) if camera.size is not None]
+
+    def _caption(self, seen: _Camera) -> tuple[str, int]:
+        """Words and colour."""
+        _, operator, robots = seen.hold
+        if operator:
+            return (f"{seen.robots} · operator" if robots else "operator"), OPERATOR
+        report = self._doing(robots[0].partition("/")[2]) if len(robots) == 1 else None
+        if report is None:
+            return seen.robots, PALE
+        return f"{seen.robots} · {report.doing}", DOING.get(report.doing, PALE)
+
+    def _write(self, at: float, seen: _Camera, caption: str, colour: int) -> None:
         """The caption hangs from the middle of the upper edge: a view's title could not follow the time."""
         words = clean_text(caption, MAX_CAPTION)
         self._drawing.show(
             at,
-            f"{camera.entity}/caption",
+            f"{seen.entity}/caption",
             rr.Points2D,
-            positions=[(camera.size[0] / 2, 0.0)] if words else [],
+            positions=[(seen.size[0] / 2, 0.0)] if words and seen.size is not None else [],
             radii=[0.0],
             colors=[bright(colour)],
             labels=[words],
             show_labels=True,
         )
 
-    def plan(self, at: float, width: float, depth: float, png: bytes) -> str:
-        """The plan of the building that `floor` is about; returns why it can't be shown, or an empty text."""
-        why = self.floor.plan(at, width, depth, png)
-        self._drawing.arrange()
-        return why
+    def _draw_boxes(self, at: float, seen: _Camera) -> None:
+        """From `at` on, these are drawn over the camera's pictures, in their pixels."""
+        boxes = [box for some in seen.boxes.values() for box in some][:MAX_BOXES]
+        self._drawing.show(
+            at,
+            f"{seen.entity}/boxes",
+            rr.Boxes2D,
+            array=[box for box in boxes if _is_inside(box, *(seen.size or (0, 0)))],
+            array_format=rr.Box2DFormat.XYWH,
+            colors=[ALERT],
+            radii=[-1.5],
+        )
 
-    def behavior(self, at: float, path: str, doing: str, detail: str = "") -> None:
-        """From `at` on, the behavior at `path` in the tree is `doing` this, one word, and `detail` says more
-        of it in the same bar; it has ended if empty."""
-        known = self._behaviors.texts(path)
-        if not doing and known is None:
+    # Devices
+
+    def state(self, at: float, state: RcState) -> None:
+        """What an RC publishes of itself: its device's figures, and its health."""
+        if state.figures:
+            self._draw_figures(at, state.rc, state.figures)
+        health = self._health.get(state.rc)
+        if health is None:
+            if state.health == "ok" or len(self._health) >= MAX_FOLLOWED:
+                return
+            health = self._health[state.rc] = _Health()
+        health.words = state.health
+        self._show_health(at, state.rc, health)
+
+    def _show_health(self, at: float, rc: str, health: _Health) -> None:
+        if health.words == health.shown or at - health.at < HEALTH_SPACING:
             return
-        word = clean_text(doing)
-        text = with_detail(doing, detail)
-        # A text that had lost its colour would get any; the word alone says as much in the right one.
-        if known is not None and len(known) >= DETAILS and text not in known:
-            text = word
-        self._behaviors.show(at, path, {text: (text, DOING.get(word, OTHER))})
-        self._drawing.arrange()
+        health.shown, health.at = health.words, at
+        if health.words == "ok":
+            self._drawing.event(at, f"{rc} is well again")
+        else:
+            self._warn(at, f"{rc} fails: {health.words}")
 
-    def figures(self, at: float, rc: str, figures: Mapping[str, float]) -> None:
-        """What an RC (`kind/name`) reports of its device; what is not a finite number is left out."""
+    def _draw_figures(self, at: float, rc: str, figures: Mapping[str, float]) -> None:
+        """What is not a finite number is left out."""
         for figure, value in figures.items():
             key = rc, figure
             drawn_at, last = self._figures.get(key, (-math.inf, math.nan))
@@ -161,6 +351,23 @@ class RobotPanes:
             self._figures[key] = at, value
             self._drawing.log(at, entity, rr.Scalars(value))
         self._drawing.arrange()
+
+
+def _detail(report: BehaviorSaid) -> str:
+    """What stands behind the word in a lane: of an alert under another word, that too."""
+    words = report.doing if report.alert and report.doing != "alert" else ""
+    return " · ".join(filter(None, (words, report.detail)))
+
+
+def _alert(report: BehaviorSaid) -> str:
+    who = _name(report.robot) if report.robot else report.path
+    if report.doing == "alert":
+        return f"{who} sees {report.detail or 'something'}"
+    return f"{who}: {_detail(report)}"
+
+
+def _name(robot: str) -> str:
+    return clean_text(robot.removeprefix("robot/"), MAX_NAME)
 
 
 def _is_inside(box: Box, width: int, height: int) -> bool:

@@ -8,7 +8,7 @@ import socket
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -16,9 +16,9 @@ import rerun.blueprint as rrb
 from zscout.config.strict import BadInput
 from zscout.services.recorder.blueprint import APPLICATION, LIVE_HOST_ROWS, LIVE_ROWS, NO_ROBOTS, blueprint
 from zscout.services.recorder.colours import OPERATOR, OTHER, PALETTE, STATES
-from zscout.services.recorder.drawing import Drawing, Lanes, clean_text, with_detail
+from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_text, with_detail
 from zscout.services.recorder.hosts import HostPane
-from zscout.services.recorder.robots import RobotPanes
+from zscout.services.recorder.robots import RobotTracker
 
 SERVER_MEMORY: Final = "200MB"
 """What the live server keeps for viewers that come late; the oldest goes first."""
@@ -36,14 +36,6 @@ DISCONNECT_SECONDS: Final = 8.0
 
 class TimelineError(BadInput):
     """The recording can't be written or served: one line that says what, where and how to mend it."""
-
-
-class HolderRow(NamedTuple):
-    """An ARC that holds an RC; `operator` if its priority is an operator's; and the robots of its gang."""
-
-    arc: str
-    operator: bool = False
-    robots: tuple[str, ...] = ()
 
 
 class Timeline(Drawing):
@@ -72,7 +64,7 @@ class Timeline(Drawing):
         self._rc_lanes = Lanes(self, "rc", MAX_RCS, "RCs: the others have no lane", colours=RC_STATES)
         self._arc_lanes = Lanes(self, "arc", MAX_ARCS, "ARCs: the others have no lane", colours=ARC_STATES)
         self.hosts = HostPane(self, self._colour_of)
-        self.robots = RobotPanes(self)
+        self.robots = RobotTracker(self)
         self._arranged: object = (False, NO_ROBOTS)
         self.recording.set_log_time_enabled(False)
         self.recording.set_log_tick_enabled(False)
