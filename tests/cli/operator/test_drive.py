@@ -19,14 +19,14 @@ from tests.hang import HANG
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.teleop import Pilot, Teleop
-from zscout.cli.operator.drive import _Console
-from zscout.cli.operator.hands import (
+from zscout.cli.operator.drive import (
     AXIS,
     BUTTON,
     FULL,
     INITIAL,
     PAD_EVENT,
     Hands,
+    _Console,
     game_pad,
 )
 from zscout.config.strict import BadInput

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import os
+import struct
 import sys
-from collections.abc import Callable
-from contextlib import AsyncExitStack
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -19,13 +21,31 @@ from zscout.config.strict import BadInput, quoted
 from zscout.types import SECOND
 
 if TYPE_CHECKING:
-    from zscout.behaviors.teleop import Teleop
+    from zscout.behaviors.teleop import Teleop, Way
     from zscout.cli.operator.picture_recording import PictureRecording
 
 REFRESH: Final = 0.2
 """Seconds between two drawings of the live line."""
 MAX_RATE: Final = 50.0
 F = TypeVar("F", bound=Callable[..., Any])
+
+WAYS: Final[dict[Way, tuple[bytes, ...]]] = {
+    "forward": (b"w", b"\x1b[A", b"\x1bOA"),
+    "back": (b"s", b"\x1b[B", b"\x1bOB"),
+    "right": (b"d", b"\x1b[C", b"\x1bOC"),
+    "left": (b"a", b"\x1b[D", b"\x1bOD"),
+}
+"""Keys that drive: w a s d, and arrows in both forms that terminals send."""
+KEYS: Final = {key: way for way, keys in WAYS.items() for key in keys}
+
+PAD_EVENT: Final = struct.Struct("<IhBB")
+"""An event of Linux's joystick interface: time in ms, value, type, number (Documentation/input/joydev)."""
+AXIS: Final = 0x02
+BUTTON: Final = 0x01
+INITIAL: Final = 0x80
+ACROSS, ALONG = 0, 1
+"""Axes of the left stick."""
+FULL: Final = 32_767
 
 HELP: Final = "arrows or wasd drive · space stops · + - speed · g gives back · q ends"
 
@@ -100,7 +120,6 @@ async def drive(
     common.check_recording("--record", record)
     from zscout.behaviors.sensor_net.held_robot import RobotNeeds
     from zscout.behaviors.teleop import Pilot, Teleop
-    from zscout.cli.operator.hands import Hands, game_pad
 
     fleet = common.the_fleet()
     async with AsyncExitStack() as stack:
@@ -137,8 +156,7 @@ async def _stream(
     stack: AsyncExitStack, robot: str, record: Path | None, console: _Console, *, view: bool
 ) -> PictureRecording:
     """The picture's stream, and a window onto it where there is a display."""
-    from zscout.cli.fleet.children import WINDOW, has_display, viewer
-    from zscout.cli.fleet.view import free_port
+    from zscout.cli.fleet.view import WINDOW, free_port, has_display, viewer
 
     # Rerun takes seconds to load on a busy machine, and the operator may be in a hurry.
     await asyncio.to_thread(importlib.import_module, "zscout.cli.operator.picture_recording")
@@ -234,3 +252,91 @@ class _Console(terminal.LiveLine):
             if teleop.robot.refused:
                 line.append(f", {teleop.robot.refused} refused", style="red")
         self.draw(line.append(f"\n{HELP}", style="dim"))
+
+
+# Hands
+
+
+class Hands:
+    """What the operator's keys and game pad do."""
+
+    def __init__(self, teleop: Teleop, end: asyncio.Event) -> None:
+        self.teleop, self.pilot, self._end = teleop, teleop.pilot, end
+
+    def _now(self) -> float:
+        return self.teleop.client.mesh.now() / SECOND
+
+    def key(self, key: bytes) -> None:
+        """A key was typed."""
+        if key in KEYS:
+            self.pilot.press(self._now(), KEYS[key])
+            self.teleop.take()
+        elif key in (b" ", b"x"):
+            self.pilot.stop()
+        elif key in (b"+", b"="):
+            self.pilot.faster(1)
+        elif key in (b"-", b"_"):
+            self.pilot.faster(-1)
+        elif key == b"g":
+            self.teleop.give_back()
+        elif key in (b"q", b"\x04"):
+            self._end.set()
+        self.teleop.wake()
+
+    def moved(self, forward: float, right: float) -> None:
+        """The pad's stick was moved."""
+        self.pilot.stick(self._now(), forward, right)
+        if not self.pilot.wheels(self._now()).still:
+            self.teleop.take()
+        self.teleop.wake()
+
+    def button(self, number: int) -> None:
+        """A button of the pad was pressed."""
+        if number == 0:
+            self.pilot.stop()
+            self.teleop.wake()
+        elif number == 1:
+            self.teleop.give_back()
+
+
+@contextmanager
+def game_pad(
+    device: Path, moved: Callable[[float, float], None], button: Callable[[int], None]
+) -> Iterator[None]:
+    """Calls `moved(forward, right)`, -1 to 1 each, as the left stick moves, and `button` with the number of
+    one that is pressed. A pad that is unplugged moves to 0, 0. Raises BadInput for what can't be opened."""
+    try:
+        descriptor = os.open(device, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise BadInput(
+            f"--pad: {quoted(str(device))} can't be opened ({error.strerror}); "
+            "name a joystick, as in /dev/input/js0"
+        ) from None
+    loop = asyncio.get_running_loop()
+    stick = {ACROSS: 0.0, ALONG: 0.0}
+
+    def readable() -> None:
+        try:
+            events = os.read(descriptor, PAD_EVENT.size * 64)
+        except BlockingIOError:
+            return
+        except OSError:
+            events = b""
+        if not events:
+            loop.remove_reader(descriptor)
+            moved(0.0, 0.0)
+        whole = len(events) // PAD_EVENT.size * PAD_EVENT.size
+        for _, value, kind, number in PAD_EVENT.iter_unpack(events[:whole]):
+            if kind & ~INITIAL == AXIS and number in stick:
+                stick[number] = value / FULL
+                # Pushed away from oneself is negative there.
+                moved(-stick[ALONG], stick[ACROSS])
+            elif kind == BUTTON and value:
+                button(number)
+
+    loop.add_reader(descriptor, readable)
+    try:
+        yield
+    finally:
+        loop.remove_reader(descriptor)
+        os.close(descriptor)
