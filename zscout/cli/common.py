@@ -187,6 +187,16 @@ async def within(seconds: float | None, event: asyncio.Event) -> bool:
     return event.is_set()
 
 
+async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float) -> bool:
+    """Waits until `true()`, looked at whenever something has `changed`, at most so long; returns which."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            while not true():
+                changed.clear()
+                await changed.wait()
+    return true()
+
+
 @asynccontextmanager
 async def beside(work: Coroutine[Any, Any, Any]) -> AsyncIterator[None]:
     """Runs `work` for as long as the context lasts."""

@@ -147,7 +147,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
 def _line(text: str) -> str:
     from zscout.terminal import clean
 
-    return clean(" ".join(text.split()))
+    return " ".join(clean(text).split())
 
 
 def _pipe_closed() -> int:

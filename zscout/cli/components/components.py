@@ -10,7 +10,7 @@ import click
 from zscout import terminal
 from zscout.cli import common, completion
 from zscout.cli.components.placing import COMPONENT, placement_object, placer_of, tail_of, unknown_here
-from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView
+from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView, see_hosts
 from zscout.cli.fleet.watching import Overview, show
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
 
 ASK_NODES: Final = 1.0
-QUIET: Final = 0.3
-"""Seconds without a new host after which all have been seen."""
 STYLES: Final = {
     "running": "green",
     "waiting": "yellow",
@@ -91,7 +89,7 @@ class Listing:
             found = [self.fleet_view.hosts.get(host or "") for host in hosts]
             return all(host is not None and (host.load or not host.has(Role.LOAD)) for host in found)
 
-        await self.fleet_view.until(reported, FIND_LOADS)
+        await common.until(reported, self.fleet_view.changed, FIND_LOADS)
         await self.find_ages()
 
     async def refresh(self) -> None:
@@ -181,8 +179,7 @@ async def _kinds(*, as_json: bool) -> None:
     async with common.connected("components", need_rcm=False) as client:
         with suppress(common.NobodyThere):
             await common.see_rcm(client)
-        with FleetView(client) as fleet_view:
-            await fleet_view.all_seen()
+        await see_hosts(client)
         nodes = await ask_nodes(client, ListComponents())
         fleet = client.fleet.name
     if not nodes:

@@ -19,7 +19,7 @@ from zscout.cli.components.placing import (
     standing,
     unknown_here,
 )
-from zscout.cli.fleet.fleet_view import FleetView
+from zscout.cli.fleet.fleet_view import see_hosts
 from zscout.messages import Output, Placement, ReadOutput
 
 READ_TIMEOUT: Final = 2.0
@@ -83,16 +83,14 @@ class Reader:
             await self._placer.refresh()
         except (common.NobodyThere, PlacerSilent):
             # The nodes answer without an RCM as well.
-            await self._see_hosts()
+            await see_hosts(self._client)
         while True:
             if self._record is not None and self._host is None:
                 self._host = self._record.host
-            output = await self._read()
-            if output is not None:
+            if (output := await self._read()) is not None:
                 return output
-            await self._see_hosts()
-            output = await self._read_anywhere()
-            if output is not None:
+            await see_hosts(self._client)
+            if (output := await self._read_anywhere()) is not None:
                 return output
             if self._record is None or self._record.state in OVER or self._only or not follow:
                 raise await self._nothing()
@@ -151,10 +149,8 @@ class Reader:
         asked = ReadOutput(self._name)
         replies = await mesh.ask(mesh.keys.component_any, asked, Output, timeout=READ_TIMEOUT)
         found = [(one.message.incarnation, mesh.keys.host_of(one.key)) for one in replies if one.message]
-        if not found:
-            return None
-        _, self._host = max(found)
-        return await self._read()
+        self._host = max(found)[1] if found else self._host
+        return await self._read() if found else None
 
     async def _successor(self, *, silent: bool = False) -> bool:
         """Waits until it goes on somewhere, if only where it was and its host is merely `silent`; False: it
@@ -175,10 +171,6 @@ class Reader:
                     return True
             await self._placer.wait_changed()
 
-    async def _see_hosts(self) -> None:
-        with FleetView(self._client) as fleet_view:
-            await fleet_view.all_seen()
-
     async def _nothing(self) -> common.Failed:
         """What to raise where there is no output."""
         if self._only:
@@ -186,9 +178,7 @@ class Reader:
                 f"{self._host} knows no output of {self._name}; leave --host out to see where it ran last"
             )
         if self._record is not None:
-            return common.Failed(
-                terminal.clean(f"no host knows any output of {self._name}: it {standing(self._record)}")
-            )
+            return common.Failed(f"no host knows any output of {self._name}: it {standing(self._record)}")
         return await unknown_here(self._placer, self._name)
 
     def write(self, text: str) -> None:

@@ -73,22 +73,18 @@ async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: s
         raise
     except RequestRefused as refused:
         raise common.Failed(f"{name} was not moved: {refused}") from None
-    if not begun(record):
-        if to == record.host:
-            return record
-        raise common.Failed(terminal.clean(f"{name} was not moved: it {standing(record)}"))
-    while True:
+    if begun(record):
+        while record.state not in ("running", *OVER):
+            shown.update(f"{name} {standing(record)}")
+            await placer.wait_changed()
+            record = placer.placements.get(name, record)
         if record.state == "running":
             if record.host != before.host:
                 return record
-            raise common.Failed(
-                terminal.clean(f"{name} was not moved, it goes on on {record.host}: {record.reason}")
-            )
-        if record.state in OVER:
-            raise common.Failed(terminal.clean(f"{name} was not moved: it {standing(record)}"))
-        shown.update(f"{name} {standing(record)}")
-        await placer.wait_changed()
-        record = placer.placements.get(name, record)
+            raise common.Failed(f"{name} was not moved, it goes on on {record.host}: {record.reason}")
+    elif to == record.host:
+        return record
+    raise common.Failed(f"{name} was not moved: it {standing(record)}")
 
 
 @click.command()
@@ -129,9 +125,7 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
     for one in moved:
         shown.say(f"{one.component} went to {one.host}{out_of_work(one)}")
     if stay:
-        raise common.Failed(
-            terminal.clean(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
-        )
+        raise common.Failed(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
     shown.say(f"{host} is empty; {cordoned}")
 
 

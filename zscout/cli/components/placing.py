@@ -77,7 +77,7 @@ class Progress(terminal.LiveLine):
             async with asyncio.timeout(seconds):
                 yield
         except TimeoutError:
-            raise common.Failed(terminal.clean(late())) from None
+            raise common.Failed(late()) from None
         except asyncio.CancelledError:
             self.hide()
             terminal.print_line(interrupted, sys.stderr)

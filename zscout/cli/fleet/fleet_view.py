@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -116,23 +115,6 @@ class FleetView:
             return False
         return host.load is None or self.mesh.now() - host.reported > STALE
 
-    async def until(self, true: Callable[[], bool], seconds: float) -> bool:
-        """Waits until `true()`, at most so long; returns which."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                while not true():
-                    self.changed.clear()
-                    await self.changed.wait()
-        return true()
-
-    async def all_seen(self) -> None:
-        """Returns when no host has come into sight for a while: links are made one after another."""
-        deadline = self.mesh.now() + round(FIND_LOADS * SECOND)
-        known = -1
-        while known < len(self.hosts) and self.mesh.now() < deadline:
-            known = len(self.hosts)
-            await self.until(lambda known=known: len(self.hosts) > known, QUIET)  # type: ignore[misc]
-
     async def settled(self, *, loads: bool = True) -> RcmState:
         """The RCM's state, once its RCs are seen, and the hosts with their `loads`. Raises NobodyThere."""
         await common.see_rcm(self.client)
@@ -149,7 +131,7 @@ class FleetView:
                 seen &= all(host.tokens for host in self.all_hosts().values())
             return seen and not (loads and silent)
 
-        await self.until(complete, FIND_LOADS)
+        await common.until(complete, self.changed, FIND_LOADS)
         self._settled = loads
         if not loads:
             return state
@@ -158,6 +140,16 @@ class FleetView:
             async with asyncio.timeout(ASK_PLACER):
                 await self._placer.try_refresh()
         return await self.client.state(forecast=True) or state
+
+
+async def see_hosts(client: Client) -> None:
+    """Returns when no host has come into sight for a while: links are made one after another."""
+    deadline = client.mesh.now() + round(FIND_LOADS * SECOND)
+    known = -1
+    with FleetView(client) as seen:
+        while known < len(seen.hosts) and client.mesh.now() < deadline:
+            known = len(seen.hosts)
+            await common.until(lambda: len(seen.hosts) > known, seen.changed, QUIET)  # noqa: B023 - awaited
 
 
 class Devices:

@@ -161,29 +161,24 @@ class Standing:
     def as_object(self) -> dict[str, Any]:
         """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
         state, homes, now = self.state, self._homes(), self.fleet_view.mesh.now()
-        holds, views = (state.holds, state.rcs) if state is not None else ([], [])
-        rcs = [
-            {
-                "rc": view.rc,
-                "present": view.present,
-                "sharable": view.sharable,
-                "host": homes.get(view.rc),
-                "holders": [
-                    {"arc": hold.arc, "id": hold.id, "client": hold.client}
-                    for hold in holds
-                    if view.rc in hold.needs
-                ],
-                **self.devices.as_object(view.rc),
-            }
-            for view in views
-        ]
+        holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
+
+        def holders(rc: str) -> list[dict[str, str]]:
+            theirs = [hold for hold in holds if rc in hold.needs]
+            return [{"arc": hold.arc, "id": hold.id, "client": hold.client} for hold in theirs]
+
         return {
             "fleet": self.fleet_view.client.fleet.name,
             "links": self.fleet_view.mesh.links(),
             "rcm": None if state is None else {"host": state.host, "term": state.term, "seq": state.seq},
-            "rcs": rcs,
-            "holds": [structs.asdict(hold) for hold in holds],
-            "queue": [structs.asdict(wait) for wait in state.queue] if state is not None else [],
+            "rcs": [
+                structs.asdict(view)
+                | {"host": homes.get(view.rc), "holders": holders(view.rc)}
+                | self.devices.as_object(view.rc)
+                for view in views
+            ],
+            "holds": list(map(structs.asdict, holds)),
+            "queue": list(map(structs.asdict, queue)),
             "more": state.more if state is not None else 0,
             "hosts": [
                 self._host_object(name, host, now) for name, host in self.fleet_view.all_hosts().items()

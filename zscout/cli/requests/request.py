@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Coroutine, Iterator
 from contextlib import asynccontextmanager
 from typing import IO, Any, Final
 
@@ -135,7 +135,7 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
             await client.end(arc)
         line = f"{wanted.name} was not granted within {span(wanted.timeout or 0)}, and is cancelled"
         report.event("ended", "", outcome="timeout", reason=why)
-        raise Failed(clean(f"{line}: {why}" if why else line)) from None
+        raise Failed(f"{line}: {why}" if why else line) from None
     except asyncio.CancelledError:
         if arc is not None:
             await client.end(arc)
@@ -143,7 +143,7 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
         raise
     if grant is None:
         report.event("ended", "", outcome=arc.outcome, reason=arc.reason)
-        raise Failed(clean(f"{wanted.name} was not granted: {arc.reason or arc.outcome}"))
+        raise Failed(f"{wanted.name} was not granted: {arc.reason or arc.outcome}")
     return arc
 
 
@@ -176,7 +176,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         return code
     if held.active:
         # By our clock its time is over; the RCM's own word is on its way.
-        await report.within(LAST_WORD, lambda: not held.active)
+        await common.until(lambda: not held.active, report.changed, LAST_WORD)
     if held.active or _ending(arc).outcome == "completed":
         arc.finish("completed", "its time is over", client.mesh.now())
         report.event("ended", f"the time of {arc.name} is over", outcome="completed")
@@ -212,7 +212,7 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
         await client.end(arc)
     if wanted.command:
         return TAKEN_AWAY
-    raise Failed(clean(f"{line}; ask again, or with a higher priority"))
+    raise Failed(f"{line}; ask again, or with a higher priority")
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
@@ -263,7 +263,7 @@ class Report(LiveLine):
         self._name, self._client, self._as_json = name, client, as_json
         self._mesh = client.mesh
         self._arc: OpenArc | None = None
-        self._changed = asyncio.Event()
+        self.changed = asyncio.Event()
         self._printed: object = None
         """How it waited by the last line that stays."""
         self._state: RcmState | None = None
@@ -282,7 +282,7 @@ class Report(LiveLine):
     def news(self, arc: OpenArc) -> None:
         """A watcher for the client."""
         self._arc = arc
-        self._changed.set()
+        self.changed.set()
 
     @asynccontextmanager
     async def telling(self, follow: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
@@ -299,7 +299,7 @@ class Report(LiveLine):
             if self._looked is not None and self._arc is not None and self._arc.state == "queued":
                 # One look per REFRESH: news may come in a crowd.
                 await asyncio.sleep(REFRESH - (self._mesh.now() - self._looked) / SECOND)
-            self._changed.clear()
+            self.changed.clear()
             arc = self._arc
             if arc is None:
                 self.draw(f"{self._name}: asking the RCM")
@@ -315,18 +315,11 @@ class Report(LiveLine):
     async def follow_hold(self, arc: OpenArc) -> None:
         """Shows how long a hold without a command goes on, until cancelled."""
         while True:
-            self._changed.clear()
+            self.changed.clear()
             left = (arc.end - self._mesh.now()) / SECOND
             rest = f"held for {span(self._since(arc))}, kept" if arc.keep else f"{span(left)} left"
             self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}; Ctrl-C gives back")
             await self._news_or_a_second()
-
-    async def within(self, seconds: float, true: Callable[[], bool]) -> None:
-        """Waits for news until `true`, at most so long."""
-        deadline = self._mesh.now() + round(seconds * SECOND)
-        while not true() and (left := deadline - self._mesh.now()) > 0:
-            self._changed.clear()
-            await common.within(left / SECOND, self._changed)
 
     def _show_wait(self, arc: OpenArc) -> None:
         now, start, starts_in = self._mesh.now(), "", None
@@ -365,7 +358,7 @@ class Report(LiveLine):
         return (self._mesh.now() - arc.since) / SECOND
 
     async def _news_or_a_second(self) -> None:
-        await common.within(REFRESH if self.watched else None, self._changed)
+        await common.within(REFRESH if self.watched else None, self.changed)
 
 
 def _how(arc: OpenArc) -> object:
