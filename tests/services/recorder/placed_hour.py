@@ -9,8 +9,6 @@ import msgspec
 
 from zscout.messages import ComponentUse, LoadReport, Placement, Placements
 from zscout.services.recorder.drawing import HolderRow
-from zscout.services.recorder.hosts import Use
-from zscout.services.recorder.placement_tracker import PlacementTracker
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import Term
 
@@ -83,7 +81,7 @@ def story() -> list[tuple[float, Placements]]:
 
 def play(timeline: Timeline) -> None:
     """The hour, as the recorder would write it."""
-    written = PlacementTracker(timeline)
+    written = timeline.hosts
     written.listed(0, Placements(TERM), set())
     says = story()
     runs: dict[str, str] = {}
@@ -101,9 +99,7 @@ def play(timeline: Timeline) -> None:
                 continue
             report = report_of(host, at, loads, [name for name, where in runs.items() if where == host])
             timeline.hosts.load(at, host, report.load_average[0], report.cpu / 100)
-            timeline.hosts.uses(
-                at, host, [Use(one.component, one.cpu, one.memory) for one in report.components]
-            )
+            timeline.hosts.uses(at, host, report.components)
     for arc, begin, end in (("counter", 600, 1500), ("survey", 1700, 2800)):
         timeline.holders(begin, "robot/scout33", [HolderRow(arc)])
         timeline.arc(begin, arc, "running", "priority 1")

@@ -15,7 +15,6 @@ from zscout.lab.study.placement.study import SCENARIOS, study
 from zscout.messages import Placements
 from zscout.services.recorder.blueprint import MARK_WORDS
 from zscout.services.recorder.colours import FAILED, LINES, MARKS, PALETTE
-from zscout.services.recorder.placement_tracker import PlacementTracker
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import POLICIES, Term
 
@@ -67,7 +66,7 @@ def test_words_that_the_viewer_can_t_draw_do_not_end_it(tmp_path: Path) -> None:
         timeline.arc(0, words, "waiting", words)
         timeline.event(0, f"{words}: Grüße, Ελλάδα, Москва, Łódź → “…”")
         timeline.hosts.load(0, words, 1.0)
-        tracker = PlacementTracker(timeline)
+        tracker = timeline.hosts
         tracker.published(0, Placements(Term(1, words)))
     with viewer(path, tmp_path) as client:
         settled_picture(client, tmp_path / "picture.png")

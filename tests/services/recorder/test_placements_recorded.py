@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -15,11 +15,10 @@ from tests.services.recorder.placed_hour import TERM, placement, play
 from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Sender
 from zscout.mesh import IncomingQuery, ZenohMesh
-from zscout.messages import ListPlacements, Placement, Placements, PlacerOperation
+from zscout.messages import ComponentUse, ListPlacements, Placement, Placements, PlacerOperation
 from zscout.services.recorder import hosts as module
 from zscout.services.recorder.drawing import HolderRow
-from zscout.services.recorder.hosts import Running, Use
-from zscout.services.recorder.placement_tracker import PlacementTracker
+from zscout.services.recorder.hosts import HostTracker
 from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import Term
@@ -89,7 +88,8 @@ def test_a_component_has_the_colour_of_its_arc(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         timeline.holders(0, "robot/a", [HolderRow("first"), HolderRow("counter")])
-        timeline.hosts.runs(1, "anvil", [Running("counter"), Running("other")])
+        on_anvil = [placement(name, "running", "anvil", 1) for name in ("counter", "other")]
+        say(timeline.hosts, 1, *on_anvil)
         timeline.holders(2, "robot/a", [HolderRow("other"), HolderRow("next")])
     rc, host = colours(path, "/rc/**")["/rc/robot/a"], colours(path, "/host/**")["/host/anvil"]
     assert host == {name: rc[name] for name in ("counter", "other")}
@@ -99,7 +99,7 @@ def test_a_component_has_the_colour_of_its_arc(tmp_path: Path) -> None:
 def test_a_move_that_failed_is_told_and_leaves_no_mark(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        tracker = PlacementTracker(timeline)
+        tracker = timeline.hosts
         say(tracker, 0, placement("counter", "running", "anvil", 1))
         say(tracker, 1, placement("counter", "moving", "anvil", 1, to="basil"))
         say(tracker, 2, placement("counter", "running", "anvil", 1, reason="not at a safe point for 5 s"))
@@ -114,14 +114,14 @@ def test_a_move_that_failed_is_told_and_leaves_no_mark(tmp_path: Path) -> None:
     assert lanes(path, "/host/**")["/host/basil"] == [(1, ["counter · gets ready"]), (2, [""])]
 
 
-def say(tracker: PlacementTracker, at: float, *told: Placement, term: Term = TERM) -> None:
+def say(tracker: HostTracker, at: float, *told: Placement, term: Term = TERM) -> None:
     tracker.published(at, Placements(term, list(told)))
 
 
 def test_what_a_late_recorder_reads_did_not_happen_now(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        tracker = PlacementTracker(timeline)
+        tracker = timeline.hosts
         say(tracker, 1, placement("newer", "running", "anvil", 2))
         older = [placement("newer", "starting", "anvil", 1), placement("counter", "running", "basil", 7)]
         tracker.listed(2, Placements(TERM, older, ["crucible"]), {"newer"})
@@ -148,7 +148,7 @@ def test_bad_names_are_left_out_and_lanes_are_bounded(
     monkeypatch.setattr(module, "MAX_HOSTS", 2)
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
-        tracker = PlacementTracker(timeline)
+        tracker = timeline.hosts
         say(tracker, 0, placement("a/b", "running", "anvil", 1), placement("a", "running", "h" * 70, 1))
         for number in range(4):
             say(tracker, 1, placement(f"c{number}", "running", f"host{number}", 1))
@@ -156,20 +156,22 @@ def test_bad_names_are_left_out_and_lanes_are_bounded(
     assert sum(text.startswith("timeline: more than 2 hosts") for text in events(path)) == 1
 
 
+def use(component: str, cpu: float, memory: int = 0) -> ComponentUse:
+    return ComponentUse(component, "kind", 1, cpu, memory)
+
+
 def test_the_heaviest_components_have_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_CURVES", 3)
     monkeypatch.setattr(module, "MAX_DRAWN", 5)
     path = tmp_path / "run.rrd"
-    many = [Use(f"c{number}", cpu=0.1 * number, memory=0) for number in range(1, 7)]
+    many = [use(f"c{number}", 0.1 * number) for number in range(1, 7)]
     with Timeline("lab", path=path) as timeline:
         timeline.hosts.uses(0, "anvil", many)
-        timeline.hosts.uses(1, "basil", [Use("heavy", cpu=0.3, memory=2e9)])
+        timeline.hosts.uses(1, "basil", [use("heavy", 0.3, 2_000_000_000)])
         timeline.hosts.uses(2, "anvil", many)
-        timeline.hosts.uses(3, "anvil", [Use("c6", cpu=0.6, memory=5e6)])
-        timeline.hosts.uses(
-            4, "anvil", [Use(f"d{number}", cpu=9, memory=float("nan")) for number in range(3)]
-        )
-        timeline.hosts.uses(5, "anvil", [Use(f"d{number}", cpu=9, memory=0) for number in range(3)])
+        timeline.hosts.uses(3, "anvil", [use("c6", 0.6, 5_000_000)])
+        timeline.hosts.uses(4, "anvil", [])
+        timeline.hosts.uses(5, "anvil", [use(f"d{number}", 9) for number in range(3)])
     drawn = {entity for entity, _, _ in rows(path, "/use/cpu/**", SCALARS)}
     assert drawn == {
         "/use/cpu/anvil/c6",
@@ -228,13 +230,13 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
             async with await ZenohMesh.open(fleet.name, Sender("here", "recorder"), fleet.mesh) as ears:
                 with Timeline("lab", path=path) as timeline:
                     there, stop = asyncio.Event(), asyncio.Event()
-                    runs = timeline.hosts.runs
+                    show = timeline.hosts.lanes.show
 
-                    def shown(at: float, host: str, components: Iterable[Running]) -> None:
-                        runs(at, host, components)
+                    def seen(at: float, name: str, shown: Mapping[str, tuple[str, int]]) -> None:
+                        show(at, name, shown)
                         there.set()
 
-                    timeline.hosts.runs = shown  # type: ignore[method-assign]
+                    timeline.hosts.lanes.show = seen  # type: ignore[method-assign]
                     recording = asyncio.create_task(Recorder(ears, fleet, timeline).run(stop))
                     async with asyncio.timeout(HANG):
                         await asked.wait()

@@ -1,17 +1,26 @@
-"""The hosts' part of the timeline: load curves with marks on them, what runs where, and what it uses."""
+"""The hosts' part of the timeline: load curves with marks on them, what runs where as the placer publishes
+it, and what it uses. Times are passed in."""
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import rerun as rr
 
+from zscout.keyexpr import NAME
+from zscout.messages import MAX_PLACED, ComponentUse, Placement, Placements, absurd
 from zscout.services.recorder.colours import LINES, MARKS, STATES
 from zscout.services.recorder.drawing import Drawing, Lanes, clean_path, clean_text, with_detail
+from zscout.types import NO_TERM, Term
 
+log = logging.getLogger(__name__)
+
+MAX_FOLLOWED: Final = 2 * MAX_PLACED
+"""Components."""
 MAX_HOSTS: Final = 256
 MAX_CURVES: Final = 32
 """Components whose use is drawn at one time: the heaviest."""
@@ -26,30 +35,21 @@ SMOOTHING: Final = 0.1
 SAME_MOMENT: Final = 1.0
 """Marks of one host within so many seconds stand above each other."""
 MAX_STACK: Final = 10
+GETS_READY: Final = "gets ready"
+"""A component on the host to which it moves."""
 SILENCE: Final = 10.0
 """Seconds without a report after which a load curve is interrupted."""
 
 Mark: TypeAlias = Literal["placed", "restarted", "left", "came", "given_up"]
 
 
-class Running(NamedTuple):
-    """A component on a host. `state` is empty while it just runs; `ready` if it has begun to work."""
+@dataclass(slots=True)
+class _Component:
+    """A component that is followed: its newest placement, and which start of it ran last, where."""
 
-    component: str
-    state: str = ""
-    ready: bool = True
-
-
-class Use(NamedTuple):
-    """What a component uses: `cpu` in cores, `memory` in bytes."""
-
-    component: str
-    cpu: float
-    memory: float
-
-    @property
-    def weight(self) -> float:
-        return self.cpu + self.memory / GIGABYTE
+    placement: Placement
+    ran: int = 0
+    where: str | None = None
 
 
 @dataclass(slots=True)
@@ -68,8 +68,8 @@ class _Marked:
     height: float
 
 
-class HostPane:
-    """Draws hosts; `colour` gives a component its RGBA."""
+class HostTracker:
+    """Draws hosts and components; `colour` gives a component its RGBA."""
 
     def __init__(self, drawing: Drawing, colour: Callable[[str], int]) -> None:
         self._drawing, self._colour = drawing, colour
@@ -83,6 +83,12 @@ class HostPane:
         self._curves: dict[tuple[str, str], float] = {}
         """Weight of each component that has curves now, by host and component."""
         self._drawn: set[tuple[str, str]] = set()
+        self._term: Term = NO_TERM
+        self._components: dict[str, _Component] = {}
+        """The one that changed longest ago first."""
+        self._cordoned: frozenset[str] = frozenset()
+
+    # Loads and marks
 
     def load(self, at: float, host: str, load1: float, cpu: float | None = None) -> None:
         """A host's load average over 1 minute and, kept under `/cpu`, its CPU use (0 to 1).
@@ -108,16 +114,6 @@ class HostPane:
         if math.isfinite(load1):
             known.load, self._peak = load1, max(self._peak, load1)
 
-    def runs(self, at: float, host: str, components: Iterable[Running]) -> None:
-        """From `at` on, exactly these components are on the host; none if empty. Each gets a row."""
-        self.placing = True
-        self._drawing.arrange()
-        shown = dict[str, tuple[str, int]]()
-        for one in components:
-            colour = self._colour(one.component) if one.ready else STATES["waiting"]
-            shown[one.component] = with_detail(one.component, one.state), colour
-        self.lanes.show(at, host, shown)
-
     def mark(self, at: float, host: str, mark: Mark, component: str) -> None:
         """Marks on the host's load curve what happened to a component there."""
         entity = f"/mark/{mark}"
@@ -140,21 +136,18 @@ class HostPane:
         words = rr.AnyValues(component=clean_text(component), host=clean_text(host))
         self._drawing.log(at, entity, rr.Scalars(height), words)
 
-    def uses(self, at: float, host: str, uses: Iterable[Use]) -> None:
+    def uses(self, at: float, host: str, uses: Iterable[ComponentUse]) -> None:
         """What all components of a host use; the curve of one that is not named ends."""
-        known = {
-            use.component: use
-            for use in uses
-            if math.isfinite(use.weight) and use.cpu >= 0 and use.memory >= 0
-        }
+        known = {use.component: use for use in uses}
         for key in [key for key in self._curves if key[0] == host and key[1] not in known]:
             self._end_curve(at, key)
-        for use in sorted(known.values(), key=lambda use: use.weight, reverse=True):
+        for use in sorted(known.values(), key=_weight, reverse=True):
             key = host, use.component
-            if key not in self._curves and not self._make_room(at, key, use.weight):
+            now = _weight(use)
+            if key not in self._curves and not self._make_room(at, key, now):
                 continue
-            weight = self._curves.get(key, use.weight)
-            self._curves[key] = weight + SMOOTHING * (use.weight - weight)
+            weight = self._curves.get(key, now)
+            self._curves[key] = weight + SMOOTHING * (now - weight)
             for entity, value in zip(_entities(key), (use.cpu, use.memory / 1e6), strict=True):
                 self._drawing.log(at, entity, rr.Scalars(value))
 
@@ -179,6 +172,143 @@ class HostPane:
         del self._curves[key]
         for entity in _entities(key):
             self._drawing.erase(at, entity)
+
+    # What runs where
+
+    def published(self, at: float, news: Placements) -> None:
+        """What has changed."""
+        self._take_in(at, news, forgotten=news.forgotten, fresher=(), seen=True)
+
+    def listed(self, at: float, news: Placements, fresher: Collection[str]) -> None:
+        """All there is. `fresher` names what was published since the question, and is known better.
+
+        What was not known before is shown, but did not happen now."""
+        there = {placement.component for placement in news.components}
+        self._take_in(
+            at, news, forgotten=self._components.keys() - there - set(fresher), fresher=fresher, seen=False
+        )
+
+    def _take_in(
+        self, at: float, news: Placements, *, forgotten: Collection[str], fresher: Collection[str], seen: bool
+    ) -> None:
+        """`seen`: whether a component that is new here was placed just now."""
+        if news.term < self._term or absurd(news.term, self._term):
+            return
+        self._term = news.term
+        touched: set[str] = set()
+        for placement in news.components:
+            if placement.component not in fresher:
+                touched |= self._take(at, placement, news=seen or placement.component in self._components)
+        for name in forgotten:
+            known = self._components.pop(name, None)
+            touched |= _seats(known.placement).keys() if known is not None else set()
+        for host in sorted(touched):
+            self._show_lane(at, host)
+        cordoned, before = frozenset(news.cordoned), self._cordoned
+        self._cordoned = cordoned
+        for host in sorted(cordoned - before):
+            self._drawing.event(at, f"{host} is being emptied: nothing is placed there any more", "WARN")
+        for host in sorted(before - cordoned):
+            self._drawing.event(at, f"{host} is used again")
+
+    def _show_lane(self, at: float, host: str) -> None:
+        """Each component on the host gets a row."""
+        self.placing = True
+        self._drawing.arrange()
+        shown = dict[str, tuple[str, int]]()
+        for name, known in self._components.items():
+            words = _seats(known.placement).get(host)
+            if words is not None:
+                ready = words not in ("starting", GETS_READY)
+                shown[name] = with_detail(name, words), self._colour(name) if ready else STATES["waiting"]
+        self.lanes.show(at, host, shown)
+
+    def _take(self, at: float, now: Placement, *, news: bool) -> set[str]:
+        """Takes a component in; returns the hosts whose lanes are another."""
+        names = (now.component, *(host for host in (now.host, now.to) if host is not None))
+        if not all(NAME.fullmatch(name) for name in names):
+            log.warning("the placer published a component or host with a bad name: %.200r", names)
+            return set()
+        known = self._components.pop(now.component, None)
+        if known is None and len(self._components) >= MAX_FOLLOWED:
+            return set()
+        before = known.placement if known is not None else None
+        known = known or _Component(now)
+        known.placement = now
+        self._components[now.component] = known
+        self._log_change(at, known, before, news=news)
+        if now.state in ("running", "moving") and now.host is not None:
+            known.ran, known.where = max(known.ran, now.incarnation), now.host
+        return {*_seats(now), *(_seats(before) if before is not None else ())}
+
+    def _log_change(self, at: float, known: _Component, before: Placement | None, *, news: bool) -> None:
+        """The event, and the marks, if any."""
+        now, name = known.placement, known.placement.component
+        event, mark = self._drawing.event, self.mark
+        why = f": {now.reason}" if now.reason else ""
+        if now.state == "running" and now.host is not None and now.incarnation > known.ran:
+            if not news:
+                event(at, f"{name} ({now.spec.kind}) runs on {now.host} already")
+            elif not known.ran or known.where is None:
+                mark(at, now.host, "placed", name)
+                event(at, f"{name} ({now.spec.kind}) is placed on {now.host}{why}")
+            elif before is not None and now.moves > before.moves:
+                dead = "" if now.dead is None else f", dead {_duration(now.dead)}"
+                mark(at, known.where, "left", name)
+                mark(at, now.host, "came", name)
+                event(at, f"{name} moved {known.where} -> {now.host}{dead}")
+            else:
+                was = "" if now.host == known.where else f", it was on {known.where}"
+                mark(at, now.host, "restarted", name)
+                event(at, f"{name} is restarted on {now.host}{was}{why}", "WARN")
+            return
+        if before is not None and (before.state, before.reason) == (now.state, now.reason):
+            return
+        match now.state:
+            case "waiting":
+                event(at, f"{name} waits for a host{why}", "WARN")
+            case "moving":
+                event(at, f"{name} moves from {now.host} to {now.to}{why}")
+            case "running" if before is not None and before.state == "moving":
+                event(at, f"{name} stays on {now.host}{why}", "WARN")
+            case "backing_off":
+                where = f" on {known.where}" if known.where else ""
+                event(at, f"{name} failed{where}, and is tried again{why}", "WARN")
+            case "ended":
+                event(at, f"{name} ended{why}")
+            case "given_up":
+                host = known.where or now.host
+                if host is not None and news:
+                    mark(at, host, "given_up", name)
+                event(at, f"{name} is given up{why}", "ERROR")
+            case _:
+                pass
+
+
+def _seats(placement: Placement) -> dict[str, str]:
+    """In which hosts' lanes a component stands, and what it does there: empty while it just runs."""
+    host, to = placement.host, placement.to
+    if host is None:
+        return {}
+    match placement.state:
+        case "running":
+            return {host: ""}
+        case "moving" if to is not None and to != host:
+            return {host: f"moves to {to}", to: GETS_READY}
+        case "moving":
+            return {host: "moves"}
+        case "starting" | "stopping":
+            return {host: placement.state}
+        case _:
+            return {}
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds * 1000:.0f} ms" if seconds < 1 else f"{seconds:.1f} s"
+
+
+def _weight(use: ComponentUse) -> float:
+    return use.cpu + use.memory / GIGABYTE
 
 
 def _entities(key: tuple[str, str]) -> tuple[str, str]:

@@ -33,8 +33,7 @@ from zscout.messages import (
     RcState,
     StateAsk,
 )
-from zscout.services.recorder.hosts import Use
-from zscout.services.recorder.placement_tracker import MAX_FOLLOWED, PlacementTracker
+from zscout.services.recorder.hosts import MAX_FOLLOWED
 from zscout.services.recorder.request_tracker import RequestTracker
 from zscout.services.recorder.robots import MAX_CAMERAS
 from zscout.services.recorder.timeline import Timeline
@@ -89,8 +88,7 @@ class Recorder:
         self._zero = mesh.now()
         self._over = asyncio.Event()
         self._supervisor = Supervisor("the recorder", lambda _: self._over.set())
-        self._placements = PlacementTracker(timeline)
-        self._robots = timeline.robots
+        self._hosts, self._robots = timeline.hosts, timeline.robots
         self._requests = RequestTracker(timeline, fleet.operator_priority)
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
         self._leaders: set[Token] = set()
@@ -164,9 +162,8 @@ class Recorder:
     def _on_load(self, key: str, report: LoadReport) -> None:
         host, at = self.mesh.keys.host_of(key), self._now()
         if host == report.host:
-            self.timeline.hosts.load(at, host, report.load_average[0], report.cpu / 100)
-            uses = [Use(one.component, one.cpu, one.memory) for one in report.components]
-            self.timeline.hosts.uses(at, host, uses)
+            self._hosts.load(at, host, report.load_average[0], report.cpu / 100)
+            self._hosts.uses(at, host, report.components)
 
     def _on_token(self, token: Token, alive: bool) -> None:
         instances = self._tokens.setdefault((token.host, token.role, token.name), set())
@@ -243,13 +240,13 @@ class Recorder:
                 failed += 1
             else:
                 failed = 0
-                self._placements.listed(self._now(), reply.message, fresher)
+                self._hosts.listed(self._now(), reply.message, fresher)
 
     def _on_placements(self, _key: str, news: Placements) -> None:
         if self._fresher is not None and len(self._fresher) < MAX_FOLLOWED:
             self._fresher.update(one.component for one in news.components)
             self._fresher.update(news.forgotten)
-        self._placements.published(self._now(), news)
+        self._hosts.published(self._now(), news)
 
     # Robots
 

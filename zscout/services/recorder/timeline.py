@@ -17,7 +17,7 @@ from zscout.config.strict import BadInput
 from zscout.services.recorder.blueprint import APPLICATION, LIVE_HOST_ROWS, LIVE_ROWS, NO_ROBOTS, blueprint
 from zscout.services.recorder.colours import OPERATOR, OTHER, PALETTE, STATES
 from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_text, with_detail
-from zscout.services.recorder.hosts import HostPane
+from zscout.services.recorder.hosts import HostTracker
 from zscout.services.recorder.robots import RobotTracker
 
 SERVER_MEMORY: Final = "200MB"
@@ -63,7 +63,7 @@ class Timeline(Drawing):
         """Of ARCs and components, by order of appearance: a component has that of the ARC with its name."""
         self._rc_lanes = Lanes(self, "rc", MAX_RCS, "RCs: the others have no lane", colours=RC_STATES)
         self._arc_lanes = Lanes(self, "arc", MAX_ARCS, "ARCs: the others have no lane", colours=ARC_STATES)
-        self.hosts = HostPane(self, self._colour_of)
+        self.hosts = HostTracker(self, self._colour_of)
         self.robots = RobotTracker(self)
         self._arranged: object = (False, NO_ROBOTS)
         self.recording.set_log_time_enabled(False)
