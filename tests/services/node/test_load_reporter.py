@@ -141,7 +141,8 @@ def test_served_is_the_share_of_all_threads_since_the_last_look(proc: Proc) -> N
 
 def test_there_is_a_limit_to_components(proc: Proc) -> None:
     proc.process(10, 1)
-    meter = proc.meter(*[10] * (messages.MAX_COMPONENTS + 5))
+    listed = [RunningComponent(f"c{i}", "camera", 1, 10) for i in range(messages.MAX_COMPONENTS + 5)]
+    meter = UseMeter(lambda: listed, proc=proc.folder, now=lambda: proc.at)
     assert len(meter.measure()) == messages.MAX_COMPONENTS
 
 

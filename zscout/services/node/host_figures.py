@@ -226,19 +226,14 @@ def clock() -> tuple[float, float]:
         found = psutil.cpu_freq()
     except (OSError, NotImplementedError, RuntimeError, ValueError):
         found = None
-    if found is None:
-        return 0.0, 0.0
-    return float(found.current or 0), float(found.max or 0)
+    return (0.0, 0.0) if found is None else (float(found.current or 0), float(found.max or 0))
 
 
 def temperature() -> float | None:
     """The hottest of the host's sensors in degrees Celsius; None where there is none."""
-    sensors = getattr(psutil, "sensors_temperatures", None)
-    if sensors is None:
-        return None
     try:
-        found = sensors()
-    except (OSError, RuntimeError, ValueError):
+        found = psutil.sensors_temperatures()
+    except (AttributeError, OSError, RuntimeError, ValueError):  # not every system has this function
         return None
     current = [one.current for group in found.values() for one in group if one.current]
     return max(current, default=None)

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import os
 from collections.abc import Iterable
-from typing import Final, NamedTuple
+from typing import Final, TypeAlias
 
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Mesh, Supervisor
@@ -40,6 +40,10 @@ USES_SHARE: Final = 0.002
 """Of one core, that is spent on looking at what components use: many are looked at less often."""
 TREE_SHARE: Final = 0.004
 """Likewise, at looking at this process and its descendants."""
+
+
+LoadFigures: TypeAlias = tuple[tuple[float, float, float], float, int]
+"""Of a host, or of what is taken for one: load averages, percent of all cores, bytes of memory available."""
 
 
 class LoadReporter:
@@ -112,16 +116,6 @@ class LoadReporter:
         return Gauge(self.mesh.me.host, self._labels, self._running, load=load)
 
 
-class HostLoadFigures(NamedTuple):
-    """How busy a host is, or what is taken for one."""
-
-    averages: tuple[float, float, float]
-    cpu: float
-    """Percent of all cores."""
-    available: int
-    """Bytes of memory."""
-
-
 class TreeLoad:
     """The load of one process tree, as if there were no other programs."""
 
@@ -130,11 +124,10 @@ class TreeLoad:
         self._averages = 0.0, 0.0, 0.0
         self._uses = Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
 
-    def __call__(self, size: float, ram: HostMemory) -> HostLoadFigures:
+    def __call__(self, size: float, ram: HostMemory) -> LoadFigures:
         """Of so many cores, with this memory; CPU use since the tree was last looked at."""
         use = self._uses()
-        percent = min(100.0, 100 * use.cores / size)
-        return HostLoadFigures(self._averages, percent, max(0, ram.total - use.memory))
+        return self._averages, min(100.0, 100 * use.cores / size), max(0, ram.total - use.memory)
 
     def _measure(self) -> TreeUse:
         use = self._meter.measure()
@@ -169,16 +162,16 @@ class Gauge:
         """The host's load now; CPU use since the last call."""
         self._number += 1
         size, ram = cores(self._cgroup), memory(self._cgroup)
-        load = self._load(size, ram)
+        averages, percent, available = self._load(size, ram)
         now, rated = self._clocks()
         return LoadReport(
             host=self._host,
             number=self._number,
             # Readers of the first version take whole numbers only.
             cores=int(size) if size.is_integer() else size,
-            load_average=load.averages,
-            cpu=load.cpu,
-            memory_available=load.available,
+            load_average=averages,
+            cpu=percent,
+            memory_available=available,
             memory_total=ram.total,
             speed=round(self._speeds(), 3),
             clock=round(now, 1),
@@ -188,9 +181,9 @@ class Gauge:
             components=self._uses(),
         )
 
-    def _host_load(self, size: float, ram: HostMemory) -> HostLoadFigures:
+    def _host_load(self, size: float, ram: HostMemory) -> LoadFigures:
         """Of the whole host, or of the container where that has limits; CPU use since the last call."""
-        return HostLoadFigures(os.getloadavg(), self._cpu.percent(size), ram.available)
+        return os.getloadavg(), self._cpu.percent(size), ram.available
 
     def _measure_speed(self) -> float:
         if self._fresh:

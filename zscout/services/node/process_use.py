@@ -6,7 +6,8 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
@@ -41,7 +42,7 @@ Running: TypeAlias = Callable[[], Iterable[RunningComponent]]
 
 class _Process(NamedTuple):
     parent: int
-    state: str
+    state: bytes
     cpu: float
     """Seconds, with those of the children that it waited for."""
     started: float
@@ -49,22 +50,21 @@ class _Process(NamedTuple):
     memory: int
 
 
-class _Wanted(NamedTuple):
-    """Nanoseconds that a thread ran, and that it waited for a processor."""
-
-    ran: int
-    waited: int
+_Demand: TypeAlias = tuple[int, int]
+"""Nanoseconds that a thread ran, and that it waited for a processor."""
 
 
 class _Tree(NamedTuple):
     """A process and all its descendants at one moment, `at` in seconds since the host's start."""
 
     at: float
+    started: float = 0.0
+    """When its root did, on the same clock."""
     cpu: float = 0.0
     """Seconds of processor time so far."""
     memory: int = 0
     pids: Sequence[int] = ()
-    threads: Mapping[int, _Wanted] = {}
+    threads: Mapping[int, _Demand] = {}
 
     def cores(self, before: _Tree) -> float:
         """What it had on average since. What leaves the tree for another parent takes its time with it."""
@@ -72,31 +72,30 @@ class _Tree(NamedTuple):
         return max(0.0, self.cpu - before.cpu) / elapsed if elapsed > 0 else 0.0
 
 
-class _Processes:
-    """All processes at one moment; with `ended` also those that nobody has waited for yet."""
-
-    def __init__(self, proc: Path, at: float, *, ended: bool = False) -> None:
-        self._proc, self._at = proc, at
-        self.table: dict[int, _Process] = {}
-        self._children: dict[int, list[int]] = {}
-        for name in _names(str(proc)):
-            if name.isascii() and name.isdigit():
-                process = _parse(_read(f"{proc}/{name}/stat"))
-                if process is not None and (ended or process.state not in "ZXx"):
-                    self.table[int(name)] = process
-                    self._children.setdefault(process.parent, []).append(int(name))
-
-    def tree(self, root: int) -> _Tree:
-        """Raises KeyError. Processes come and go while the table is read: it may hold a circle of parents."""
-        pids = {root: self.table[root]}
-        queue = [root]
-        for pid in queue:
-            for child in self._children.get(pid, ()):
-                if child not in pids:
-                    pids[child] = self.table[child]
-                    queue.append(child)
-        cpu, memory = sum(one.cpu for one in pids.values()), sum(one.memory for one in pids.values())
-        return _Tree(self._at, cpu, memory, queue, _threads(self._proc, queue))
+def _trees(proc: Path, at: float, roots: Iterable[int], *, ended: bool = False) -> dict[int, _Tree]:
+    """The trees of those roots that live; with `ended` also of processes that were not waited for yet."""
+    table: dict[int, _Process] = {}
+    children: dict[int, list[int]] = {}
+    for name in _names(str(proc)):
+        if name.isascii() and name.isdigit():
+            process = _parse(_read(f"{proc}/{name}/stat"))
+            if process is not None and (ended or process.state not in b"ZXx"):
+                table[int(name)] = process
+                children.setdefault(process.parent, []).append(int(name))
+    found = {}
+    for root in roots:
+        if root in table:
+            # Processes come and go while the table is read: it may hold a circle of parents.
+            pids = {root: table[root]}
+            queue = [root]
+            for pid in queue:
+                for child in children.get(pid, ()):
+                    if child not in pids:
+                        pids[child] = table[child]
+                        queue.append(child)
+            cpu, memory = sum(one.cpu for one in pids.values()), sum(one.memory for one in pids.values())
+            found[root] = _Tree(at, table[root].started, cpu, memory, queue, _threads(proc, queue))
+    return found
 
 
 class UseMeter:
@@ -110,17 +109,11 @@ class UseMeter:
     def measure(self) -> tuple[ComponentUse, ...]:
         """One entry for each component whose root process lives, MAX_COMPONENTS at most."""
         running = list(self._running())[:MAX_COMPONENTS]
-        last, self._last = self._last, {}
-        if not running:
-            return ()
-        processes = _Processes(self._proc, self._now())
-        found = []
-        for one in running:
-            if one.pid in processes.table:
-                before = last.get(one) or _Tree(processes.table[one.pid].started)
-                self._last[one] = tree = processes.tree(one.pid)
-                found.append(_use(one, before, tree))
-        return tuple(found)
+        trees = _trees(self._proc, self._now(), {one.pid for one in running}) if running else {}
+        last, self._last = self._last, {one: trees[one.pid] for one in running if one.pid in trees}
+        return tuple(
+            _use(one, last.get(one) or _Tree(tree.started), tree) for one, tree in self._last.items()
+        )
 
 
 def _use(one: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
@@ -177,10 +170,10 @@ class TreeMeter:
 
     def _look(self) -> _Tree:
         # A child that ended keeps its time until somebody waits for it, and then hands it on.
-        processes = _Processes(self._proc, self._now(), ended=True)
-        if self._root not in processes.table:
+        trees = _trees(self._proc, self._now(), [self._root], ended=True)
+        if self._root not in trees:
             raise OSError(f"{self._proc} does not tell of process {self._root}; mount it, or set load = true")
-        return processes.tree(self._root)
+        return trees[self._root]
 
 
 def faded(averages: tuple[float, ...], wanted: float, seconds: float) -> tuple[float, float, float]:
@@ -193,15 +186,19 @@ def faded(averages: tuple[float, ...], wanted: float, seconds: float) -> tuple[f
     return one, five, fifteen
 
 
+def _fields(stat: bytes) -> list[bytes]:
+    """What follows the name, which stands in brackets and may hold anything, brackets and spaces too."""
+    return stat[stat.rfind(b")") + 1 :].split()
+
+
 def _parse(stat: bytes) -> _Process | None:
-    """A line of /proc/PID/stat. The name in brackets may hold anything, brackets and spaces too."""
-    fields = stat[stat.rfind(b")") + 1 :].split()
+    """A line of /proc/PID/stat."""
+    fields = _fields(stat)
     try:
-        cpu = sum(map(int, fields[11:15])) * TICK
         return _Process(
             parent=int(fields[1]),
-            state=fields[0].decode("ascii", "replace"),
-            cpu=cpu,
+            state=fields[0],
+            cpu=sum(map(int, fields[11:15])) * TICK,
             started=int(fields[19]) * TICK,
             memory=max(0, int(fields[21])) * PAGE,
         )
@@ -209,47 +206,41 @@ def _parse(stat: bytes) -> _Process | None:
         return None
 
 
-def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Wanted]:
-    """Of each thread: /proc/PID/schedstat is that of a process's first one only."""
-    found: dict[int, _Wanted] = {}
-    for pid in pids:
-        folder = f"{proc}/{pid}/task"
-        for name in _names(folder):
-            if len(found) >= MAX_THREADS:
-                return found
-            try:
-                ran, waited, *_ = map(int, _read(f"{folder}/{name}/schedstat").split())
-                found[int(name)] = _Wanted(ran, waited)
-            except ValueError:
-                continue
+def _tasks(proc: Path, pids: Iterable[int], file: str) -> Iterator[tuple[int, bytes]]:
+    """This file of each thread, of MAX_THREADS at most: in the process's own folder is its first one's."""
+    tasks = ((f"{proc}/{pid}/task", name) for pid in pids for name in _names(f"{proc}/{pid}/task"))
+    for folder, name in islice(tasks, MAX_THREADS):
+        yield int(name), _read(f"{folder}/{name}/{file}")
+
+
+def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Demand]:
+    found: dict[int, _Demand] = {}
+    for thread, figures in _tasks(proc, pids, "schedstat"):
+        try:
+            ran, waited, *_ = map(int, figures.split())
+        except ValueError:  # it ended just now, or the system does not tell
+            continue
+        found[thread] = ran, waited
     return found
 
 
-def _demand(before: Mapping[int, _Wanted], now: Mapping[int, _Wanted]) -> _Wanted:
+def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Demand:
     """What the threads that are there now ran and waited since."""
     ran = waited = 0
-    for thread, wanted in now.items():
-        last = before.get(thread)
-        if last is None or wanted.ran < last.ran or wanted.waited < last.waited:  # another of the same number
-            last = _Wanted(0, 0)
-        ran += wanted.ran - last.ran
-        waited += wanted.waited - last.waited
-    return _Wanted(ran, waited)
+    for thread, (ran_now, waited_now) in now.items():
+        ran_then, waited_then = before.get(thread, (0, 0))
+        if ran_now < ran_then or waited_now < waited_then:  # another of the same number
+            ran_then = waited_then = 0
+        ran += ran_now - ran_then
+        waited += waited_now - waited_then
+    return ran, waited
 
 
 def _runnable(proc: Path, pids: Iterable[int]) -> int:
     """Threads that run or wait for a processor at this moment, but for the one that asks."""
-    mine, found, looked = str(threading.get_native_id()), 0, 0
-    for pid in pids:
-        folder = f"{proc}/{pid}/task"
-        for name in _names(folder):
-            looked += 1
-            if looked > MAX_THREADS:
-                return found
-            stat = _read(f"{folder}/{name}/stat")
-            if name != mine and stat[stat.rfind(b")") + 1 :].split()[:1] == [b"R"]:
-                found += 1
-    return found
+    mine = threading.get_native_id()
+    tasks = _tasks(proc, pids, "stat")
+    return sum(thread != mine and _fields(stat)[:1] == [b"R"] for thread, stat in tasks)
 
 
 def _names(folder: str) -> list[str]:
