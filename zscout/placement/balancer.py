@@ -30,7 +30,6 @@ from zscout.placement.model import (
     SCORES,
     STALE,
     WORDS,
-    Exclusion,
     Outlook,
     Profile,
     Ranking,
@@ -249,7 +248,7 @@ class Balancer:
             return min(one, other, key=lambda found: self._chosen.get(found[1], 0))
         return min(one, other)
 
-    def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, Exclusion]]:
+    def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
         """Eligible hosts, and why the others are not."""
         pending = query.policy in COUNTING
         doubtful: Iterable[HostName]
@@ -261,7 +260,7 @@ class Balancer:
             fit = self._outlooks.copy()
             overdue = takewhile(lambda host: now - self.reports[host][0] > STALE, self.reports)
             doubtful = {*overdue, *(self._pending.keys() & fit.keys() if pending else ())}
-        left_out: dict[HostName, Exclusion] = {}
+        left_out: dict[HostName, str] = {}
         for host in sorted(doubtful):
             reason = self._unfit(now, host, query)
             if reason is None:
@@ -271,24 +270,22 @@ class Balancer:
                 fit.pop(host, None)
         return fit, left_out
 
-    def _unfit(self, now: Ns, host: HostName, query: RankQuery) -> Exclusion | None:
+    def _unfit(self, now: Ns, host: HostName, query: RankQuery) -> str | None:
         """Why a host is not eligible; None if it is."""
         if host not in self.reports:
             return NO_REPORT
         at, report = self.reports[host]
         if now - at > STALE:
-            words = f"its last report is {(now - at) / SECOND:.1f} s old"
-            return Exclusion(words, cause="its last report is")
+            return f"its last report is {(now - at) / SECOND:.1f} s old"
         if host in self.cordoned:
-            return Exclusion("it is cordoned")
+            return "it is cordoned"
         missing = sorted(query.labels.difference(report.labels))
         if missing:
-            return Exclusion(f"it has no label {', '.join(missing)}")
+            return f"it has no label {', '.join(missing)}"
         if query.memory:
             available = max(0, self.outlook(now, host, pending=query.policy in COUNTING).memory)
             if available < query.memory:
-                words = f"{available:,} bytes available, {query.memory:,} required"
-                return Exclusion(words, cause="bytes available")
+                return f"{available:,} bytes available, {query.memory:,} required"
         return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
 from zscout.messages import ComponentSpec, ComponentState, RankedHost
@@ -13,6 +14,7 @@ from zscout.placement.state import (
     ComponentRecord,
     PlacementState,
     Termination,
+    host_gone,
 )
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
@@ -25,6 +27,8 @@ TRY_AGAIN: Final[Ns] = SECOND
 AT_ONCE: Final = 100
 """Components placed in one instant; the next follow SHORTLY after."""
 SHORTLY: Final[Ns] = SECOND // 100
+FIGURES: Final = re.compile(r"[\d.,]+ (?=s old|bytes available)")
+"""In the reason why there is no eligible host."""
 CAUSES_NAMED: Final = 4
 """In the reason why no host can start a component."""
 
@@ -109,20 +113,17 @@ class Lifecycle:
 
     def _choose_host(self, record: ComponentRecord) -> None:
         """The best host that was not tried in this round."""
-        eligible = self.state.eligible_hosts(record.spec)
-        hosts, tried = eligible.hosts, record.tried
+        hosts, why_none = self.state.eligible_hosts(record.spec)
+        tried = record.tried
         untried = next((one for one in hosts if one.host not in tried), None)
         if untried is not None:
             self._start_on(record, untried)
         elif not hosts:
             tried.clear()
-            causes = eligible.causes()
-            if record.no_host is None and eligible.explain(record.reason):
-                # Inherited: all that is known of the causes then is the reason.
-                record.no_host = causes, record.reason
-            if record.no_host != (causes, record.reason):
-                record.reason = f"no host will do: {eligible.why_none()}"
-                record.no_host = causes, record.reason
+            reason = f"no host will do: {why_none}"
+            # The figures in it change all the time: for them alone it is not published again.
+            if FIGURES.sub("", reason) != FIGURES.sub("", record.reason):
+                record.reason = reason
             self.state.wake(record, self.state.now + TRY_AGAIN)
         elif all(tried[one.host] for one in hosts):
             refusals = list(dict.fromkeys(tried[one.host] for one in hosts))
@@ -231,7 +232,7 @@ class Lifecycle:
             self.watch(record)
             return None
         if host is None or host not in state.alive:
-            return Termination("lost", f"host {host} is gone", with_host=True)
+            return host_gone(host)
         if record.unanswered >= MAX_PROBES and not record.token:
             self.surplus.add(record.component, record.incarnation, host)
             return Termination("lost", f"its token is gone, and {host} tells nothing of it")
@@ -293,9 +294,6 @@ class Lifecycle:
         elif record.restarts >= self.state.rules.restarts:
             self._finish(record, "given_up", f"{cause}; {record.restarts} starts in a row failed")
         return record.state == "given_up"
-
-    def host_lost(self, record: ComponentRecord, host: HostName) -> None:
-        self.ended(record, Termination("lost", f"host {host} is gone", with_host=True))
 
     # Stopping: what is to end is surplus
 
@@ -363,7 +361,7 @@ class Lifecycle:
     def _repeat_start(self, record: ComponentRecord) -> None:
         host = record.host
         if host is None or host not in self.state.alive:
-            self.host_lost(record, host or "of its start")
+            self.ended(record, host_gone(host or "of its start"))
         elif record.start_until is not None:
             self.start_answered(record, StartAnswered(record.component, record.incarnation, host, "unknown"))
         else:

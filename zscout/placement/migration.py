@@ -62,15 +62,14 @@ class Migrations:
         elif not record.movable:
             state.refuse(component, "not_movable", f"{component} gives no checkpoint: it can't be moved")
         else:
-            eligible = state.eligible_hosts(record.spec, other_than=record.host, only=to)
-            if eligible.hosts:
-                self.begin(record, eligible.hosts[0].host, "as asked")
+            hosts, why_none = state.eligible_hosts(record.spec, other_than=record.host, only=to)
+            if hosts:
+                self.begin(record, hosts[0].host, "as asked")
                 state.mark_changed(component, always=True)
             elif to is not None:
-                message = f"{component} can't move there: {eligible.why_none()}"
-                state.refuse(component, "unknown_host", message)
+                state.refuse(component, "unknown_host", f"{component} can't move there: {why_none}")
             else:
-                message = f"no other host will do for {component}: {eligible.why_none()}"
+                message = f"no other host will do for {component}: {why_none}"
                 state.refuse(component, "move_failed", message)
 
     def begin(self, record: ComponentRecord, to: HostName, why: str) -> None:
@@ -168,10 +167,6 @@ class Migrations:
             self._finish(record, move)
         else:
             self._probe(record, move)
-
-    def source_host_lost(self, record: ComponentRecord, move: Migration) -> None:
-        end = Termination("lost", f"host {record.host} is gone", with_host=True)
-        self.source_ended(record, move, end)
 
     def source_vanished(self, record: ComponentRecord, move: Migration) -> None:
         """Its token is gone: as a rule because it handed over, and its answer is on its way."""
@@ -331,15 +326,14 @@ class Migrations:
             if not record.movable:
                 self._stays(record, f"it can't be moved; {host} is drained")
             elif record.not_before <= state.now and room > 0:
-                eligible = state.eligible_hosts(record.spec, other_than=host)
-                if eligible.hosts:
+                hosts, why_none = state.eligible_hosts(record.spec, other_than=host)
+                if hosts:
                     room -= 1
                     state.mark_changed(component)
-                    self.begin(record, eligible.hosts[0].host, f"{host} is drained")
+                    self.begin(record, hosts[0].host, f"{host} is drained")
                 else:
                     record.not_before = state.now + RETRY
-                    why = f"{host} is drained, and no other host will do: {eligible.why_none()}"
-                    self._stays(record, why)
+                    self._stays(record, f"{host} is drained, and no other host will do: {why_none}")
         if any(record.movable and record.migration is None for record in records):
             state.timers.set(TimerKind.DRAIN, "", state.now + RETRY)
 

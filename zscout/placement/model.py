@@ -64,25 +64,18 @@ class RankQuery:
         return cls(asked.kind, asked.metric, asked.policy, labels, asked.memory, hosts)
 
 
-class Exclusion(NamedTuple):
-    """Why a host can't be used. `cause`: what stays of the words while the figures in them change."""
-
-    words: str
-    cause: str = ""
-
-
-NO_REPORT: Final = Exclusion("no report of it")
+NO_REPORT: Final = "no report of it"
 
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
     """Hosts best first; `metric` is the one that was used, `why` is how it was chosen; `more` hosts are
-    ranked behind those listed."""
+    ranked behind those listed. `left_out`: why the others can't be used."""
 
     hosts: tuple[RankedHost, ...]
     metric: Metric
     why: str
-    left_out: Mapping[HostName, Exclusion] = field(default_factory=dict)
+    left_out: Mapping[HostName, str] = field(default_factory=dict)
     more: int = 0
 
 

@@ -10,7 +10,14 @@ from zscout.messages import ComponentState, ComponentView, Incarnation, Placemen
 from zscout.placement.events import ComponentsListed, TokenAppeared, TokenVanished
 from zscout.placement.lifecycle import GRACE, Lifecycle
 from zscout.placement.migration import Migrations
-from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, PlacementState, Termination
+from zscout.placement.state import (
+    OVER,
+    PROBE_TIMEOUT,
+    ComponentRecord,
+    PlacementState,
+    Termination,
+    host_gone,
+)
 from zscout.types import ComponentId, HostName
 
 RUNNING: Final = ("running", "stopping")
@@ -27,9 +34,8 @@ class Reconciler:
     def appeared(self, token: TokenAppeared) -> None:
         state, component, incarnation, host = self.state, token.component, token.incarnation, token.host
         record = state.get(component)
-        if not state.is_plausible(incarnation):
+        if not state.note_incarnation(component, incarnation):
             return
-        state.note_incarnation(component, incarnation)
         self.surplus.token(component, incarnation, alive=True)
         if record is None or host not in state.alive:
             # If its node's token is late, the host is probed when it joins.
@@ -131,9 +137,8 @@ class Reconciler:
 
     def _listed(self, host: HostName, listed: ComponentView) -> None:
         state, component, incarnation = self.state, listed.component, listed.incarnation
-        if not state.is_plausible(incarnation):
+        if not state.note_incarnation(component, incarnation):
             return
-        state.note_incarnation(component, incarnation)
         record = state.get(component)
         if record is None:
             self._adopt(host, listed)
@@ -270,20 +275,19 @@ class Reconciler:
             self.probes.add(host, record.component)
             move = record.migration
             if move is None:
-                self.lifecycle.host_lost(record, host)
+                self.lifecycle.ended(record, host_gone(host))
             elif move.to == host:
                 self.migrations.target_host_lost(record, move)
             else:
-                self.migrations.source_host_lost(record, move)
+                self.migrations.source_ended(record, move, host_gone(host))
 
     # What was published before
 
     def inherited(self, status: Placement) -> None:
         """It stands until a host reports otherwise, or none does within GRACE."""
         state = self.state
-        if not state.is_plausible(status.incarnation):
+        if not state.note_incarnation(status.component, status.incarnation):
             return
-        state.note_incarnation(status.component, status.incarnation)
         record = state.get(status.component)
         if record is not None:
             # A host was quicker; that it is to stop is known here only.

@@ -6,10 +6,9 @@ from __future__ import annotations
 import heapq
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from itertools import islice
 from typing import Final, Literal, TypeAlias
 
 from zscout.config.fleet import PlacementPolicy
@@ -32,7 +31,7 @@ from zscout.placement.events import (
     PlacementRefused,
     PlacerEffect,
 )
-from zscout.placement.model import NO_REPORT, Exclusion, RankQuery
+from zscout.placement.model import NO_REPORT, RankQuery
 from zscout.types import SECOND, ComponentId, HostName, Kind, Ns
 
 PER_TERM: Final = 1_000
@@ -65,8 +64,8 @@ TRANSITIONS: Final[Mapping[ComponentState, frozenset[ComponentState]]] = {
 }
 OVER: Final[frozenset[ComponentState]] = frozenset({"ended", "given_up"})
 
-GONE: Final = Exclusion("its node is not there")
-NOT_NAMED: Final = Exclusion("it is not among the hosts that the component asks for")
+GONE: Final = "its node is not there"
+NOT_NAMED: Final = "it is not among the hosts that the component asks for"
 
 SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
 """What is known of the source or the target of a migration."""
@@ -81,6 +80,10 @@ class Termination:
     reason: str
     tail: str = ""
     with_host: bool = False
+
+
+def host_gone(host: HostName | None) -> Termination:
+    return Termination("lost", f"host {host} is gone", with_host=True)
 
 
 @dataclass(slots=True)
@@ -139,8 +142,6 @@ class ComponentRecord:
     """Its host reported that it runs, and whether it is movable."""
     probed: bool = False
     """A probe is sent, and not answered."""
-    no_host: tuple[Mapping[HostName, str], str] | None = None
-    """The causes for which no host would do (`EligibleHosts.causes`), and the reason given for that."""
     tried: dict[HostName, str] = field(default_factory=dict)
     """Hosts that did not start it in this round, with the reason if another try there would not help."""
     whereabouts_unknown: bool = False
@@ -174,34 +175,6 @@ class ComponentRecord:
             moves=self.moves,
             dead=self.dead,
             tail=self.tail,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class EligibleHosts:
-    """Hosts that can run a component, best first, and of the others why not."""
-
-    hosts: tuple[RankedHost, ...]
-    left_out: Mapping[HostName, Exclusion]
-    elsewhere: bool = False
-    """The host where it is was excluded."""
-
-    def why_none(self) -> str:
-        """One bounded line: why there is no host."""
-        named = [f"{host}: {why.words}" for host, why in islice(sorted(self.left_out.items()), HOSTS_NAMED)]
-        more = len(self.left_out) - len(named)
-        none = "there is no other that it may use" if self.elsewhere else "there is no host"
-        return "; ".join(named) + (f"; and {more} more" if more else "") or none
-
-    def causes(self) -> dict[HostName, str]:
-        """The same without the figures, which change all the time."""
-        return {host: why.cause or why.words for host, why in self.left_out.items()}
-
-    def explain(self, reason: str) -> bool:
-        """Whether a reason of before names these hosts and causes."""
-        named = islice(sorted(self.causes().items()), HOSTS_NAMED)
-        return reason.startswith("no host will do") and all(
-            f"{host}: " in reason and cause in reason for host, cause in named
         )
 
 
@@ -365,16 +338,16 @@ class PlacementState:
 
     # Incarnations
 
-    def is_plausible(self, incarnation: Incarnation) -> bool:
-        return incarnation <= self._highest
-
-    def note_incarnation(self, component: ComponentId, incarnation: Incarnation) -> None:
-        """It exists or existed: the next one must be higher."""
+    def note_incarnation(self, component: ComponentId, incarnation: Incarnation) -> bool:
+        """It exists or existed: the next one must be higher. False: it can't be, and is not noted."""
+        if incarnation > self._highest:
+            return False
         if incarnation > self._incarnations.get(component, self._lowest):
             if component not in self._incarnations and len(self._incarnations) >= 2 * MAX_COMPONENTS:
                 self._lowest = incarnation
             else:
                 self._incarnations[component] = incarnation
+        return True
 
     def next_incarnation(self, component: ComponentId) -> Incarnation:
         incarnation = max(self._incarnations.get(component, 0), self._lowest) + 1
@@ -385,7 +358,8 @@ class PlacementState:
 
     def eligible_hosts(
         self, spec: ComponentSpec, *, other_than: HostName | None = None, only: HostName | None = None
-    ) -> EligibleHosts:
+    ) -> tuple[Sequence[RankedHost], str]:
+        """Hosts that can run a component, best first; if there is none, why: one bounded line."""
         query = RankQuery.of(spec)
         if only is not None:
             query = replace(query, hosts=frozenset({only}))
@@ -393,14 +367,20 @@ class PlacementState:
         found = tuple(one for one in ranking.hosts if one.host in self.alive and one.host != other_than)
         left_out = dict(ranking.left_out)
         if only is not None and spec.hosts is not None and only not in spec.hosts:
-            found, left_out = (), {only: NOT_NAMED}
-        elif not found:
+            left_out = {only: NOT_NAMED}
+        elif found:
+            return found, ""
+        else:
             left_out |= {one.host: GONE for one in ranking.hosts if one.host != other_than}
             known = self.alive if query.hosts is None else self.alive & query.hosts
             left_out |= dict.fromkeys(known - self.balancer.reports.keys(), NO_REPORT)
             if other_than is not None:
                 left_out.pop(other_than, None)
-        return EligibleHosts(found, left_out, other_than is not None)
+        named = [f"{host}: {why}" for host, why in heapq.nsmallest(HOSTS_NAMED, left_out.items())]
+        if len(left_out) > HOSTS_NAMED:
+            named.append(f"and {len(left_out) - HOSTS_NAMED} more")
+        none = "there is no host" if other_than is None else "there is no other that it may use"
+        return (), "; ".join(named) or none
 
     def component_arrives(self, component: ComponentId, kind: Kind, host: HostName) -> None:
         """It is on its way to a host."""

@@ -87,7 +87,6 @@ class LoadBalancer:
         for host in ask.hosts or ():
             check_name(host, "host")
         ranking = self.core.rank(self.mesh.now(), RankQuery.of(ask), ask.at_most)
-        some = itertools.islice(ranking.left_out.items(), ask.at_most)
-        left_out = {host: why.words for host, why in some}
+        left_out = dict(itertools.islice(ranking.left_out.items(), ask.at_most))
         hosts = list(ranking.hosts)
         query.answer(HostRanking(hosts, ranking.metric, ranking.why, left_out, ranking.more))
