@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from tests.behaviors.perception.rooms import room, sofa
-from zscout.behaviors.perception.garble import garbled
-from zscout.behaviors.perception.lens import Picture
+from zscout.behaviors.perception.lens import Picture, garbled
 from zscout.lab.building.air import Air
 from zscout.lab.building.bodies import Pose
 from zscout.lab.building.plan import Robot

@@ -11,9 +11,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
 
-from zscout.behaviors.perception.garble import garbled
 from zscout.behaviors.perception.hiding.hider import Hider
-from zscout.behaviors.perception.lens import Picture
+from zscout.behaviors.perception.lens import Picture, garbled
 from zscout.behaviors.perception.motion import Box, MotionDetector
 
 PATIENCE: Final = 10.0

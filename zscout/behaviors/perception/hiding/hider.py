@@ -19,8 +19,7 @@ import msgspec
 import numpy as np
 
 from zscout.behaviors.perception.darkness import View, analyse
-from zscout.behaviors.perception.garble import garbled
-from zscout.behaviors.perception.hiding import entering, searching
+from zscout.behaviors.perception.hiding import phases
 from zscout.behaviors.perception.hiding.compass import BANDS, strip_and_tones
 from zscout.behaviors.perception.hiding.state import (
     FORM,
@@ -30,7 +29,7 @@ from zscout.behaviors.perception.hiding.state import (
     Step,
     WheelCommand,
 )
-from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture
+from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture, garbled
 
 
 class PhaseCode(NamedTuple):
@@ -42,23 +41,23 @@ class PhaseCode(NamedTuple):
     """The phase begins; nothing is commanded yet."""
     cruises: bool = False
     """It drives without waiting for a still picture."""
-    stuck: Callable[[HidingState, View], Step] = searching.stuck
+    stuck: Callable[[HidingState, View], Step] = phases.stuck
     """It drove, and nothing moved."""
 
 
 PHASES: Final[dict[Phase, PhaseCode]] = {
-    "scan": PhaseCode(searching.scan, searching.begin_scan),
-    "aim": PhaseCode(searching.aim),
-    "roam": PhaseCode(searching.roam, searching.begin_roam, True, searching.roam_stuck),
-    "approach": PhaseCode(entering.approach, cruises=True),
-    "enter": PhaseCode(entering.enter, entering.begin_enter, True, entering.enter_stuck),
-    "face": PhaseCode(entering.face, entering.begin_face),
-    "settle": PhaseCode(entering.settle),
-    "back": PhaseCode(searching.back, searching.begin_back),
-    "dodge": PhaseCode(searching.dodge),
-    "leave": PhaseCode(searching.leave, searching.begin_leave, True),
-    "hidden": PhaseCode(entering.hidden),
-    "check": PhaseCode(entering.check, entering.begin_check),
+    "scan": PhaseCode(phases.scan, phases.begin_scan),
+    "aim": PhaseCode(phases.aim),
+    "roam": PhaseCode(phases.roam, phases.begin_roam, True, phases.roam_stuck),
+    "approach": PhaseCode(phases.approach, cruises=True),
+    "enter": PhaseCode(phases.enter, phases.begin_enter, True, phases.enter_stuck),
+    "face": PhaseCode(phases.face, phases.begin_face),
+    "settle": PhaseCode(phases.settle),
+    "back": PhaseCode(phases.back, phases.begin_back),
+    "dodge": PhaseCode(phases.dodge),
+    "leave": PhaseCode(phases.leave, phases.begin_leave, True),
+    "hidden": PhaseCode(phases.hidden),
+    "check": PhaseCode(phases.check, phases.begin_check),
 }
 RESUMES: Final[dict[Phase, Phase]] = {"hidden": "check", "check": "check", "face": "face", "settle": "face"}
 """Where a phase goes on that was in the dark when the hold was lost; all others search anew."""
