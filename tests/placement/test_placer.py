@@ -84,7 +84,7 @@ def test_what_has_ended_is_forgotten_after_a_while_and_its_incarnations_are_not_
     assert changes(placer.handle(SECOND, ended)) == [("a", "ended")]
     assert ("a", "forgotten") not in changes(placer.handle(RETENTION))
     assert placer.handle(SECOND + RETENTION) == [ComponentChanged("a", None), PlacerWakeAt(None)]
-    assert placer.status().components == {}
+    assert placer.components == {}
     now = SECOND + RETENTION
     balancer.reported(now, report("h0", 2))
     again = starts(placer.handle(now, PlaceComponent("a", spec), PlaceComponent("b", spec)))
@@ -102,7 +102,7 @@ def test_limits_hold_and_what_has_ended_makes_room(monkeypatch: pytest.MonkeyPat
     assert changes(effects) == [("a", "forgotten"), ("b", "ended"), ("c", "ended")]
     effects = placer.handle(2, *(PlaceComponent(name, spec) for name in "xyz"))
     assert changes(effects)[:3] == [("x", "waiting"), ("b", "forgotten"), ("y", "waiting")]
-    assert set(placer.status().components) == {"d", "x", "y", "z"}
+    assert set(placer.components) == {"d", "x", "y", "z"}
 
 
 def test_many_are_placed_a_part_at_a_time_and_all_of_them() -> None:
@@ -172,7 +172,7 @@ def test_what_nobody_would_send_does_no_harm() -> None:
             for effect in effects:
                 if isinstance(effect, HostCommand):
                     assert effect.host in alive, (seed, effect)
-            for record in placer.status().components.values():
+            for record in placer.components.values():
                 assert (record.to is not None) == (record.state == "moving")
 
 

@@ -109,7 +109,7 @@ class Chaos:
 
     def check(self) -> None:
         world = self.world
-        records = world.placer.status().components
+        records = world.placer.components
         assert records == world.published
         assert world.alive == {host.name for host in world.hosts.values() if host.there}
         for name in NAMES:
@@ -142,7 +142,7 @@ class Chaos:
         """What could leave a drained host has left it."""
         world = self.world
         usable = world.alive - world.balancer.cordoned
-        for record in world.placer.status().components.values():
+        for record in world.placer.components.values():
             if record.host in world.balancer.cordoned:
                 assert not (usable & set(record.spec.hosts or usable)), record
 

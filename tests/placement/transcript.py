@@ -129,7 +129,7 @@ class PlacerPlayer:
         raise ValueError(f"woke {MOST_WAKES} times")
 
     def lead(self, counter: int, *, rebalance: bool) -> list[PlacerEvent]:
-        records = tuple(self.placer.status().components.values())
+        records = tuple(self.placer.components.values())
         cordoned = frozenset(self.balancer.cordoned)
         self.balancer.cordoned.clear()
         self.placer, self.wake = Placer(self.balancer, counter, PlacementPolicy(rebalance=rebalance)), None

@@ -17,6 +17,11 @@ PR_SET_PDEATHSIG = 1
 NOT_EXECUTABLE, NOT_FOUND = 126, 127
 
 
+def prefix(tty: int = -1) -> list[str]:
+    """What stands before a command that is to end with this process."""
+    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(tty)]
+
+
 def main() -> None:
     # What Python changed at its start must not be inherited.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)

@@ -30,12 +30,14 @@ from zscout.placement.model import (
     SCORES,
     STALE,
     WORDS,
+    MetricLearner,
+    Observation,
     Outlook,
     Profile,
     Ranking,
     RankQuery,
+    learn_profile,
 )
-from zscout.placement.profiles import MetricLearner, Observation, learn_profile
 from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns
 
 LOAD_TIME: Final = 60 * SECOND

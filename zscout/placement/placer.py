@@ -17,7 +17,6 @@ same incarnation, until that host's node is gone. So nothing runs twice for long
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 from zscout.config.fleet import DEFAULT_PLACEMENT, PlacementPolicy
@@ -53,14 +52,6 @@ from zscout.placement.state import PlacementState, TimerKind
 from zscout.types import ComponentId, HostName, Ns
 
 
-@dataclass(frozen=True, slots=True)
-class PlacerStatus:
-    """`components` as they were last published: a view that follows what is handled."""
-
-    components: Mapping[ComponentId, Placement]
-    cordoned: frozenset[HostName]
-
-
 class Placer:
     """All components of one fleet. `balancer` knows the hosts, and learns what is placed; `counter` is that
     of the term, and makes incarnations higher than those of terms before."""
@@ -73,12 +64,14 @@ class Placer:
         self._rebalancer = Rebalancer(state, self._migrations)
         self._reconciler = Reconciler(state, self._lifecycle, self._migrations)
         self._wake: Ns | None = None
+        self.components: Mapping[ComponentId, Placement] = MappingProxyType(state.published)
+        """As they were last published: a view that follows what is handled."""
         if rules.rebalance:
             state.timers.set(TimerKind.REBALANCE, "", 0)
 
-    def status(self) -> PlacerStatus:
-        state = self._state
-        return PlacerStatus(MappingProxyType(state.published), frozenset(state.balancer.cordoned))
+    @property
+    def cordoned(self) -> frozenset[HostName]:
+        return frozenset(self._state.balancer.cordoned)
 
     def handle(self, now: Ns, *events: PlacerEvent) -> list[PlacerEffect]:
         """Applies one instant's events, or only the time. Raises ValueError if `now` goes backwards."""

@@ -16,7 +16,7 @@ from zscout.lab.study.placement.study import (
     figure,
     learn,
 )
-from zscout.placement.profiles import (
+from zscout.placement.model import (
     CHOICES,
     ENOUGH,
     MetricLearner,

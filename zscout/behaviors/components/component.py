@@ -132,7 +132,7 @@ class SafePointGate:
 
 
 class BadKind(Exception):
-    """This kind can't be had; one line that says why."""
+    """A component of this kind can't be made here; one line that says why."""
 
 
 def installed_kinds() -> dict[str, str]:

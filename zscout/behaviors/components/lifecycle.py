@@ -46,10 +46,6 @@ SUPERSEDED: Final = 0.5
 """Seconds that a superseded one has to clean up."""
 
 
-class _Unusable(Exception):
-    """It can't be made here; one line that says why."""
-
-
 class ComponentLifecycle:
     """Runs the component of `job`. `report` sends one to the node, waited for or not."""
 
@@ -136,7 +132,7 @@ class ComponentLifecycle:
             finally:
                 client = self._client = await connecting
             made = self._component = self._make(kind)
-        except (_Unusable, MeshError) as error:
+        except (BadKind, MeshError) as error:
             return EndReport("failed", str(error))
         movable = is_movable(made)
         watch = client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)
@@ -155,21 +151,21 @@ class ComponentLifecycle:
     def _load(self) -> type[Component]:
         try:
             return load_kind(self._job.start.spec.kind, self._job.where)
-        except BadKind as error:
-            raise _Unusable(str(error)) from None
+        except BadKind:
+            raise
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            raise _Unusable(f"its kind can't be imported: {_words(error)}") from None
+            raise BadKind(f"its kind can't be imported: {_words(error)}") from None
 
     def _make(self, kind: type[Component]) -> Component:
         limit_allocations(self._job.memory)
         try:
             return kind(self._job.start.spec.params)
         except ValueError as error:
-            raise _Unusable(f"these parameters are no good: {_words(error, named=False)}") from None
+            raise BadKind(f"these parameters are no good: {_words(error, named=False)}") from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            raise _Unusable(f"it can't be made: {_words(error)}") from None
+            raise BadKind(f"it can't be made: {_words(error)}") from None
 
     async def _called(self, client: Client) -> bool:
         """Waits until it is to run: it was activated, or handed an ARC."""

@@ -15,7 +15,7 @@ from zscout.behaviors.sensor_net.net import SensorNet
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot, Slots
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
 from zscout.behaviors.tree import Behavior, BehaviorContext, StatusPublisher
-from zscout.config.strict import BadInput, check_name, check_rc_name, check_unique, key, quoted
+from zscout.config.strict import check_name, check_rc_name, check_unique, key, quoted
 from zscout.keyexpr import BadName, check_need
 from zscout.mesh.supervision import supervised
 from zscout.messages import BehaviorSaid, ComponentSpec
@@ -64,6 +64,9 @@ class RobotParams(SharedParams):
     robot: Annotated[str, key("To be placed.", remedy="add one, as in robot/scout33")]
     above: Annotated[str, Meta(max_length=MAX_PATH)] = ""
 
+    def __post_init__(self) -> None:
+        self.needs(self.robot)
+
 
 class NetParams(SharedParams):
     """Parameters of `place_sensor_net`. `wanted`: how many robots are to be placed (all), the others stand in
@@ -75,6 +78,19 @@ class NetParams(SharedParams):
     ]
     wanted: int | None = None
     name: str = "place_sensor_net"
+
+    def __post_init__(self) -> None:
+        for number, robot in enumerate(self.robots):
+            check_rc_name(robot, (PARAMS / "robots").item(number), "robot")
+        check_unique(self.robots, PARAMS / "robots")
+        if not self.robots:
+            raise (PARAMS / "robots").bad("is empty", 'name one, as in ["robot/scout33"]')
+        if self.wanted is not None and not 1 <= self.wanted <= len(self.robots):
+            remedy = f"write a whole number from 1 to {len(self.robots)}"
+            raise (PARAMS / "wanted").bad(f"is {self.wanted}", remedy)
+        check_name(self.name, PARAMS / "name")
+        # Wrong ones are reported here and now, not by each robot's component.
+        self.needs(self.robots[0])
 
 
 class TreeComponent(Component):
@@ -132,12 +148,8 @@ class PlaceRobotComponent(TreeComponent):
 
     def __init__(self, params: dict[str, Any]) -> None:
         wanted = read_params(params, RobotParams)
-        try:
-            needs = wanted.needs(wanted.robot)
-        except BadInput as error:
-            raise ValueError(str(error)) from None
         self.speed = wanted.speed
-        self.root = PlaceRobot(wanted.robot.partition("/")[2], needs, wanted.slots())
+        self.root = PlaceRobot(wanted.robot.partition("/")[2], wanted.needs(wanted.robot), wanted.slots())
         self.root.above = wanted.above
 
 
@@ -146,25 +158,11 @@ class PlaceSensorNetComponent(TreeComponent):
 
     def __init__(self, params: dict[str, Any]) -> None:
         net = read_params(params, NetParams)
-        wanted = len(net.robots) if net.wanted is None else net.wanted
-        try:
-            for number, robot in enumerate(net.robots):
-                check_rc_name(robot, (PARAMS / "robots").item(number), "robot")
-            check_unique(net.robots, PARAMS / "robots")
-            if not net.robots:
-                raise (PARAMS / "robots").bad("is empty", 'name one, as in ["robot/scout33"]')
-            if not 1 <= wanted <= len(net.robots):
-                remedy = f"write a whole number from 1 to {len(net.robots)}"
-                raise (PARAMS / "wanted").bad(f"is {wanted}", remedy)
-            check_name(net.name, PARAMS / "name")
-            # Wrong ones are reported here and now, not by each robot's component.
-            net.needs(net.robots[0])
-        except BadInput as error:
-            raise ValueError(str(error)) from None
         self.speed = net.speed
         shared = [field.name for field in structs.fields(SharedParams)]
         self._shared: dict[str, Any] = {name: params[name] for name in shared if name in params}
-        self.root = PlaceSensorNet(net.name, SensorNet(list(net.robots), wanted), self._spec_for)
+        robots = SensorNet(list(net.robots), net.wanted or len(net.robots))
+        self.root = PlaceSensorNet(net.name, robots, self._spec_for)
 
     def _spec_for(self, robot: str, path: str) -> ComponentSpec:
         return ComponentSpec(

@@ -289,10 +289,9 @@ async def child(
     """Starts a child that ends with this context, and with this process however that ends.
 
     It leads a session of its own: Ctrl-C reaches only us, and we end it in order."""
-    assert launch.__file__ is not None  # noqa: S101
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-I", "-S", launch.__file__, str(os.getpid()), "-1"),
+        *launch.prefix(),
         *command,
         stdin=pipe if job is not None else asyncio.subprocess.DEVNULL,
         stdout=pipe if job is not None else asyncio.subprocess.DEVNULL,

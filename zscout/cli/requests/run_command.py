@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.arc import Held
     from zscout.behaviors.client.client import Client
 
-LAUNCHER: Final = Path(str(launch.__file__))
 NOT_EXECUTABLE, NOT_FOUND = 126, 127
 LOOK_AGAIN: Final = 0.3
 """Seconds between two looks at a terminal, or at a group without its leader: neither reports changes."""
@@ -78,10 +77,9 @@ class RunningCommand:
         self._loop.add_signal_handler(signal.SIGCHLD, self._look)
         self._loop.add_signal_handler(signal.SIGTSTP, self._note_suspension)
         handed = self._tty.fd if self._tty.ours_to_give() else None
-        launcher = [sys.executable, "-I", "-S", str(LAUNCHER)]
         try:
             self._process: subprocess.Popen[Any] = subprocess.Popen(  # noqa: S603, ASYNC220 - returns at once
-                [*launcher, str(os.getpid()), str(-1 if handed is None else handed), *self._command],
+                [*launch.prefix(-1 if handed is None else handed), *self._command],
                 env=dict(self._env),
                 process_group=0,
                 pass_fds=() if handed is None else (handed,),

@@ -114,8 +114,8 @@ class DemoRunner(ABC):
             file = self.folder / f"{host}.toml"
             file.write_text(text + extra.get(host, ""))
             # The launcher has the kernel end the node with this process, however that may end.
-            start = ["-I", "-S", launch.__file__, str(os.getpid()), "-1", sys.executable, "-m", "zscout.node"]
-            await self.start(f"node {host}", [*start, str(file)])
+            node = [*launch.prefix()[1:], sys.executable, "-m", "zscout.node", str(file)]
+            await self.start(f"node {host}", node)
 
     async def start(
         self, name: str, arguments: Sequence[str], *, piped: bool = False

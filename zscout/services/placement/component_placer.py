@@ -63,7 +63,7 @@ class ComponentPlacer:
         self.mesh, self.term = mesh, term
         self._core = Placer(balancer.core, term.counter, fleet.placement)
         self._supervisor = Supervisor("the component placer", on_failure)
-        self._requests = PlacerRequestHandler(self._core.status, term, self._supervisor)
+        self._requests = PlacerRequestHandler(self._core, term, self._supervisor)
         self._nodes = NodeClient(mesh, fleet.placement.start_timeout)
         self._inherited = inherited
         self._instances: dict[HostName, set[str]] = {}
@@ -171,7 +171,7 @@ class ComponentPlacer:
                     self._wake_at(at)
                 case _:
                     self._supervisor.spawn(self._command(effect))
-        cordoned = self._core.status().cordoned
+        cordoned = self._core.cordoned
         if changed or self._cordoned != cordoned:
             self._publish(changed, cordoned)
         return refusals

@@ -7,7 +7,7 @@ its `wait` is over.
 from __future__ import annotations
 
 from asyncio import TimerHandle
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -32,7 +32,7 @@ from zscout.messages import (
     UncordonHost,
 )
 from zscout.placement.events import PlacementRefused, PlacerEvent
-from zscout.placement.placer import PlacerStatus
+from zscout.placement.placer import Placer
 from zscout.placement.state import OVER
 from zscout.types import Term
 
@@ -58,8 +58,8 @@ class PlacerRequestHandler:
     """`receive` gives the event of a request, which the caller feeds to the core between `begin` and
     `finish`."""
 
-    def __init__(self, status: Callable[[], PlacerStatus], term: Term, supervisor: Supervisor) -> None:
-        self._status, self.term, self._supervisor = status, term, supervisor
+    def __init__(self, placer: Placer, term: Term, supervisor: Supervisor) -> None:
+        self._placer, self.term, self._supervisor = placer, term, supervisor
         self._early: list[tuple[PlacerQuery, PlacerEvent]] = []
         self._is_open = False
         self._waiting: dict[PlacerQuery, _Waiting] = {}
@@ -94,7 +94,7 @@ class PlacerRequestHandler:
     def begin(self, query: PlacerQuery) -> None:
         operation = query.message
         if isinstance(operation, PlacementOperation):
-            before = self._status().components.get(operation.component)
+            before = self._placer.components.get(operation.component)
             timer = self._supervisor.call_later(min(operation.wait, MAX_WAIT), self._timed_out, query)
             self._waiting[query] = _Waiting(operation, before, timer)
 
@@ -112,7 +112,7 @@ class PlacerRequestHandler:
             operation, component = waiting.operation, waiting.operation.component
             if component not in components:
                 continue
-            status = self._status().components.get(component)
+            status = self._placer.components.get(component)
             ends = OVER if isinstance(operation, EndComponent) else SETTLED
             if status is not None and status.state not in ends:
                 continue
@@ -127,20 +127,19 @@ class PlacerRequestHandler:
 
     def placements(self, component: str | None = None, *, host: str | None = None) -> Placements:
         """All components, or that one, or those of a host."""
-        status = self._status()
         return Placements(
             self.term,
             [
                 one
-                for name, one in sorted(status.components.items())
+                for name, one in sorted(self._placer.components.items())
                 if component in (None, name) and host in (None, one.host)
             ],
-            sorted(status.cordoned),
+            sorted(self._placer.cordoned),
         )
 
     def _timed_out(self, query: PlacerQuery) -> None:
         waiting = self._pop(query)
-        status = self._status().components.get(waiting.operation.component) if waiting else None
+        status = self._placer.components.get(waiting.operation.component) if waiting else None
         if status is not None:
             query.answer(status)
 
