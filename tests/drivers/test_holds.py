@@ -140,7 +140,7 @@ def test_hear(heard: Grants, now_holds: list[int], outdated: bool, reread: bool)
     change = rc.apply_grants(heard, NOW)
     assert (grants(rc), change.outdated, change.reread) == (now_holds, outdated, reread)
     began = {held.grant.seq for held in change.began}
-    stopped = {held.grant.seq for held in change.stopped}
+    stopped = {held.grant.seq for held in change.removed}
     assert {2} - stopped | began == set(now_holds)
     assert bool(change) == bool(began or stopped)
     assert change.stayed == (2 in now_holds and bool(change))
@@ -183,9 +183,9 @@ def test_only_an_rcm_that_is_obeyed_keeps_holds_alive(heard: Grants, refreshed: 
 def test_read(read: RcmState, sharable: bool, now_holds: list[int], presents: bool) -> None:
     rc = holding(HELD)
     change = rc.apply_snapshot(read, NOW, sharable=sharable)
-    assert (grants(rc), change.present) == (now_holds, presents)
+    assert (grants(rc), change.announce) == (now_holds, presents)
     assert change.outdated == (read.term < TERM)
-    assert not change.stopped
+    assert not change.removed
 
 
 def test_what_is_read_of_a_free_rc_is_held_whole() -> None:
@@ -247,8 +247,8 @@ def test_who_has_heard_of_nobody_promises_much_but_not_everything() -> None:
 def test_expire(after: Ns, lease: bool, ended: list[tuple[int, str]]) -> None:
     rc = holding(said(2, holder(2, remaining=1), holder(3, remaining=2), holder(4, remaining=1, keep=True)))
     change = rc.expire(NOW + after, lease=lease)
-    assert [(hold.grant.seq, hold.why) for hold in change.ended] == ended
-    assert [held.grant.seq for held in change.stopped] == [seq for seq, _ in ended]
+    assert [(hold.grant.seq, hold.why) for hold in change.expired_locally] == ended
+    assert [held.grant.seq for held in change.removed] == [seq for seq, _ in ended]
     assert grants(rc) == [seq for seq in (2, 3, 4) if seq not in dict(ended)]
     assert not rc.expire(NOW + after, lease=lease)
 
@@ -327,9 +327,9 @@ def test_the_reason_given_with_a_revocation_is_what_a_late_command_is_told() -> 
 def test_a_hand_over_changes_grant_and_client_at_once() -> None:
     rc = holding(HELD)
     change = rc.apply_grants(said(3, holder(3, "h/two", place=2)), NOW)
-    assert [held.client for held in change.stopped] == ["h/one"]
+    assert [held.client for held in change.removed] == ["h/one"]
     assert [held.client for held in change.began] == ["h/two"]
-    assert change.stopped[0].place == change.began[0].place
+    assert change.removed[0].place == change.began[0].place
     codes = [rc.check(Grant(TERM, seq), client, NOW) for seq, client in ((2, "h/one"), (3, "h/two"))]
     assert [refusal and refusal.code for refusal in codes] == ["ended", None]
 
@@ -362,4 +362,4 @@ def test_only_so_many_ended_grants_are_remembered() -> None:
 def test_an_exclusive_rc_obeys_only_the_newest_of_two_holders() -> None:
     rc = holding(HELD)
     change = rc.apply_grants(said(3, ONE, TWO), NOW, sharable=False)
-    assert (grants(rc), change.present) == ([3], True)
+    assert (grants(rc), change.announce) == ([3], True)

@@ -146,7 +146,7 @@ def _asked_of(request: ArcRequest, rc: RcName) -> Params:
 
 def check_settled(now: Ns, core: Core, rcs: Iterable[WorkloadRc]) -> None:
     """After a pass with no vote out: by the letter of steps 1 to 3, nobody who waits could start."""
-    if core._votes.out:
+    if core._votes.proposals:
         return
     oracle = Oracle(rcs)
     for arc in (*core._state.running.values(), *core._state.queued.values()):

@@ -31,7 +31,7 @@ class PlainPriority(Priority):
                 case Inadmissible(_, reason):
                     actions.wait(arc, reason)
                 case VotesNeeded(questions) if silent := [
-                    one for one in questions if one[0].name in votes.silent
+                    one for one in questions if one[0].name in votes.unresponsive
                 ]:
                     actions.wait(arc, of_rcs(ReasonCode.SILENT, [rc.name for rc, _ in silent]))
                     for rc, holders in silent:

@@ -171,8 +171,8 @@ def test_a_gain_is_told_in_words() -> None:
         Requested(arc("right", "cd", 3)),
     )
     assert core._state.running.keys() == {"left", "right"}
-    assert strategy.news().startswith("adaptive: pairs in use from 2 to 4 at priority 3, in ")
-    assert not strategy.news()
+    assert strategy.log_line().startswith("adaptive: RC assignments at priority 3: 2 -> 4, in ")
+    assert not strategy.log_line()
 
 
 def steps(strategy: Adaptive) -> int:

@@ -11,7 +11,7 @@ from tests.scheduling.test_patterns import workload as with_patterns
 from tests.scheduling.test_waiting import workload as with_one_priority
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
-from zscout.scheduling.conflict_groups import candidates
+from zscout.scheduling.conflict_groups import undecided_arcs
 from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.replay import replay
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
@@ -55,11 +55,11 @@ class Compared:
         self.name, self.strategy = strategy.name, strategy
         self.seen: Counter[int] = Counter()
 
-    def news(self) -> str:
-        return self.strategy.news()
+    def log_line(self) -> str:
+        return self.strategy.log_line()
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
-        indexed = candidates(state)
+        indexed = undecided_arcs(state)
         assert indexed is not None
         assert {arc.id for arc in indexed} == everyone_looked_at(state, state.votes, state.now)
         self.seen[len(indexed)] += 1
@@ -100,5 +100,5 @@ def test_too_many_are_left_to_the_heuristic() -> None:
     for number in range(12):
         wanted = ArcRequest(f"a{number}", "h/c", {"robot/a": {}}, 1, SECOND)
         state.enqueue(Arc(wanted, (0, number), state.rc("robot/a").bit), 0)  # type: ignore[arg-type]
-    assert candidates(state, limit=11) is None
-    assert len(candidates(state, limit=12) or []) == 12
+    assert undecided_arcs(state, limit=11) is None
+    assert len(undecided_arcs(state, limit=12) or []) == 12

@@ -148,7 +148,7 @@ def test_a_silent_rc_is_asked_once_a_quantum() -> None:
     core.handle(0, VoteOverdue(question(core.handle(0, Requested(request("a", "radio/0"))))))
     questions = sum(len(only(Propose, core.handle(step * QUANTUM // 10, Tick()))) for step in range(1, 51))
     assert questions == 5
-    assert len(core._votes.out) <= 8
+    assert len(core._votes.proposals) <= 8
 
 
 def test_what_an_open_visit_would_free_is_off_limits() -> None:

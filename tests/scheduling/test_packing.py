@@ -100,7 +100,7 @@ def test_what_is_cut_short_is_lawful_no_better_than_the_best_and_no_worse_than_t
 def test_the_bound_is_one() -> None:
     for seed in range(times(200)):
         asked = problem(case(seed))
-        assert asked.bound_of_all() >= asked.value(pack(asked).chosen)
+        assert asked.upper_bound_of_all() >= asked.value(pack(asked).chosen)
 
 
 def test_a_search_in_slices_is_the_search_in_one_go() -> None:

@@ -267,7 +267,7 @@ def test_nobody_waits_while_some_choice_is_free(strategy: StrategyName, seed: in
 
     def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
         ledger.take(now, core, effects)
-        if not core._votes.out:
+        if not core._votes.proposals:
             for arc in core._state.queued.values():
                 assert not could_start(core, arc, work), f"{arc.id} waits: {arc.reason}"
 

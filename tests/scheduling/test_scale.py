@@ -167,7 +167,7 @@ class Twins:
     def compare(self) -> None:
         """All state, the words for who asks, and the clients' ARCs; slow."""
         # What the plain core said of an ARC is older than what it did for those below: one more pass.
-        calm = not self.send(Tick()) and not self.indexed._votes.out
+        calm = not self.send(Tick()) and not self.indexed._votes.proposals
         validate(self.indexed)
         one, two = self.indexed._state, self.plain._state
         assert list(one.queued) == list(two.queued)

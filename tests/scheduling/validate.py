@@ -23,7 +23,7 @@ def validate(core: Core) -> None:
         assert arc.reason is None, f"{arc.id} runs and has a reason to wait"
     for arc in state.queued.values():
         assert arc.reason is not None, f"{arc.id} waits without a reason"
-    for rc, holders in state.votes.out.values():
+    for rc, holders in state.votes.proposals.values():
         assert state.rc(rc).present, f"a proposal is out at {rc}, which is absent"
         assert all(state.arc(arc) for arc in holders), f"a proposal at {rc} names an ARC that ended"
 
@@ -67,7 +67,7 @@ def _check_index(state: SchedulerState, index: QueueIndex) -> None:
     queued = state.queued.values()
     assert index.ranks == sorted(arc.rank for arc in queued), "the ranks are not those of the queue"
     patient = sorted((arc.since, arc.id) for arc in queued if not arc.starving)
-    assert index._patient == patient, "the patient are not those of the queue"
+    assert index._not_starving == patient, "the patient are not those of the queue"
     band = state.band
     starving = sorted((-band(arc.priority), arc.since, arc.id) for arc in queued if arc.starving)
     assert index.starving == starving, "the starving are not those of the queue"

@@ -38,35 +38,35 @@ class HoldEntry:
 
 @dataclass(slots=True)
 class HoldChange:
-    """What an input changed: holders that began or stopped, and what the RC is to do about it."""
+    """What an input changed: holders that were added or removed, and what the RC is to do about it."""
 
     began: list[Holder] = field(default_factory=list)
-    stopped: list[Holder] = field(default_factory=list)
-    ended: list[EndedHold] = field(default_factory=list)
-    """Of the stopped, those whose hold ended here by itself."""
+    removed: list[Holder] = field(default_factory=list)
+    expired_locally: list[EndedHold] = field(default_factory=list)
+    """Of the removed, those whose hold ended here by itself: by time, by lease, or as the device failed."""
     stayed: bool = False
     """Others hold the RC before and after."""
     outdated: bool = False
     """The RCM is behind: publish this RC's state, so that it sees the newer term."""
     reread: bool = False
     """Something was missed: read `rcm/state`."""
-    present: bool = False
+    announce: bool = False
     """This RC holds what a snapshot does not know: publish its state."""
 
     def __bool__(self) -> bool:
-        return bool(self.began or self.stopped)
+        return bool(self.began or self.removed)
 
     @property
     def handed_over(self) -> bool:
         """Whether a holder goes on in another client: the same ARC has the same place."""
-        before = {holder.place: holder.client for holder in self.stopped}
+        before = {holder.place: holder.client for holder in self.removed}
         return any(before.get(holder.place, holder.client) != holder.client for holder in self.began)
 
     @property
-    def ends(self) -> list[Holder]:
-        """Of the stopped, those that do not go on in another client."""
+    def removed_not_handed_over(self) -> list[Holder]:
+        """Of the removed, those that do not go on in another client."""
         after = {holder.place: holder.client for holder in self.began}
-        return [holder for holder in self.stopped if after.get(holder.place, holder.client) == holder.client]
+        return [holder for holder in self.removed if after.get(holder.place, holder.client) == holder.client]
 
     @property
     def interrupts(self) -> bool:
@@ -96,7 +96,7 @@ class HoldTable:
         """Takes a publication. Of several holders of an exclusive RC only the newest grant is obeyed."""
         missed = grants.term != self.term or grants.prev > self.seq
         change = HoldChange()
-        if not self._take(grants, change, now):
+        if not self._accept(grants, change, now):
             return change
         change.reread = missed
         holders = grants.rcs.get(self.rc)
@@ -104,15 +104,15 @@ class HoldTable:
             return change
         if len(holders) > 1 and not sharable:
             holders = [max(holders, key=lambda holder: holder.grant)]
-            change.present = True
+            change.announce = True
         reasons = {revoked.grant: f"{revoked.outcome}: {revoked.reason}" for revoked in grants.revoked}
         wanted = {holder.grant: holder for holder in holders[:MAX_HOLDERS]}
         self._awaited.clear()
         for grant in [grant for grant in self.held if grant not in wanted]:
-            self._stop(grant, reasons.get(grant, "the RCM gave it to another"), change)
+            self._remove(grant, reasons.get(grant, "the RCM gave it to another"), change)
         for grant, holder in wanted.items():
             if grant in self._ended:
-                change.present = True
+                change.announce = True
             elif grant not in self.held:
                 self._begin(holder, change, now)
         return change
@@ -120,16 +120,16 @@ class HoldTable:
     def apply_snapshot(self, state: RcmState, now: Ns, *, sharable: bool) -> HoldChange:
         """Takes a snapshot: what was missed is added, what the snapshot does not know is presented."""
         change = HoldChange()
-        if not self._take(state, change, now):
+        if not self._accept(state, change, now):
             return change
         known = {view.grant for view in state.holds if self.rc in view.needs}
-        change.present = any(grant not in known for grant in self.held)
+        change.announce = any(grant not in known for grant in self.held)
         self._awaited.clear()
         for view in state.holds:
             if self.rc not in view.needs or view.grant in self.held or view.grant in self._ended:
                 continue
             if self.held and not sharable:
-                change.present = True
+                change.announce = True
                 self._awaited.add(view.grant)
                 continue
             own: dict[str, Any] = {"rcs": sorted(view.needs), "params": view.needs[self.rc]}
@@ -137,14 +137,14 @@ class HoldTable:
             self._begin(Holder(**shared, **own), change, now)
         return change
 
-    def _take(self, news: Grants | RcmState, change: HoldChange, now: Ns) -> bool:
+    def _accept(self, update: Grants | RcmState, change: HoldChange, now: Ns) -> bool:
         """Whether this is obeyed: it is not older than what is known, and its term no absurd jump."""
-        if (news.term, news.seq) < (self.term, self.seq):
-            change.outdated = news.term < self.term
+        if (update.term, update.seq) < (self.term, self.seq):
+            change.outdated = update.term < self.term
             return False
-        if absurd(news.term, self.term):
+        if absurd(update.term, self.term):
             return False
-        self.term, self.seq, self.last_contact = news.term, news.seq, now
+        self.term, self.seq, self.last_contact = update.term, update.seq, now
         return True
 
     def promise(self, term: Term) -> bool:
@@ -160,12 +160,12 @@ class HoldTable:
     def expire(self, now: Ns, *, lease: bool = True) -> HoldChange:
         """Ends what is over. Holds that may be kept end only with the lease."""
         change = HoldChange()
-        silent = lease and self.held and now - self.last_contact >= self.hold_lease
+        lease_over = lease and self.held and now - self.last_contact >= self.hold_lease
         for grant, held in list(self.held.items()):
-            if silent:
-                self._stop(grant, "lease: no RCM was heard for too long", change, ended="lease")
+            if lease_over:
+                self._remove(grant, "lease: no RCM was heard for too long", change, expired="lease")
             elif now >= held.end and not held.holder.keep:
-                self._stop(grant, "its time is over", change, ended="time")
+                self._remove(grant, "its time is over", change, expired="time")
         return change
 
     def next_expiry(self) -> Ns | None:
@@ -179,7 +179,7 @@ class HoldTable:
         """The device can't carry its holders any longer."""
         change = HoldChange()
         for grant in list(self.held):
-            self._stop(grant, why, change, ended="failed")
+            self._remove(grant, why, change, expired="failed")
         return change
 
     # Commands
@@ -220,12 +220,12 @@ class HoldTable:
         change.began.append(holder)
         change.stayed = len(self.held) > len(change.began)
 
-    def _stop(self, grant: Grant, why: str, change: HoldChange, ended: str | None = None) -> None:
+    def _remove(self, grant: Grant, why: str, change: HoldChange, expired: str | None = None) -> None:
         holder = self.held.pop(grant).holder
-        change.stopped.append(holder)
+        change.removed.append(holder)
         change.stayed = len(self.held) > len(change.began)
-        if ended is not None:
-            change.ended.append(EndedHold(id=holder.id, grant=grant, why=ended))
+        if expired is not None:
+            change.expired_locally.append(EndedHold(id=holder.id, grant=grant, why=expired))
         self._ended[grant] = why
         if len(self._ended) > REMEMBERED:
             self._ended.popitem(last=False)

@@ -327,10 +327,10 @@ class ResourceController:
     # Holds
 
     async def _carry_out_change(self, change: HoldChange) -> None:
-        for holder in change.ends:
+        for holder in change.removed_not_handed_over:
             await self._guard(self.driver.end(holder))
         # A device that still serves others, or goes on in another client, stays as it is.
-        if change.stopped and change.interrupts:
+        if change.removed and change.interrupts:
             await self._guard(self.driver.safe())
         for holder in change.began:
             await self._guard(self.driver.begin(holder))
@@ -348,8 +348,8 @@ class ResourceController:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
             self.queue.put_change(change)
             self.queue.resume(lambda query: query.message.grant in self.holds.held)
-        if change.outdated or change.present or change.ended:
-            self.publish(change.ended)
+        if change.outdated or change.announce or change.expired_locally:
+            self.publish(change.expired_locally)
         self._missed |= change.reread
         self._set_timer()
 

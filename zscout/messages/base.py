@@ -34,7 +34,10 @@ MAX_SECONDS = Decimal(10 * 366 * 86_400)
 
 Amounts: TypeAlias = dict[str, Decimal]
 State: TypeAlias = Literal["queued", "running", "ended"]
-Seconds: TypeAlias = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+Finite: TypeAlias = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+Metres: TypeAlias = Finite
+Radians: TypeAlias = Finite
+Seconds: TypeAlias = Finite
 """A duration that is computed with: bounded, so that it is still finite in nanoseconds."""
 Elapsed: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 """Likewise, of the past."""

@@ -6,7 +6,7 @@ from typing import Annotated, TypeAlias
 
 from msgspec import Meta
 
-from zscout.messages.base import Message, Seconds
+from zscout.messages.base import Finite, Message, Metres, Radians, Seconds
 
 MAX_BOXES = 32
 MAX_DETAIL = 200
@@ -47,9 +47,9 @@ class BuildingPlan(Message, frozen=True):
     """A building seen from above."""
 
     name: Word
-    width: Seconds
+    width: Metres
     """Metres along x; the picture's columns."""
-    depth: Seconds
+    depth: Metres
     """Metres along y; the picture's rows, the largest y at the top."""
     picture: bytes
     """PNG."""
@@ -59,9 +59,9 @@ class Placed(Message, frozen=True):
     """Where something stands: metres, radians."""
 
     name: Word
-    x: Seconds
-    y: Seconds
-    heading: Seconds = 0.0
+    x: Metres
+    y: Metres
+    heading: Radians = 0.0
     camera: int = 0
     """The video channel that it transmits on; 0: none."""
     hidden: bool = False
@@ -73,7 +73,7 @@ class BuildingPoses(Message, frozen=True):
 
     time: Seconds
     """Of the building, in seconds since it began."""
-    speed: Seconds = 1.0
+    speed: Finite = 1.0
     """How many of the building's seconds pass in a real one."""
     robots: Annotated[list[Placed], Meta(max_length=MAX_ROBOTS)] = []
     people: Annotated[list[Placed], Meta(max_length=MAX_PEOPLE)] = []

@@ -3,9 +3,9 @@
 A pass:
 
 1. Reserve RCs for ARCs that have waited too long (`reservations.py`).
-2. Take the candidates, in groups that have no RC in common (`conflict_groups.py`).
-3. Take each group's set by the heuristic, as if every vote that is not known were a yes. Where it reaches the
-   bound nothing can be gained: the group is left to step 6.
+2. Take the undecided ARCs, in groups that have no RC in common (`conflict_groups.py`).
+3. Take each group's set by the heuristic, as if every vote that is not known were a yes. Where it reaches
+   the upper bound nothing can be gained: the group is left to step 6.
 4. Elsewhere search the best set: by branch and bound, or by local search where that takes too long.
 5. Ask the votes that a better set needs, and take it once they are in. While a group is searched or its votes
    are out, it is off limits and all others go on.
@@ -42,7 +42,7 @@ MAX_PACKED: Final = 60
 """Larger groups go to local search at once."""
 SLICE: Final = 150
 """Steps of local search in one pass: some 3 ms."""
-MAX_CANDIDATES: Final = 1_000
+MAX_STARTABLE: Final = 1_000
 """Where more ARCs than that could start at one instant, `priority` decides."""
 MAX_STEPS: Final = 6_500
 MAX_SLICES: Final = 48
@@ -75,8 +75,7 @@ class _Search:
     best: int
     begun: bool = False
     inexact: bool = False
-    """Its best may not be the best of all. The heuristic's set then has to be one that votes allow: what
-    they make of it otherwise might be worth more than the best."""
+    """Optimality is not proven, so the heuristic's set must pass the votes before it serves as baseline."""
     local: LocalSearch | None = None
     """None before it begins, and once there is nothing more to look for."""
     steps: int = 0
@@ -105,7 +104,7 @@ class Adaptive(Strategy):
     name: StrategyName = "adaptive"
 
     def __init__(self) -> None:
-        self._news = ""
+        self._log_line = ""
         self._reserved: Reservations | None = None
         self._searches: dict[ArcId, _Search] = {}
         self._work = 0
@@ -116,10 +115,10 @@ class Adaptive(Strategy):
         self._seen: tuple[int, ...] = ()
         """The situation in which they are unfinished."""
 
-    def news(self) -> str:
+    def log_line(self) -> str:
         """Where a search has beaten the heuristic, and at what cost."""
-        news, self._news = self._news, ""
-        return news
+        line, self._log_line = self._log_line, ""
+        return line
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
         if self._reserved is None and not self._searches and _one_without_choice(state):
@@ -132,7 +131,7 @@ class Adaptive(Strategy):
         before, self._searches, self._unfinished = self._searches, {}, []
         held = 0
         reserved = self._reserve(state)
-        for group in conflict_groups(state, reserved, MAX_CANDIDATES):
+        for group in conflict_groups(state, reserved, MAX_STARTABLE):
             if not self._decide(group, before, actions):
                 held |= group.mask
         priority.run_pass(state, actions, off_limits=held, reserved=reserved)
@@ -195,16 +194,16 @@ class Adaptive(Strategy):
 
     def _ask(self, group: ConflictGroup, search: _Search, chosen: int, actions: Actions) -> _Asked:
         """Asks what is not known yet about a set. NO: a silent RC rules it out; that is barred now."""
-        questions = group.ask(chosen)
-        if questions == []:
+        proposals = group.ask(chosen)
+        if proposals == []:
             return YES
-        sets = None if questions is None else [(rc.name, holders) for rc, holders in questions]
+        sets = None if proposals is None else [(rc.name, holders) for rc, holders in proposals]
         if sets is None or sets != search.asked:
             search.rounds += 1
             search.asked = sets
-        if questions is None:
+        if proposals is None:
             return NO
-        for rc, holders in questions:
+        for rc, holders in proposals:
             actions.propose(rc, holders)
         return OPEN
 
@@ -214,11 +213,11 @@ class Adaptive(Strategy):
             return self._bounded(earlier[0])
         problem = group.problem()
         heuristic = problem.complete()
-        if problem.value(heuristic) >= problem.bound_of_all():
+        if problem.value(heuristic) >= problem.upper_bound_of_all():
             return None
         arcs = [arc.id for arc in group.arcs]
-        wish = problem.complete(_warm_start(earlier, arcs)) if earlier else heuristic
-        best = max(heuristic, wish, key=problem.key)
+        preferred = problem.complete(_warm_start(earlier, arcs)) if earlier else heuristic
+        best = max(heuristic, preferred, key=problem.key)
         search = _Search(list(group.items), arcs, set(group.nogoods), problem, heuristic, best)
         for one in earlier:
             search.steps = max(search.steps, one.steps)
@@ -266,11 +265,11 @@ class Adaptive(Strategy):
     def _report_gain(self, group: ConflictGroup, search: _Search) -> None:
         found, heuristic = _pairs(group, search.best), _pairs(group, search.heuristic)
         changed = [
-            f"{heuristic[level]} to {found[level]} at priority {level}"
+            f"at priority {level}: {heuristic[level]} -> {found[level]}"
             for level in found
             if found[level] != heuristic[level]
         ]
-        self._news = f"adaptive: pairs in use from {', '.join(changed)}, in {search.steps} steps"
+        self._log_line = f"adaptive: RC assignments {', '.join(changed)}, in {search.steps} steps"
 
 
 def _one_without_choice(state: SchedulerState) -> bool:

@@ -1,12 +1,12 @@
 """What a pass could change at all, in groups that can be decided apart.
 
-Most of a busy fleet is settled: who runs, and could only have to give way to ARCs that can't start, stays;
-an ARC that needs what such a one holds waits. The others are the candidates. The index of the queue gives
+Most of a busy fleet is settled. A running ARC that no startable ARC could preempt stays; an ARC needing its
+exclusive RCs waits. The others are undecided. The index of the queue gives
 whom to look at: all but watchers, the watchers of RCs at which something was freed, and, where a running ARC
 may have to end, the watchers of what it holds.
 
-Candidates that share no RC, not even by way of others, are decided apart: so a slow voter stops nobody who
-has nothing to do with it, and the cost is that of the groups.
+Undecided ARCs that share no RC, not even by way of others, are decided apart: so a slow voter delays no ARC
+outside its group, and the cost is that of the groups.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Ns
 
 
-def candidates(
+def undecided_arcs(
     state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None
 ) -> list[Arc] | None:
     """Those who might start, best-ranked first, then those who might have to end; None: more than `limit`
@@ -47,7 +47,7 @@ class _Search:
         self._started: Counter[str] = Counter()
         """ARCs of each owner that might start, where there is a quota."""
         self._shared_taken = 0
-        """Sharable RCs at which one passes those starving: whether a second could as well was not asked."""
+        """Sharable RCs where one ARC was already let past the starving ones; a second was not checked."""
 
     def run(self, limit: int | None) -> list[Arc] | None:
         index = self.state.index
@@ -62,7 +62,7 @@ class _Search:
         last: Rank | None = None
         while self._heap:
             rank, _, arc, rc = heapq.heappop(self._heap)
-            # One may come by several ways, but then at once: ranks are unique.
+            # An ARC may be queued twice in the heap; duplicates are adjacent because ranks are unique.
             if rank != last and self._might_start(arc):
                 found.append(arc)
                 if limit is not None and len(found) > limit:
@@ -103,7 +103,7 @@ class _Search:
         """Whether an RC has vetoed the ARC beside those who stay in any case, or is silent about that."""
         stay = (holder.id for holder in rc.holders.values() if self._stays(holder, arc))
         answer = self.votes.known(rc.name, frozenset((*stay, arc.id)))
-        return rc.name in self.votes.silent if answer is None else not answer.accept
+        return rc.name in self.votes.unresponsive if answer is None else not answer.accept
 
     def _reserved_for_other(self, arc: Arc) -> bool:
         """Whether what it would take is kept for another."""
@@ -143,7 +143,7 @@ def conflict_groups(
     `priority` starts it, as any strategy would."""
     return [
         ConflictGroup(state, members, reserved)
-        for members in split(candidates(state, reserved, limit) or ())
+        for members in split(undecided_arcs(state, reserved, limit) or ())
         if len(members) > 1
         and (
             sum(arc.hold is None for arc in members) > 1 or any(arc.mask & state.sharable for arc in members)
@@ -156,12 +156,12 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
     members = sorted(arcs, key=attrgetter("rank"))
     if _one_group(members):
         return [members]
-    leader = list(range(len(members)))
+    root = list(range(len(members)))
 
     def find(number: int) -> int:
-        while leader[number] != number:
-            leader[number] = leader[leader[number]]
-            number = leader[number]
+        while root[number] != number:
+            root[number] = root[root[number]]
+            number = root[number]
         return number
 
     first: dict[int, int] = {}
@@ -171,7 +171,7 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
         while mask:
             bit = mask & -mask
             mask ^= bit
-            leader[find(first.setdefault(bit, number))] = find(number)
+            root[find(first.setdefault(bit, number))] = find(number)
     groups: dict[int, list[Arc]] = {}
     for number, arc in enumerate(members):
         groups.setdefault(find(number), []).append(arc)
@@ -240,15 +240,15 @@ class ConflictGroup:
         vetoes = {rc.name: set(self._vetoes(rc)) for rc in self.sharables}
         self.nogoods = set().union(*vetoes.values())
         """Sets that vetoes rule out, as `PackingProblem` has them."""
-        self._short = {name for name, nogoods in vetoes.items() if nogoods}
-        """RCs that have not enough for all."""
+        self._contended = {name for name, nogoods in vetoes.items() if nogoods}
+        """Names of the sharable RCs that vetoed some set of these ARCs."""
 
     def problem(self) -> PackingProblem:
         return PackingProblem(self.items, sorted(self.nogoods))
 
     def ask(self, chosen: int) -> list[tuple[Rc, HolderSet]] | None:
         """What has to be asked before this set can be taken. None: a veto, now in `nogoods`, rules it out."""
-        questions: list[tuple[Rc, HolderSet]] = []
+        proposals: list[tuple[Rc, HolderSet]] = []
         ruled_out = False
         for rc in self.sharables:
             holders = frozenset(self._holders(rc, chosen))
@@ -256,14 +256,14 @@ class ConflictGroup:
             if holders <= rc.holders.keys():
                 continue
             answer = self.votes.known(rc.name, holders)
-            if answer is None and rc.name not in self.votes.silent:
-                questions.append((rc, self._probe(rc, holders) if rc.name in self._short else holders))
+            if answer is None and rc.name not in self.votes.unresponsive:
+                proposals.append((rc, self._probe(rc, holders) if rc.name in self._contended else holders))
             elif answer is None or not answer.accept:
-                # Who was not asked in time is taken to refuse, from the first that it was not asked about.
+                # A silent RC counts as a veto of the shortest ranked prefix without an answer.
                 ranked, accepted = self._ranked(rc, holders)
                 self.nogoods.add(self._bits(frozenset(ranked[: accepted + 1]) if answer is None else holders))
                 ruled_out = True
-        return None if ruled_out else questions
+        return None if ruled_out else proposals
 
     def take(self, chosen: int, actions: Actions) -> None:
         """Carries the set out: ends who has to end, starts who is to start."""
@@ -284,7 +284,7 @@ class ConflictGroup:
                 yield nogood
 
     def _probe(self, rc: Rc, holders: HolderSet) -> HolderSet:
-        """What to ask an RC that is short: half of those whom it has not accepted yet, beside the others.
+        """What to ask a contended RC: half of those whom it has not accepted yet, beside the others.
 
         A veto of few rules out far more sets than one of many; in a few rounds all are asked."""
         ranked, accepted = self._ranked(rc, holders)

@@ -310,7 +310,7 @@ class Core:
             self._ask(*one)
 
     def _expire(self) -> None:
-        for arc in self._state.over():
+        for arc in self._state.expired_arcs():
             if arc.request.keep:
                 self._state.min_runtime_over(arc)
             else:
@@ -344,7 +344,7 @@ class Core:
         self._effects.append(Queued(arc.id, arc.request.client, reason, settled))
 
     def propose(self, rc: Rc, holders: HolderSet) -> None:
-        number = self._votes.open_question(rc.name, holders, self._state.now)
+        number = self._votes.propose(rc.name, holders, self._state.now)
         if number is None:
             return
         arcs = (self._state.arc(holder) for holder in sorted(holders))

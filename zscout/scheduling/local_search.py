@@ -3,7 +3,7 @@
 A step picks an RC at random that is free, or used below the highest level that could use it, and forces in
 the best item that covers it: those in its way leave, and whatever fits then comes in. What was moved a moment
 ago does not move again (tabu), so the search walks on from a local best. Every set that looks better than the
-best is made lawful first (`PackingProblem.complete`), so that the result can be taken as it is.
+best is made feasible first (`PackingProblem.complete`), so that the result can be taken as it is.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ IDLE_FACTOR: Final = 40
 
 
 class LocalSearch:
-    """A search that goes on in slices. `best` is always lawful, and at least as good as the start."""
+    """A search that goes on in slices. `best` is always feasible, and at least as good as the start."""
 
     def __init__(self, problem: PackingProblem, start: int) -> None:
         self.problem = problem
-        self.bound = problem.bound_of_all()
+        self.upper_bound = problem.upper_bound_of_all()
         self.best = problem.complete(start)
         self.best_key = problem.key(self.best)
         self.steps = 0
@@ -59,7 +59,11 @@ class LocalSearch:
     @property
     def done(self) -> bool:
         """Whether nothing better is there, or nothing better was found for long."""
-        return self.best_key[0] >= self.bound or not self._pool or self.steps - self._improved_at > self._idle
+        return (
+            self.best_key[0] >= self.upper_bound
+            or not self._pool
+            or self.steps - self._improved_at > self._idle
+        )
 
     def _adopt(self, chosen: int) -> None:
         """Starts from this set."""
@@ -95,13 +99,13 @@ class LocalSearch:
         return self.steps - began
 
     def _keep(self) -> None:
-        valid = self.problem.complete(self._chosen)
-        key = self.problem.key(valid)
+        completed = self.problem.complete(self._chosen)
+        key = self.problem.key(completed)
         if key > self.best_key:
-            self.best, self.best_key = valid, key
+            self.best, self.best_key = completed, key
             self._improved_at = self.steps
-        if valid != self._chosen:
-            self._adopt(valid)
+        if completed != self._chosen:
+            self._adopt(completed)
 
     def _pick(self, rc: int) -> int:
         """The item to force in at `rc`: that which gains most, the longest unmoved of equals; -1 for none."""

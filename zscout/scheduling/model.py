@@ -140,8 +140,8 @@ class Arc:
     """Those of `mask`, in the order of the bits; set when the ARC is first queued."""
     footprint: int | None = None
     """While it is VOTING, DEFERRED or PARKED: bits of the RCs that it would take or free."""
-    hidden: int = 0
-    """While VOTING or DEFERRED: bits of the RCs with an obstacle under what was off limits."""
+    masked_obstacles: int = 0
+    """While VOTING or DEFERRED: bits of the RCs whose obstacle was off limits, so that it did not count."""
     watched: Rc | None = None
     """The RC that it is WATCHING."""
     starving: bool = False
@@ -210,7 +210,7 @@ class Rc:
     watchers: list[Rank] = field(default_factory=list)
     """Ranks of the queued ARCs that watch this RC (`QueueIndex`), best first."""
 
-    def firm(self, arc: Arc, now: Ns) -> list[Arc]:
+    def non_preemptible_holders(self, arc: Arc, now: Ns) -> list[Arc]:
         """Its holders that are not preempted for `arc`."""
         return [holder for holder in self.holders.values() if not holder.preemptible_by(arc, now)]
 

@@ -5,8 +5,8 @@ lexicographically; among equals the set with fewest preemptions, then the one th
 in which they differ. Items are numbered by rank. With "take it" tried first and best ranks decided first, the
 first best set that is met is the best-ranked one, so only strictly better sets need be looked for.
 
-The bound: an RC is used once, so free RCs, each counted at the highest level that still covers it, can't be
-beaten; pairs at sharable RCs are added as they are.
+The upper bound: an RC is used once, so free RCs, each counted at the highest level that still covers it,
+can't be beaten; pairs at sharable RCs are added as they are.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Packing:
 
 
 class PackingProblem:
-    """Items in rank order, so levels never fall; and `nogoods`, bit sets of items not to be chosen all.
+    """Items in rank order, so levels never fall; and `nogoods`, item sets that must not be chosen together.
 
     All running items fit together, or are barred from it by a veto."""
 
@@ -81,7 +81,7 @@ class PackingProblem:
         beside = chosen | 1 << number
         return all(nogood & ~beside for nogood in self.nogoods[number])
 
-    def bound(self, open_: Iterable[int]) -> int:
+    def upper_bound(self, open_: Iterable[int]) -> int:
         """What these items can be worth together, at most. Levels must not fall."""
         masks, units = self.masks, self.unit
         if self.plain:
@@ -89,19 +89,19 @@ class PackingProblem:
             for number in open_:
                 layer |= masks[number]
             return layer.bit_count()
-        bound = seen = layer = unit = extra = 0
+        total = seen = layer = unit = extra = 0
         for number in open_:
             if units[number] != unit:
-                bound += (layer & ~seen).bit_count() * unit
+                total += (layer & ~seen).bit_count() * unit
                 seen |= layer
                 layer, unit = 0, units[number]
             if self.worth[number]:
                 layer |= masks[number]
             extra += self.extra[number]
-        return bound + (layer & ~seen).bit_count() * unit + extra
+        return total + (layer & ~seen).bit_count() * unit + extra
 
-    def bound_of_all(self) -> int:
-        return self.bound(number for number in range(len(self.items)) if self.allowed(number, 0))
+    def upper_bound_of_all(self) -> int:
+        return self.upper_bound(number for number in range(len(self.items)) if self.allowed(number, 0))
 
     def value(self, chosen: int) -> int:
         return sum(self.worth[number] for number in numbers(chosen))
@@ -116,16 +116,16 @@ class PackingProblem:
         """Compares sets by value, then by preemptions; greater is better."""
         return self.value(chosen), -self.preemptions(chosen)
 
-    def complete(self, wish: int = 0) -> int:
-        """A lawful set that nothing can be added to: level by level who runs, who is wished for, the rest by
-        rank. Without a wish that is the heuristic's."""
+    def complete(self, preferred: int = 0) -> int:
+        """A feasible set that nothing can be added to: level by level the running items, the preferred, the
+        rest by rank. Without preferred items it is the heuristic's."""
         items, masks = self.items, self.masks
 
         def order(number: int) -> tuple[int, int]:
             item = items[number]
             if item.running:
                 return item.level, 3 if item.past_min_runtime else 0
-            return item.level, 1 if wish >> number & 1 else 2
+            return item.level, 1 if preferred >> number & 1 else 2
 
         used = chosen = 0
         for number in sorted(range(len(items)), key=order):
@@ -134,8 +134,8 @@ class PackingProblem:
                 chosen |= 1 << number
         return chosen
 
-    def valid(self, chosen: int) -> bool:
-        """Whether nobody is left out who runs and fits beside the chosen above and the equals that run."""
+    def preempts_only_if_needed(self, chosen: int) -> bool:
+        """No running item is dropped that fits beside the chosen items which outrank it."""
         for number in self.running:
             if chosen >> number & 1:
                 continue
@@ -168,12 +168,15 @@ class _BranchAndBound:
         items = problem.items
         # These stay wherever they fit, so there is nothing to decide about them. Others that run have to be
         # decided by rank, and the set as a whole is checked.
-        self.firm = [
+        self.always_kept = [
             item.in_min_runtime and not nogoods for item, nogoods in zip(items, problem.nogoods, strict=True)
         ]
         self.in_min_runtime = [item.in_min_runtime for item in items]
         self.ends = any(self.in_min_runtime)
-        self.checked = any(item.running and not firm for item, firm in zip(items, self.firm, strict=True))
+        self.checked = any(
+            item.running and not always_kept
+            for item, always_kept in zip(items, self.always_kept, strict=True)
+        )
         self.best = -1
         self.best_preemptions = 0
         self.chosen = 0
@@ -182,7 +185,7 @@ class _BranchAndBound:
     def run(self) -> Packing:
         problem = self.problem
         whole = [number for number in range(len(problem.items)) if problem.allowed(number, 0)]
-        whole.sort(key=lambda number: (problem.items[number].level, not self.firm[number]))
+        whole.sort(key=lambda number: (problem.items[number].level, not self.always_kept[number]))
         out = sum(self.in_min_runtime) - sum(self.in_min_runtime[number] for number in whole)
         todo = [(whole, 0, 0, out)]
         cut = False
@@ -209,8 +212,8 @@ class _BranchAndBound:
             if self.nodes > self.limit:
                 return True
             if self.best >= 0:
-                bound = value + problem.bound(open_)
-                if bound < self.best or (bound == self.best and preemptions >= self.best_preemptions):
+                most = value + problem.upper_bound(open_)
+                if most < self.best or (most == self.best and preemptions >= self.best_preemptions):
                     return False
             head, *tail = open_
             mask = masks[head]
@@ -221,11 +224,11 @@ class _BranchAndBound:
             dropped = preemptions
             if self.ends and len(rest) < len(tail):
                 dropped += sum(self.in_min_runtime[number] for number in set(tail).difference(rest))
-            if not self.firm[head] and (len(rest) < len(tail) or self._in_the_way(head, taken, tail)):
+            if not self.always_kept[head] and (len(rest) < len(tail) or self._in_the_way(head, taken, tail)):
                 todo.append((tail, chosen, value, preemptions + self.in_min_runtime[head]))
             open_, chosen, value, preemptions = rest, taken, value + worth[head], dropped
         better = value > self.best or (value == self.best and preemptions < self.best_preemptions)
-        if better and (not self.checked or problem.valid(chosen)):
+        if better and (not self.checked or problem.preempts_only_if_needed(chosen)):
             self.best, self.best_preemptions, self.chosen = value, preemptions, chosen
         return False
 

@@ -72,16 +72,18 @@ class Binder:
     def _fitness(self, arc: Arc, rc: Rc) -> tuple[int, float]:
         """How well `rc` would do, and what decides between equals."""
         demand = float(rc.demand)
-        firm = rc.firm(arc, self._state.now)
+        non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
-            answer = self._votes.known(rc.name, frozenset((*(holder.id for holder in firm), arc.id)))
-            if answer is None and rc.name in self._votes.silent:
+            answer = self._votes.known(
+                rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id))
+            )
+            if answer is None and rc.name in self._votes.unresponsive:
                 return Fitness.RESERVED, demand
             if answer is not None and not answer.accept:
                 return Fitness.HELD, demand
             return Fitness.FREE, len(rc.holders) + (answer is None)
-        if firm:
-            return Fitness.HELD, max(0 if one.hold is None else one.hold.end for one in firm)
+        if non_preemptible:
+            return Fitness.HELD, max(0 if one.hold is None else one.hold.end for one in non_preemptible)
         if self._reserved is not None and self._reserved.reserves(rc, arc):
             return Fitness.RESERVED, demand
         if rc.holders:

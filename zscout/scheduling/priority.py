@@ -6,10 +6,10 @@ A pass:
 2. Collect whom to check: those who are ready, and the first watcher of each RC that was freed.
 3. Check them in rank order (`AdmissionCheck`). For each, `a`:
    a. An RC of `a` is absent, or held by one that is not preempted for `a`: `a` waits.
-   b. Every sharable RC that `a` needs must accept `a` beside all who would still hold it if the blockers
-      (who hold an exclusive RC that `a` needs) and the candidates (who are preemptible, and hold a sharable
-      RC that `a` needs) were gone. Otherwise `a` waits, and nobody is preempted.
-   c. Reprieve: candidates stay, in rank order, as long as the votes allow. The others are preempted.
+   b. Every sharable RC that `a` needs must accept `a` beside all who would still hold it if the exclusive
+      victims (who hold an exclusive RC that `a` needs) and the preemptible sharers (who hold a sharable RC
+      that `a` needs) were gone. Otherwise `a` waits, and nobody is preempted.
+   c. Reprieve: preemptible sharers stay, in rank order, as long as the votes allow; others are preempted.
    d. `a` starts.
 4. Index `a` by what it waits for, or preempt its victims and start it; what that changes calls others.
 
@@ -36,7 +36,7 @@ nothing:
 - It is PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked
   when anything within changes, is answered or becomes off limits, and when that RC may be asked again.
 - It is VOTING or DEFERRED, but nothing within its footprint has changed: if what it would take is off limits
-  and what hides its firm obstacles still is, or it waits for the same votes as before.
+  and what masks its obstacles still is, or it waits for the same votes as before.
 
 An ARC with patterns is always checked, unless an RC that it names keeps it out.
 """
@@ -72,7 +72,7 @@ class Inadmissible:
 class VotesNeeded:
     """The check can't be decided before these are answered."""
 
-    questions: list[tuple[Rc, HolderSet]]
+    proposals: list[tuple[Rc, HolderSet]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +88,10 @@ class AdmissionCheck:
     def __init__(self, state: SchedulerState, arc: Arc) -> None:
         self.state, self.arc = state, arc
         self.votes, self.now = state.votes, state.now
-        self.firm: list[tuple[Rc, Arc]] = []
-        """Exclusive RCs it needs, with holders that are not preempted for it."""
-        self.blockers: dict[ArcId, Arc] = {}
-        """The holders of the others."""
+        self.non_preemptible: list[tuple[Rc, Arc]] = []
+        """Exclusive RCs that it needs, with holders that are not preempted for it."""
+        self.exclusive_victims: dict[ArcId, Arc] = {}
+        """Holders of exclusive RCs that it needs: preempted if it starts."""
         self._sharables: list[Rc] = []
         for rc in arc.rcs:
             if rc.sharable:
@@ -99,14 +99,14 @@ class AdmissionCheck:
                 continue
             for holder in rc.holders.values():
                 if holder.preemptible_by(arc, self.now):
-                    self.blockers[holder.id] = holder
+                    self.exclusive_victims[holder.id] = holder
                 else:
-                    self.firm.append((rc, holder))
+                    self.non_preemptible.append((rc, holder))
 
     def footprint(self) -> int:
         """All that the ARC would take or free, as bits."""
         bits = self.arc.mask
-        for holder in (*self.blockers.values(), *self._candidates()):
+        for holder in (*self.exclusive_victims.values(), *self._preemptible_sharers()):
             bits |= holder.mask
         return bits
 
@@ -118,25 +118,25 @@ class AdmissionCheck:
                 absent = [rc.name for rc in self.arc.rcs if not rc.present]
                 return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, absent))
         lasting: tuple[int, float, int] | None = None
-        for number, (rc, holder) in enumerate(self.firm):
+        for number, (rc, holder) in enumerate(self.non_preemptible):
             if not off_limits or not rc.bit & off_limits:
                 end = math.inf if holder.request.keep or holder.hold is None else holder.hold.end
                 lasting = max(lasting or (holder.priority, -1.0, 0), (holder.priority, end, number))
         if lasting is not None:
-            shown = self.firm[:SHOWN]
+            shown = self.non_preemptible[:SHOWN]
             rcs, parties = tuple(rc.name for rc, _ in shown), tuple(holder.party for _, holder in shown)
-            reason = Reason(ReasonCode.HELD, rcs, parties, number=len(self.firm))
-            return Inadmissible(self.firm[lasting[2]][0], reason)
+            reason = Reason(ReasonCode.HELD, rcs, parties, number=len(self.non_preemptible))
+            return Inadmissible(self.non_preemptible[lasting[2]][0], reason)
         if off_limits:
             for rc in self._sharables:
                 if not rc.bit & off_limits and (answer := self._answer(rc)) is not None and not answer.accept:
                     return _vetoed(rc, answer)
         return None
 
-    def hidden(self) -> int:
-        """Bits of the RCs that keep the ARC out as things stand."""
+    def masked_obstacles(self) -> int:
+        """Bits of the RCs that keep the ARC out at present, whether off limits or not."""
         bits = 0
-        for rc, _ in self.firm:
+        for rc, _ in self.non_preemptible:
             bits |= rc.bit
         for rc in self._sharables:
             if (answer := self._answer(rc)) is not None and not answer.accept:
@@ -145,21 +145,21 @@ class AdmissionCheck:
 
     def decide(self) -> Inadmissible | VotesNeeded | Admissible:
         """Steps 3b and 3c, with the votes that are known. Only for a check without an obstacle."""
-        kept = {rc.name: self._firm_holders(rc) for rc in self._sharables}
+        kept = {rc.name: self._with_non_preemptible(rc) for rc in self._sharables}
         verdict = self._ask([(rc, kept[rc.name]) for rc in self._sharables])
         if verdict is not None:
             return verdict
-        victims = list(self.blockers.values())
-        for candidate in self._candidates():
-            shared = [rc for rc in self._sharables if candidate.id in rc.holders]
-            beside = [(rc, kept[rc.name] | {candidate.id}) for rc in shared]
+        victims = list(self.exclusive_victims.values())
+        for sharer in self._preemptible_sharers():
+            shared = [rc for rc in self._sharables if sharer.id in rc.holders]
+            beside = [(rc, kept[rc.name] | {sharer.id}) for rc in shared]
             verdict = self._ask(beside)
             match verdict:
                 case None:
                     for rc, holders in beside:
                         kept[rc.name] = holders
                 case Inadmissible():
-                    victims.append(candidate)
+                    victims.append(sharer)
                 case VotesNeeded():
                     return verdict
         return Admissible(sorted(victims, key=lambda arc: arc.rank))
@@ -167,30 +167,32 @@ class AdmissionCheck:
     def refusal(self) -> Reason | None:
         """The veto that keeps the ARC out beside those who would stay, before the silence of an RC that does
         not answer; None if there is neither."""
-        silent = None
+        unresponsive = None
         for rc in self._sharables:
             answer = self._answer(rc)
             if answer is not None and not answer.accept:
                 return _vetoed(rc, answer).reason
-            if answer is None and not silent and rc.name in self.votes.silent:
-                silent = of_rcs(ReasonCode.SILENT, [rc.name])
-        return silent
+            if answer is None and not unresponsive and rc.name in self.votes.unresponsive:
+                unresponsive = of_rcs(ReasonCode.SILENT, [rc.name])
+        return unresponsive
 
     def _answer(self, rc: Rc) -> Answer | None:
         """What `rc` votes on the ARC beside those who would stay."""
-        return self.votes.known(rc.name, self._firm_holders(rc))
+        return self.votes.known(rc.name, self._with_non_preemptible(rc))
 
-    def _firm_holders(self, rc: Rc) -> HolderSet:
+    def _with_non_preemptible(self, rc: Rc) -> HolderSet:
         """The ARC beside those who would stay."""
-        return frozenset((*(holder.id for holder in rc.firm(self.arc, self.now)), self.arc.id))
+        return frozenset(
+            (*(holder.id for holder in rc.non_preemptible_holders(self.arc, self.now)), self.arc.id)
+        )
 
-    def _candidates(self) -> list[Arc]:
-        """In rank order, those who may be preempted and hold a sharable RC that it needs."""
+    def _preemptible_sharers(self) -> list[Arc]:
+        """In rank order, the holders of its sharable RCs that may be preempted for it."""
         found = {
             holder.id: holder
             for rc in self._sharables
             for holder in rc.holders.values()
-            if holder.id not in self.blockers and holder.preemptible_by(self.arc, self.now)
+            if holder.id not in self.exclusive_victims and holder.preemptible_by(self.arc, self.now)
         }
         return sorted(found.values(), key=lambda arc: arc.rank)
 
@@ -272,7 +274,7 @@ class Pass:
                 _, _, arc, rc = heapq.heappop(heap)
                 if rc is not None and not self._needs_check(rc, arc):
                     continue
-            # One may come by several ways, but then at once: ranks are unique.
+            # An ARC may be queued twice in the heap; duplicates are adjacent because ranks are unique.
             if arc.rank != last:
                 last = arc.rank
                 if arc.footprint is None or not self._still_deferred(arc, arc.footprint):
@@ -322,8 +324,8 @@ class Pass:
                 for rc in arc.rcs:
                     if any(holder.mask & self.off_limits for holder in rc.holders.values()):
                         bits |= rc.bit
-            case VotesNeeded(questions):
-                bits = sum(rc.bit for rc, _ in questions if rc.name in self.votes.silent)
+            case VotesNeeded(proposals):
+                bits = sum(rc.bit for rc, _ in proposals if rc.name in self.votes.unresponsive)
             case _:
                 bits = 0
         return bits & arc.mask & ~arc.named_mask
@@ -344,10 +346,10 @@ class Pass:
 
     def _apply(self, arc: Arc, check: AdmissionCheck, verdict: _Verdict) -> None:
         match verdict:
-            case ReservationConflict(rc, _, ask) if ask is not None:
+            case ReservationConflict(rc, _, proposal) if proposal is not None:
                 self.index.make_ready(arc)
                 self.actions.wait(arc, VOTING, settled=False)
-                self.actions.propose(rc, ask)
+                self.actions.propose(rc, proposal)
             case Inadmissible(rc, reason) | ReservationConflict(rc, reason):
                 pattern = next((need for need, name in arc.bound.items() if name == rc.name), None)
                 if pattern is None:
@@ -365,18 +367,20 @@ class Pass:
             case "off limits":
                 self._defer(arc, check, ArcState.DEFERRED)
                 self.actions.wait(arc, VOTING, settled=False)
-            case VotesNeeded(asked) if silent := [one for one in asked if one[0].name in self.votes.silent]:
+            case VotesNeeded(proposals) if unresponsive := [
+                one for one in proposals if one[0].name in self.votes.unresponsive
+            ]:
                 if arc.patterns:
                     self.index.make_ready(arc)
                 else:
                     self.index.park(arc, check.footprint())
-                self.actions.wait(arc, of_rcs(ReasonCode.SILENT, [rc.name for rc, _ in silent]))
-                for rc, holders in silent:
+                self.actions.wait(arc, of_rcs(ReasonCode.SILENT, [rc.name for rc, _ in unresponsive]))
+                for rc, holders in unresponsive:
                     self.actions.propose(rc, holders)
-            case VotesNeeded(questions):
+            case VotesNeeded(proposals):
                 self._defer(arc, check, ArcState.VOTING)
                 self.actions.wait(arc, VOTING, settled=False)
-                for rc, holders in questions:
+                for rc, holders in proposals:
                     self.actions.propose(rc, holders)
             case Admissible(victims):
                 for victim in victims:
@@ -391,12 +395,12 @@ class Pass:
             # It is checked again whatever happens: another RC may do.
             self.index.make_ready(arc)
         else:
-            self.index.defer(arc, state, footprint, check.hidden())
+            self.index.defer(arc, state, footprint, check.masked_obstacles())
         self._put_off_limits(footprint, arc.rank)
 
     def _still_deferred(self, arc: Arc, footprint: int) -> bool:
         """Whether a check that could not be decided can't be again, seen without repeating it."""
-        if footprint & self.changed or arc.hidden & ~self.off_limits:
+        if footprint & self.changed or arc.masked_obstacles & ~self.off_limits:
             return False
         if arc.state is not ArcState.VOTING and not footprint & self.off_limits:
             return False
@@ -414,7 +418,7 @@ class Pass:
         index, votes, rc = self.index, self.votes, self.state.rc
         for name in votes.invalidated:
             index.freed |= rc(name).bit
-        due = votes.due(self.state.now) if votes.silent else ()
+        due = votes.due(self.state.now) if votes.unresponsive else ()
         for name in (*votes.answered, *due):
             index.touched |= rc(name).bit
         votes.invalidated.clear()

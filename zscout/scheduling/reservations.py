@@ -38,18 +38,18 @@ class Reservation(NamedTuple):
 
 
 class ReservationConflict(NamedTuple):
-    """An ARC would be in the way of a reservation at `rc`, unless the vote on `ask` says otherwise."""
+    """An ARC would be in the way of a reservation at `rc`, unless the vote on `proposal` says otherwise."""
 
     rc: Rc
     reason: Reason
-    ask: HolderSet | None = None
+    proposal: HolderSet | None = None
 
 
 def reservations(state: SchedulerState, patience: Ns, last: Reservations | None) -> Reservations:
     """What is reserved now: the `last` that was found, if nothing has changed that it depends on.
 
-    Time alone changes nothing: one that is to start later is reserved the same RCs, and nobody could be over
-    before one that is due already."""
+    Passing time alone does not change the RCs or their order; for an ARC already due no backfill is
+    possible."""
     state.index.mark_starving(state.now - patience // 2, state.queued)
     if last is not None and last.made_of == _versions(state):
         return last
@@ -71,7 +71,7 @@ class Reservations:
         self.bits = 0
         """RCs with reservations."""
         self._free: dict[int, Ns] = {}
-        """By bit: when those reserved for before are done with the RC."""
+        """By bit: when the earlier reservations of the RC end."""
         self.made_of = _versions(state)
         for _, _, arc in state.index.starving[:MAX_STARVING]:
             self._reserve(state.queued[arc])
@@ -92,13 +92,13 @@ class Reservations:
             self.bits |= rc.bit
 
     def _rcs(self, arc: Arc) -> list[Rc]:
-        """What it is to have: of those that meet a pattern, the one that has room for it first. An RC that is
-        not there stands for a pattern that none is left for."""
+        """The RCs to reserve. For each pattern the matching RC that is free earliest; an absent placeholder
+        RC if none is left."""
         rcs = list(self._state.rcs_in(arc.named_mask)) if arc.patterns else list(arc.rcs)
         for need in arc.patterns:
             left = [rc for rc in self._state.matching(need) if rc.present and rc not in rcs]
-            nothing = Rc(need, 0)
-            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc), rc.bit), default=nothing))
+            placeholder = Rc(need, 0)
+            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc), rc.bit), default=placeholder))
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:
@@ -111,16 +111,18 @@ class Reservations:
 
     def _free_from(self, rc: Rc, arc: Arc) -> float:
         """When `rc` has room for `arc` at the latest; infinite where that is not known."""
-        firm = rc.firm(arc, self._state.now)
+        non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
             sharing = (reservation.arc.id for reservation in self.by_rc.get(rc.bit, ()))
-            if self._votes.accepts(rc.name, frozenset((*(holder.id for holder in firm), *sharing, arc.id))):
+            if self._votes.accepts(
+                rc.name, frozenset((*(holder.id for holder in non_preemptible), *sharing, arc.id))
+            ):
                 return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
-            if rc.name in self._votes.silent or (alone is not None and not alone.accept):
+            if rc.name in self._votes.unresponsive or (alone is not None and not alone.accept):
                 return math.inf
         start: float = self._free.get(rc.bit, self._state.now)
-        for holder in firm:
+        for holder in non_preemptible:
             start = max(start, _end(holder, arc))
         return start
 
@@ -129,9 +131,8 @@ class Reservations:
         return arc.since + self._patience
 
     def goes_first(self, arc: Arc) -> bool:
-        """Whether `arc` goes before those of its equals that could start as well. Of exclusive RCs, nobody is
-        left who could take any; but of several that a sharable RC accepts beside `arc`, each by itself, it
-        may not accept all."""
+        """Whether `arc` goes before its equals that could start as well. A sharable RC may accept each
+        backfilled ARC alone but not all together, so a due ARC goes first there."""
         state = self._state
         return arc.starving and bool(arc.mask & state.sharable) and self.due(arc) <= state.now
 
@@ -156,8 +157,8 @@ class Reservations:
             together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
             if not self._votes.accepts(rc.name, together):
                 known = self._votes.known(rc.name, together)
-                asked = known is None and rc.name not in self._votes.silent
-                return ReservationConflict(rc, reason, together if asked else None)
+                is_open = known is None and rc.name not in self._votes.unresponsive
+                return ReservationConflict(rc, reason, together if is_open else None)
         return None
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
@@ -174,7 +175,7 @@ class Reservations:
         )
 
     def changed(self, earlier: Reservations) -> int:
-        """Bits of the RCs at which other reservations stand now than then."""
+        """Bits of the RCs at which the reservations differ from the `earlier` ones."""
         bits = 0
         for bit in self.by_rc.keys() | earlier.by_rc.keys():
             if self.by_rc.get(bit) != earlier.by_rc.get(bit):

@@ -46,8 +46,8 @@ class QueueIndex:
         """Bits of the RCs at which something else has changed: it concerns all but watchers."""
         self.ranks: list[Rank] = []
         """Of all that are queued, best first."""
-        self._patient: list[tuple[Ns, ArcId]] = []
-        """Those who are not starving, by the time since when they wait."""
+        self._not_starving: list[tuple[Ns, ArcId]] = []
+        """Queued ARCs that are not starving, by the time since when they wait."""
         self.starving: list[tuple[int, Ns, ArcId]] = []
         """Those who have waited for too long: by band of priorities (negated), then by the same."""
         self.starving_version = 0
@@ -56,7 +56,7 @@ class QueueIndex:
     def add(self, arc: Arc) -> None:
         """A newcomer."""
         insort(self.ranks, arc.rank)
-        insort(self._patient, (arc.since, arc.id))
+        insort(self._not_starving, (arc.since, arc.id))
         self.ready[arc.id] = arc
         arc.move_to(ArcState.READY)
 
@@ -66,21 +66,21 @@ class QueueIndex:
         if arc.starving:
             arc.starving = False
             self.starving_version += 1
-            del self.starving[bisect_left(self.starving, self._hunger(arc))]
+            del self.starving[bisect_left(self.starving, self._starving_key(arc))]
         else:
-            del self._patient[bisect_left(self._patient, (arc.since, arc.id))]
+            del self._not_starving[bisect_left(self._not_starving, (arc.since, arc.id))]
         self._leave(arc)
 
     def mark_starving(self, since: Ns, queued: Mapping[ArcId, Arc]) -> None:
         """Who has waited since then or longer is starving from now on (`reservations.py`)."""
-        count = bisect_right(self._patient, since, key=itemgetter(0))
+        count = bisect_right(self._not_starving, since, key=itemgetter(0))
         self.starving_version += count
-        for _, arc_id in self._patient[:count]:
+        for _, arc_id in self._not_starving[:count]:
             queued[arc_id].starving = True
-            insort(self.starving, self._hunger(queued[arc_id]))
-        del self._patient[:count]
+            insort(self.starving, self._starving_key(queued[arc_id]))
+        del self._not_starving[:count]
 
-    def _hunger(self, arc: Arc) -> tuple[int, Ns, ArcId]:
+    def _starving_key(self, arc: Arc) -> tuple[int, Ns, ArcId]:
         return -self._band(arc.priority), arc.since, arc.id
 
     def ahead(self, arc: Arc) -> int:
@@ -109,13 +109,13 @@ class QueueIndex:
         arc.move_to(ArcState.READY)
         self.ready[arc.id] = arc
 
-    def defer(self, arc: Arc, state: ArcState, footprint: int, hidden: int) -> None:
+    def defer(self, arc: Arc, state: ArcState, footprint: int, masked_obstacles: int) -> None:
         """The check of `arc` can't be decided yet; `state` (VOTING or DEFERRED) says why."""
         if arc.id not in self.ready:
             self._leave(arc)
             self.ready[arc.id] = arc
         arc.move_to(state)
-        arc.footprint, arc.hidden = footprint, hidden
+        arc.footprint, arc.masked_obstacles = footprint, masked_obstacles
 
     def _leave(self, arc: Arc) -> None:
         self.ready.pop(arc.id, None)
@@ -329,8 +329,9 @@ class SchedulerState:
         self.index.freed |= arc.mask
         return hold
 
-    def over(self) -> Iterator[Arc]:
-        """Those whose minimum runtime is over by now, each once; what is done to one may end others."""
+    def expired_arcs(self) -> Iterator[Arc]:
+        """The running ARCs whose minimum runtime is over by now, each once; the caller may end others
+        meanwhile."""
         while self._ends and self._ends[0][0] <= self.now:
             arc = self.running.get(heapq.heappop(self._ends)[1])
             if arc is not None and arc.hold is not None and arc.hold.end <= self.now:
@@ -356,7 +357,7 @@ class SchedulerState:
         return priority >= self.policy.operator_priority
 
     def band(self, priority: int) -> int:
-        """Priorities of one band wait for each other's due."""
+        """The band of a priority: ARCs whose priorities share a band respect each other's reservations."""
         alone = self.policy.promise == "equals" or self.operator(priority)
         return priority if alone else self.policy.operator_priority - 1
 
@@ -418,6 +419,6 @@ class Strategy(Protocol):
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
         """One pass: reads the state, and acts."""
 
-    def news(self) -> str:
+    def log_line(self) -> str:
         """What is worth a line in a log since it was last asked for; mostly empty."""
         return ""

@@ -1,7 +1,8 @@
-"""How sharable RCs have voted: the answers that stand, and the proposals that are out.
+"""How sharable RCs have voted: the answers in force, and the proposals that are open (sent and not answered;
+the query ends after the LATE_VOTE of `services/rcm/rcm.py`).
 
 An RC accepts or vetoes a set of holders. What it accepts, it accepts of every subset; so a veto holds for
-every superset, and one answer settles many questions. Answers stand until the RC's rules change.
+every superset, and one answer settles many sets. Answers are in force until the RC's rules change.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ HolderSet: TypeAlias = frozenset[ArcId]
 
 ANSWERS_PER_RC = 4096
 """Oldest answers beyond this many are forgotten; the RC is then asked again."""
-QUESTIONS_PER_SET = 8
-"""How many proposals of one set may be out: a silent RC is asked anew, and any of its answers will do."""
+PROPOSALS_PER_SET = 8
+"""How many proposals of one set may be open: an unresponsive RC is asked anew, and any answer counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +37,12 @@ class RcVotes:
     def __init__(self) -> None:
         self.accepted: dict[HolderSet, None] = {}
         self.vetoed: dict[HolderSet, str] = {}
-        self.out: dict[HolderSet, list[int]] = {}
-        """The proposals of each set that is asked for, newest last."""
+        self.proposals: dict[HolderSet, list[int]] = {}
+        """Numbers of the open proposals of each set, newest last."""
         self.overdue: set[HolderSet] = set()
-        """Those whose newest proposal is overdue, and perhaps lost: they may be asked for anew."""
-        self.ask_again: Ns = 0
-        """When, if it is silent."""
+        """Sets whose newest proposal is overdue, and perhaps lost: they may be proposed anew."""
+        self.retry_at: Ns = 0
+        """When it may be asked again, if it is unresponsive."""
         self._accepted_with: dict[ArcId, dict[HolderSet, None]] = {}
         """The accepted sets that each ARC is in."""
         self._vetoed_at: dict[ArcId, dict[HolderSet, None]] = {}
@@ -80,7 +81,7 @@ class RcVotes:
             self._drop_vetoed(next(iter(self.vetoed)))
 
     def forget(self, arc: ArcId) -> None:
-        """Of sets with this ARC, what was accepted stands without it and the vetoes fall."""
+        """Of sets with this ARC, what was accepted is accepted without it too, and vetoes are dropped."""
         for holders in list(self._accepted_with.get(arc, ())):
             self._drop_accepted(holders)
             if len(holders) > 1:
@@ -89,7 +90,7 @@ class RcVotes:
             self._drop_vetoed(holders)
 
     def rename(self, arc: ArcId, renamed: ArcId) -> list[int]:
-        """An ARC goes on by another name. Returns the proposals that are out and name it."""
+        """An ARC goes on by another name. Returns the numbers of the open proposals that name it."""
         for holders in list(self._accepted_with.get(arc, ())):
             self._drop_accepted(holders)
             self.accept(_renamed(holders, arc, renamed))
@@ -97,10 +98,10 @@ class RcVotes:
             self._drop_vetoed(holders)
             self.veto(_renamed(holders, arc, renamed), reason)
         self.overdue = {_renamed(holders, arc, renamed) for holders in self.overdue}
-        asked = [holders for holders in self.out if arc in holders]
-        for holders in asked:
-            self.out[_renamed(holders, arc, renamed)] = self.out.pop(holders)
-        return [number for holders in asked for number in self.out[_renamed(holders, arc, renamed)]]
+        proposed = [holders for holders in self.proposals if arc in holders]
+        for holders in proposed:
+            self.proposals[_renamed(holders, arc, renamed)] = self.proposals.pop(holders)
+        return [number for holders in proposed for number in self.proposals[_renamed(holders, arc, renamed)]]
 
     def _drop_accepted(self, holders: HolderSet) -> None:
         del self.accepted[holders]
@@ -126,25 +127,25 @@ def _discard(index: dict[ArcId, dict[HolderSet, None]], arc: ArcId, holders: Hol
 
 
 class Votes:
-    """All ballots of a fleet. Proposals are numbered; an answer to a number that is not out is ignored."""
+    """The votes of all RCs. Proposals are numbered; an answer to a number that is not open is ignored."""
 
     def __init__(self) -> None:
-        self._ballots: defaultdict[RcName, RcVotes] = defaultdict(RcVotes)
-        self.out: dict[int, tuple[RcName, HolderSet]] = {}
-        """The proposals that are out, by their numbers."""
+        self._by_rc: defaultdict[RcName, RcVotes] = defaultdict(RcVotes)
+        self.proposals: dict[int, tuple[RcName, HolderSet]] = {}
+        """The open proposals, by their numbers."""
         self._next = 1
-        self.silent: set[RcName] = set()
-        """RCs whose last vote is overdue: nobody waits for them until they answer."""
+        self.unresponsive: set[RcName] = set()
+        """RCs whose last vote is overdue: no decision waits for them until they answer."""
         self.version = 0
         """Grows with all that changes what is known."""
         self.answered: set[RcName] = set()
-        """RCs that answered, or fell silent, since somebody last took note and emptied this."""
+        """RCs that answered, or became unresponsive, since a pass last emptied this."""
         self.invalidated: set[RcName] = set()
-        """RCs whose answers no longer stand, likewise."""
+        """RCs whose answers are no longer in force, likewise."""
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
-        """The answer that stands for exactly this set, by itself or by what it implies; None if unknown."""
-        return self._ballots[rc].known(holders)
+        """The answer in force for exactly this set, by itself or by what it implies; None if unknown."""
+        return self._by_rc[rc].known(holders)
 
     def accepts(self, rc: RcName, holders: HolderSet) -> bool:
         """Whether it is known that an RC accepts this set."""
@@ -153,91 +154,91 @@ class Votes:
 
     def vetoed(self, rc: RcName) -> list[HolderSet]:
         """The sets that an RC has vetoed; each rules out every larger one as well."""
-        return list(self._ballots[rc].vetoed)
+        return list(self._by_rc[rc].vetoed)
 
     def due(self, now: Ns) -> list[RcName]:
-        """The silent RCs that may be asked again by now."""
-        return [rc for rc in self.silent if self._ballots[rc].ask_again <= now]
+        """The unresponsive RCs that may be asked again by now."""
+        return [rc for rc in self.unresponsive if self._by_rc[rc].retry_at <= now]
 
-    def open_question(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
-        """The number of a new proposal to send, or None where one is out already or the RC is not due.
+    def propose(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
+        """The number of a new proposal to send, or None where one is open already or the RC is not due.
 
-        A silent RC is asked again once a quantum, so that it can show that it is back."""
-        ballot = self._ballots[rc]
-        if rc in self.silent:
-            if now < ballot.ask_again:
+        An unresponsive RC is asked again once a quantum, so that it can show that it is back."""
+        votes = self._by_rc[rc]
+        if rc in self.unresponsive:
+            if now < votes.retry_at:
                 return None
-            ballot.ask_again = now + QUANTUM
-        elif holders in ballot.out and holders not in ballot.overdue:
+            votes.retry_at = now + QUANTUM
+        elif holders in votes.proposals and holders not in votes.overdue:
             return None
-        ballot.overdue.discard(holders)
+        votes.overdue.discard(holders)
         number = self._next
         self._next += 1
-        numbers = ballot.out.setdefault(holders, [])
+        numbers = votes.proposals.setdefault(holders, [])
         numbers.append(number)
-        if len(numbers) > QUESTIONS_PER_SET:
-            del self.out[numbers.pop(0)]
-        self.out[number] = (rc, holders)
+        if len(numbers) > PROPOSALS_PER_SET:
+            del self.proposals[numbers.pop(0)]
+        self.proposals[number] = (rc, holders)
         return number
 
     def answer(self, proposal: int, *, accept: bool, reason: str) -> None:
-        """Takes an answer, a late one too, unless nobody asked, or the question has become void."""
-        if proposal not in self.out:
+        """Takes an answer, a late one too, unless its proposal is not open any more."""
+        if proposal not in self.proposals:
             return
-        rc, holders = self.out[proposal]
-        ballot = self._ballots[rc]
-        self._close(ballot, holders)
-        self.silent.discard(rc)
+        rc, holders = self.proposals[proposal]
+        votes = self._by_rc[rc]
+        self._close(votes, holders)
+        self.unresponsive.discard(rc)
         self.answered.add(rc)
         self.version += 1
         if accept:
-            ballot.accept(holders)
+            votes.accept(holders)
         else:
-            ballot.veto(holders, reason)
+            votes.veto(holders, reason)
 
     def overdue(self, proposal: int, now: Ns) -> None:
-        """Marks the RC silent. The proposal stays open: an answer counts until the query for it ends."""
-        if proposal not in self.out:
+        """Marks the RC unresponsive. The proposal stays open: an answer counts until its query ends."""
+        if proposal not in self.proposals:
             return
-        rc, holders = self.out[proposal]
-        ballot = self._ballots[rc]
-        if proposal != ballot.out[holders][-1]:
+        rc, holders = self.proposals[proposal]
+        votes = self._by_rc[rc]
+        if proposal != votes.proposals[holders][-1]:
             return
-        ballot.overdue.add(holders)
+        votes.overdue.add(holders)
         self.answered.add(rc)
         self.version += 1
-        if rc not in self.silent:
-            self.silent.add(rc)
-            ballot.ask_again = now + QUANTUM
+        if rc not in self.unresponsive:
+            self.unresponsive.add(rc)
+            votes.retry_at = now + QUANTUM
 
     def forget_rc(self, rc: RcName) -> None:
-        """The RC left, came anew or changed its rules: no vote of it stands, no proposal is out."""
+        """The RC left, came anew or changed its rules: its votes and open proposals are dropped."""
         self.invalidated.add(rc)
         self.version += 1
-        self.silent.discard(rc)
-        ballot = self._ballots.pop(rc, None)
-        if ballot is not None:
-            for holders in list(ballot.out):
-                self._close(ballot, holders)
+        self.unresponsive.discard(rc)
+        votes = self._by_rc.pop(rc, None)
+        if votes is not None:
+            for holders in list(votes.proposals):
+                self._close(votes, holders)
 
     def forget_arc(self, rc: RcName, arc: ArcId) -> None:
-        """An ARC that needed `rc` has ended: what was accepted with it stands without it."""
-        ballot = self._ballots.get(rc)
-        if ballot is None:
+        """An ARC that needed `rc` has ended: what was accepted with it is accepted without it too."""
+        votes = self._by_rc.get(rc)
+        if votes is None:
             return
-        ballot.forget(arc)
+        votes.forget(arc)
         self.version += 1
-        for holders in [holders for holders in ballot.out if arc in holders]:
-            self._close(ballot, holders)
+        for holders in [holders for holders in votes.proposals if arc in holders]:
+            self._close(votes, holders)
 
     def rename_arc(self, rc: RcName, arc: ArcId, renamed: ArcId) -> None:
-        """An ARC goes on by another name: its votes stand, its proposals stay out."""
-        ballot = self._ballots.get(rc)
-        if ballot is not None:
-            for number in ballot.rename(arc, renamed):
-                self.out[number] = (rc, _renamed(self.out[number][1], arc, renamed))
+        """An ARC goes on by another name: its votes stay in force, its proposals open."""
+        votes = self._by_rc.get(rc)
+        if votes is not None:
+            for number in votes.rename(arc, renamed):
+                self.proposals[number] = (rc, _renamed(self.proposals[number][1], arc, renamed))
 
-    def _close(self, ballot: RcVotes, holders: HolderSet) -> None:
-        ballot.overdue.discard(holders)
-        for number in ballot.out.pop(holders, ()):
-            del self.out[number]
+    def _close(self, votes: RcVotes, holders: HolderSet) -> None:
+        votes.overdue.discard(holders)
+        for number in votes.proposals.pop(holders, ()):
+            del self.proposals[number]

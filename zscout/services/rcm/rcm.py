@@ -186,8 +186,8 @@ class Rcm:
                     self._set_wake(at)
                 case _:
                     pass
-        if news := self.core.strategy.news():
-            log.info("%s", news)
+        if line := self.core.strategy.log_line():
+            log.info("%s", line)
 
     def _set_wake(self, at: Ns | None) -> None:
         """A timer that goes off too early is left alone: most ends are put off before they come."""

@@ -82,20 +82,20 @@ def fit(features: Matrix, behind: Flags, fitted: Flags) -> Rule | None:
     kinds = (truth.sum(), (~truth).sum(), outcome.sum(), (~outcome).sum())
     if min(kinds) < FEWEST:
         return None
-    candidates = list(_candidates(known))
-    if not candidates:
+    conditions = list(_conditions(known))
+    if not conditions:
         return None
     best, foretold = max(
-        ((candidate, candidate.holds(known)) for candidate in candidates),
+        ((condition, condition.holds(known)) for condition in conditions),
         key=lambda pair: _score(pair[1], truth),
     )
-    conditions = [best]
-    second = max(candidates, key=lambda candidate: _score(foretold & candidate.holds(known), truth))
+    chosen = [best]
+    second = max(conditions, key=lambda condition: _score(foretold & condition.holds(known), truth))
     if _score(foretold & second.holds(known), truth) > _score(foretold, truth) + GAIN:
-        conditions.append(second)
-    foretold_there = np.logical_and.reduce([condition.holds(others) for condition in conditions])
+        chosen.append(second)
+    foretold_there = np.logical_and.reduce([condition.holds(others) for condition in chosen])
     return Rule(
-        conditions=tuple(conditions),
+        conditions=tuple(chosen),
         situations=len(outcome),
         hit_rate=float((foretold_there == outcome).mean()),
         base_rate=float(max(outcome.mean(), 1 - outcome.mean())),
@@ -105,7 +105,7 @@ def fit(features: Matrix, behind: Flags, fitted: Flags) -> Rule | None:
     )
 
 
-def _candidates(features: Matrix) -> Iterator[Condition]:
+def _conditions(features: Matrix) -> Iterator[Condition]:
     shares = np.linspace(0, 1, THRESHOLDS + 2)[1:-1]
     for name, column in zip(FEATURES, features.T, strict=True):
         for bound in np.unique(np.quantile(column, shares, method="higher")):

@@ -59,8 +59,8 @@ class _Watched:
         self.strategy, self.clock, self.observer = strategy, clock, observer
         self.took: list[Ns] = []
 
-    def news(self) -> str:
-        return self.strategy.news()
+    def log_line(self) -> str:
+        return self.strategy.log_line()
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
         if self.observer is not None:
