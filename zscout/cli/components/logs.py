@@ -98,22 +98,18 @@ class Reader:
 
     async def follow(self, output: Output) -> None:
         """Writes what comes until it has ended for good."""
-        over = output.over
+        found: Output | None = output
         while True:
-            if over and (self._only or not await self._successor()):
+            # Without an answer its host is gone or busy, or has forgotten it; the placer knows which.
+            silent = found is None
+            if (found is None or found.over) and (self._only or not await self._successor(silent=silent)):
                 break
-            if not over and not output.text:
+            if found is None or not (found.over or found.text):
                 await common.within(READ_EVERY, self._placer.changed)
                 self._placer.changed.clear()
             found = await self._read()
-            if found is None:
-                # Its host is gone or busy, or has forgotten it; the placer knows which.
-                if self._only or not await self._successor(silent=True):
-                    break
-                over = False
-                continue
-            output, over = found, found.over
-            self.write(output.text)
+            if found is not None:
+                self.write(found.text)
         record = self._record
         ended = standing(record) if record is not None and not self._only else "has ended"
         self._tell(f"{self._name} {ended}")
@@ -152,7 +148,7 @@ class Reader:
         self._host = max(found)[1] if found else self._host
         return await self._read() if found else None
 
-    async def _successor(self, *, silent: bool = False) -> bool:
+    async def _successor(self, *, silent: bool) -> bool:
         """Waits until it goes on somewhere, if only where it was and its host is merely `silent`; False: it
         has ended for good. Raises NobodyThere."""
         missed = 0

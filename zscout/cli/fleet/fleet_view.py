@@ -59,13 +59,13 @@ class FleetView:
         self.hosts: dict[str, Host] = {}
         self.changed = asyncio.Event()
         # No component has this name: it only follows which hosts are cordoned, and its answers are short.
-        self._placer = PlacerClient(client.mesh, {"*"})
+        self.placer = PlacerClient(client.mesh, {"*"})
         self._settled = False
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         keys = self.mesh.keys
-        self._stack.enter_context(self._placer)
+        self._stack.enter_context(self.placer)
         for declared in (
             self.mesh.watch(keys.alive_any(), self._on_token),
             self.mesh.subscribe(keys.load_any, LoadReport, self._on_load),
@@ -89,11 +89,6 @@ class FleetView:
         if host is not None:
             host.load, host.reported = load, self.mesh.now()
             self.changed.set()
-
-    @property
-    def cordoned(self) -> frozenset[str]:
-        """Hosts on which nothing is placed, as the placer published or answered last."""
-        return self._placer.cordoned
 
     def forget_gone(self) -> None:
         now = self.mesh.now()
@@ -138,7 +133,7 @@ class FleetView:
         # Without an answer the cordons stay as they were.
         with suppress(TimeoutError, RequestRefused):
             async with asyncio.timeout(ASK_PLACER):
-                await self._placer.try_refresh()
+                await self.placer.try_refresh()
         return await self.client.state(forecast=True) or state
 
 

@@ -146,7 +146,7 @@ class Standing:
         if self.fleet_view.stale(host):
             return "no load report", "yellow"
         words, style = ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
-        return (f"{words}, cordoned", "yellow") if name in self.fleet_view.cordoned else (words, style)
+        return (f"{words}, cordoned", "yellow") if name in self.fleet_view.placer.cordoned else (words, style)
 
     def _devices(self) -> Table:
         """Those that are not well; with `every` also those that report figures."""
@@ -194,7 +194,7 @@ class Standing:
             "rcs": sorted(token.name for token in host.tokens if token.role == Role.RC),
             "clients": sorted({token.name for token in host.tokens if token.role == Role.CLIENT}),
             "components": host.components,
-            "cordoned": name in self.fleet_view.cordoned,
+            "cordoned": name in self.fleet_view.placer.cordoned,
             "alive": bool(host.tokens),
             "gone": None if host.gone is None else (now - host.gone) / SECOND,
             "stale": self.fleet_view.stale(host),

@@ -24,7 +24,7 @@ from zscout.types import SECOND
 if TYPE_CHECKING:
     from zscout.behaviors.perception.motion import Event
     from zscout.cli.operator.picture_recording import WatchRecording
-    from zscout.cli.operator.watch_source import Source
+    from zscout.cli.operator.watch_source import LiveSource, VideoFile
 
 MAX_SECONDS: Final = 1e9
 DRAWN: Final = 0.1
@@ -95,7 +95,7 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
         opened = open_source(source, report.say)
         stack.callback(opened.close)
         if record is not None:
-            report.recording = _recording(stack, opened, record)
+            report.recording = stack.enter_context(_recording(opened.name, record))
         begun = True
         _watch(opened, report, lambda time: bool(ended_by) or (limit is not None and time > limit))
     report.summary()
@@ -103,7 +103,7 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
         raise common.Interrupted(ended_by[0])
 
 
-def _watch(source: Source, report: _WatchReport, over: Callable[[float], bool]) -> None:
+def _watch(source: VideoFile | LiveSource, report: _WatchReport, over: Callable[[float], bool]) -> None:
     from zscout.behaviors.perception.motion import EventTracker, MotionDetector
 
     detector, tracker = MotionDetector(), EventTracker()
@@ -121,7 +121,7 @@ def _watch(source: Source, report: _WatchReport, over: Callable[[float], bool]) 
                 report.recording.seen(time, picture, seen.boxes, moving=seen.moving)
         if ended is not None:
             report.event(ended)
-        report.show(source, tracker.current)
+        report.show(source.duration, tracker.current)
     last = tracker.close()
     if last is not None:
         report.event(last)
@@ -162,7 +162,7 @@ class _WatchReport(LiveLine):
         else:
             terminal.print_line(text, sys.stderr)
 
-    def show(self, source: Source, event: Event | None) -> None:
+    def show(self, duration: float | None, event: Event | None) -> None:
         """The live line, now and then."""
         now = clock.now()
         if not self.watched or now - self._drawn < DRAWN * SECOND:
@@ -170,7 +170,7 @@ class _WatchReport(LiveLine):
         self._drawn = now
         from rich.text import Text
 
-        of = "" if source.duration is None else f" of {span(source.duration)}"
+        of = "" if duration is None else f" of {span(duration)}"
         line = Text(f"{span(self.at)}{of}  {many(self._events, 'event')}  ", no_wrap=True)
         if event is None:
             line.append("still", style="green")
@@ -185,12 +185,12 @@ class _WatchReport(LiveLine):
         terminal.print_line(line, sys.stderr if self._json else sys.stdout)
 
 
-def _recording(stack: ExitStack, source: Source, file: Path) -> WatchRecording:
+def _recording(title: str, file: Path) -> WatchRecording:
     from zscout.cli.operator.picture_recording import WatchRecording
     from zscout.services.recorder.timeline import TimelineError
 
     try:
-        return stack.enter_context(WatchRecording(source.name, file))
+        return WatchRecording(title, file)
     except TimelineError as error:
         raise BadInput(f"--record: {error}") from None
 

@@ -6,7 +6,7 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,9 +14,16 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.motion import MAX_SIDE
 from zscout.config.strict import BadInput, quoted
-from zscout.drivers.capture import FILE_RATE, FILE_RATES, MAX_PIXELS, MISSES, Capture, kind_of, shown
-from zscout.mesh import clock
-from zscout.types import SECOND
+from zscout.drivers.capture import (
+    FILE_RATE,
+    FILE_RATES,
+    MAX_PIXELS,
+    MISSES,
+    Capture,
+    kind_of,
+    seconds,
+    shown,
+)
 
 OPEN_TIMEOUT: Final = 5.0
 READ_TIMEOUT: Final = 2.0
@@ -40,21 +47,7 @@ class Shot(NamedTuple):
     picture: NDArray[np.uint8] | None
 
 
-class Source(Protocol):
-    """A source that is open."""
-
-    name: str
-    duration: float | None
-    """Seconds; None where nobody knows."""
-
-    def shots(self) -> Iterator[Shot]:
-        """All pictures, to the end of the source. A live one gives an empty shot now and then."""
-        ...
-
-    def close(self) -> None: ...
-
-
-def open_source(source: str, report: Callable[[str], None]) -> Source:
+def open_source(source: str, report: Callable[[str], None]) -> VideoFile | LiveSource:
     """Opens a file, URL or device. `report` is given what becomes of a live one. Raises BadInput."""
     if not source or "\0" in source:
         raise BadInput("--source: it is empty; name a file, a URL or a device like /dev/video0")
@@ -101,8 +94,10 @@ class VideoFile:
         self._period = 1 / (rate if FILE_RATES[0] <= rate <= FILE_RATES[1] else FILE_RATE)
         count = self._video.get(cv2.CAP_PROP_FRAME_COUNT)
         self.duration = count * self._period if 1 <= count < 1e9 else None
+        """Seconds; None where nobody knows."""
 
     def shots(self) -> Iterator[Shot]:
+        """All pictures, to the end of the file."""
         picture, zero, last = self._first, self._stamp(), 0.0
         self._first = None
         while picture is not None:
@@ -153,6 +148,7 @@ class LiveSource:
         self._zero = first.time
 
     def shots(self) -> Iterator[Shot]:
+        """All pictures, without end; an empty shot now and then while there are none."""
         number, missing = 0, None
         while True:
             taken = self._capture.wait(number, LOOK)
@@ -164,7 +160,7 @@ class LiveSource:
                 _check(taken.picture, self.name)
                 yield Shot(at, taken.picture)
                 continue
-            now = clock.now() / SECOND - self._zero
+            now = seconds() - self._zero
             health = self._capture.health
             if health != "ok" and missing is None:
                 missing = now
