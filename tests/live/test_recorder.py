@@ -387,7 +387,7 @@ def test_only_the_newest_recordings_are_kept(tmp_path: Path) -> None:
     for path in others:
         path.touch()
         os.utime(path, ns=(0, 0))
-    assert set(prune(tmp_path, "lab", keep=2)) == set(made[:3])
+    prune(tmp_path, "lab", keep=2)
     assert set(tmp_path.iterdir()) == {*made[3:], *others}
 
 

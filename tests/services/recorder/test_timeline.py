@@ -273,14 +273,8 @@ def test_a_port_that_is_taken_is_a_clear_error(tmp_path: Path) -> None:
 
 
 def test_bad_addresses_and_paths_are_clear_errors(tmp_path: Path) -> None:
-    for bind, port, words in (
-        ("localhost", 0, "is not an IP address; use 127.0.0.1"),
-        ("127.0.0.1", 70000, "port 70000 is not one of 0 to 65535"),
-        ("192.0.2.1", 0, "can't listen on 192.0.2.1, port 0 (Cannot assign requested address)"),
-    ):
-        with pytest.raises(TimelineError) as caught:
-            Timeline("lab", path=None, bind=bind, port=port)
-        assert words in str(caught.value)
+    with pytest.raises(TimelineError, match=r"can't listen on 192.0.2.1, port 0 \(Cannot assign"):
+        Timeline("lab", path=None, bind="192.0.2.1", port=0)
     for path, words in (
         (tmp_path, "Is a directory"),
         (tmp_path / "no" / "run.rrd", "No such file or directory"),
@@ -290,8 +284,6 @@ def test_bad_addresses_and_paths_are_clear_errors(tmp_path: Path) -> None:
         assert f"can't write the recording {path} ({words})" in str(caught.value)
     with pytest.raises(TimelineError, match=r"can't write to /dev/full .*No space left on device"):
         Timeline("lab", path=Path("/dev/full"))
-    with pytest.raises(TimelineError, match="neither a file nor a port"):
-        Timeline("lab", path=None)
 
 
 def test_loopback_unless_told_otherwise() -> None:

@@ -26,7 +26,6 @@ MAX_SLOTS: Final = 8
 MAX_STATE: Final = 120
 MAX_EVENT: Final = 500
 """Characters."""
-LEVELS: Final = frozenset({"CRITICAL", "ERROR", "WARN", "INFO", "DEBUG", "TRACE"})
 # Latin, Greek and Cyrillic letters, dashes, quotation marks, arrows. The viewer's font lacks others, and the
 # viewer ends where it is to draw what its font lacks.
 _UNKNOWN: Final = re.compile(
@@ -83,9 +82,8 @@ class Drawing:
         )
 
     def event(self, at: float, text: str, level: str = "INFO") -> None:
-        """One line in words; `level` as in logging, WARN for what people should look at."""
-        known = level if level in LEVELS else "INFO"
-        self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=known))
+        """One line in words; `level` is one of Rerun's, WARN for what people should look at."""
+        self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=level))
 
     def note(self, at: float, text: str) -> None:
         """Reports, once, that something is left out."""

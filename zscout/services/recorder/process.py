@@ -13,7 +13,7 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
@@ -64,12 +64,8 @@ def encode_job(job: RecorderJob) -> bytes:
 
 def decode_job(line: bytes) -> RecorderJob:
     """Raises BadInput."""
-
-    def path(kind: type, value: Any) -> Any:
-        return kind(value)
-
     try:
-        return msgspec.json.decode(line, type=RecorderJob, dec_hook=path)
+        return msgspec.json.decode(line, type=RecorderJob, dec_hook=lambda path, value: path(value))
     except (msgspec.MsgspecError, UnicodeDecodeError, TypeError) as error:
         raise BadInput(f"standard input: no job for a recorder ({error}); let zscout-node start it") from None
 
@@ -101,20 +97,17 @@ def new_recording(folder: Path, fleet: str) -> Path:
     raise BadInput(f"{folder} has {MAX_A_SECOND} recordings of this second; remove some")
 
 
-def prune(folder: Path, fleet: str, keep: int = KEEP) -> list[Path]:
-    """Removes all but the newest `keep` recordings of a fleet; returns those removed.
+def prune(folder: Path, fleet: str, keep: int = KEEP) -> None:
+    """Removes all but the newest `keep` recordings of a fleet.
 
     Nothing is touched that is not named as `new_recording` names files."""
     ours = re.compile(rf"{re.escape(fleet)}-\d{{8}}-\d{{6}}(-\d+)?\.rrd")
-    removed: list[Path] = []
     try:
         found = [path for path in folder.iterdir() if ours.fullmatch(path.name) and path.is_file()]
         for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True)[keep:]:
             path.unlink()
-            removed.append(path)
     except OSError as error:
         log.warning("old recordings in %s can't be removed: %s", folder, error.strerror)
-    return removed
 
 
 class RecorderProcess:
