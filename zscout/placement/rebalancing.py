@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
-from typing import Final
+from typing import Final, TypeAlias
 
 from zscout.placement.balancer import LOAD_TIME
 from zscout.placement.migration import Migrations
@@ -29,19 +29,13 @@ FORGOTTEN: Final[Ns] = 8 * LOAD_TIME
 """After this a thousandth of what left a host is still in its load average."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Change:
-    """A move that would pay: the component runs better by `gain`, as a share of how it runs now."""
-
-    gain: float
-    record: ComponentRecord
-    to: HostName
+_Move: TypeAlias = tuple[ComponentId, HostName]
 
 
 class Rebalancer:
     def __init__(self, state: PlacementState, migrations: Migrations) -> None:
         self.state, self.migrations = state, migrations
-        self._paying: dict[tuple[ComponentId, HostName], Ns] = {}
+        self._paying: dict[_Move, Ns] = {}
         """Since when each move has paid."""
 
     def timer(self) -> None:
@@ -52,23 +46,22 @@ class Rebalancer:
             self._paying.clear()
             return
         found = self._changes()
-        before, self._paying = self._paying, {}
-        for one in found:
-            pair = (one.record.component, one.to)
-            self._paying[pair] = before.get(pair, state.now)
+        before = self._paying
+        self._paying = {move: before.get(move, state.now) for move in found}
         ripe = [
-            one
-            for one in found
-            if state.now - self._paying[one.record.component, one.to] >= state.rules.steady
+            (gain, move)
+            for move, gain in found.items()
+            if state.now - self._paying[move] >= state.rules.steady
         ]
         if ripe:
-            best = max(ripe, key=lambda one: (one.gain, one.record.component, one.to))
+            gain, (component, to) = max(ripe)
             self._paying.clear()
-            state.mark_changed(best.record.component)
-            self.migrations.begin(best.record, best.to, f"where it runs {best.gain:.0%} better")
+            state.mark_changed(component)
+            self.migrations.begin(state.components[component], to, f"where it runs {gain:.0%} better")
 
-    def _changes(self) -> list[_Change]:
-        """All moves that would pay now. Of equal components on one host the first by name stands for all."""
+    def _changes(self) -> dict[_Move, float]:
+        """All moves that would pay now, and by how much the component would run better, as a share of how it
+        runs now. Of equal components on one host the first by name stands for all."""
         state = self.state
         groups: dict[tuple[HostName, RankQuery], ComponentRecord] = {}
         running: Counter[HostName] = Counter()
@@ -81,7 +74,7 @@ class Rebalancer:
                 query = replace(RankQuery.of(spec), metric="composite", policy="pending")
                 groups.setdefault((host, query), record)
         outlook, targets = cache(self._outlook), cache(self._targets)
-        found = []
+        found = {}
         for (host, query), record in groups.items():
             profile = state.balancer.profile(record.spec.kind)
             for target in targets(query):
@@ -91,7 +84,7 @@ class Rebalancer:
                 gain = rate(there, profile) / rate(here, profile) - 1
                 others = running[host] - 1, running[target]
                 if gain >= state.rules.gain and _pays(here, there, profile, others):
-                    found.append(_Change(gain, record, target))
+                    found[record.component, target] = gain
         return found
 
     def _may_leave(self, record: ComponentRecord, host: HostName) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -83,7 +84,9 @@ class ComponentGroup:
         """Kills what is still in it, and removes it."""
         for folder in self.folders:
             for last in range(CLOSE_TRIES):
-                _kill_all(folder)
+                for pid in _numbers(folder / "cgroup.procs"):
+                    with suppress(OSError):
+                        os.kill(pid, signal.SIGKILL)
                 try:
                     folder.rmdir()
                 except FileNotFoundError:
@@ -118,7 +121,7 @@ class ControlGroups:
     def sweep(self) -> None:
         """Removes the groups of nodes that were killed. Not for the event loop."""
         for parent in (self._own("memory"), self._own("cpu"), self._base()):
-            for folder in _folders(parent):
+            for folder in parent.glob(f"{PREFIX}*"):
                 owner = folder.name.removeprefix(PREFIX).partition(".")[0]
                 if owner.isdecimal() and not Path("/proc", owner).exists():
                     with suppress(OSError):
@@ -155,7 +158,7 @@ class ControlGroups:
         return _make(group, base / name, wanted, also)
 
     def _base(self) -> Path:
-        own = group_folders(self._root, self._of.get("", ()))[-1]
+        own = self._own("")
         return own.parent if own.name == LEAF else own
 
 
@@ -211,21 +214,8 @@ def _is_ours(pid: int) -> bool:
         return False
 
 
-def _kill_all(folder: Path) -> None:
-    for pid in _numbers(folder / "cgroup.procs"):
-        with suppress(OSError):
-            os.kill(pid, 9)
-
-
 def _quota(cores: float) -> int:
     return max(LEAST_US, round(cores * PERIOD_US))
-
-
-def _folders(parent: Path) -> list[Path]:
-    try:
-        return [folder for folder in parent.iterdir() if folder.name.startswith(PREFIX)]
-    except OSError:
-        return []
 
 
 def _write(file: Path, text: str) -> None:
