@@ -140,7 +140,9 @@ class ComponentLifecycle:
             if job.start.standby:
                 await _finds(client, Role.RCM, [lambda _: True], LINKED)
                 await self._report(PhaseReport("standby", movable))
-                if not await self._called(client):
+                # Once restored it has as long again to be activated, or handed an ARC.
+                called = self._activated, client.expected_came
+                if not await _first(STAND_BY, *called, self._restored) or not await _first(STAND_BY, *called):
                     return EndReport(
                         "stopped", f"it stood by for {STAND_BY:g} s and nothing was handed to it"
                     )
@@ -166,12 +168,6 @@ class ComponentLifecycle:
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
             raise BadKind(f"it can't be made: {_words(error)}") from None
-
-    async def _called(self, client: Client) -> bool:
-        """Waits until it is to run: it was activated, or handed an ARC."""
-        if await _first(STAND_BY, self._activated, client.expected_came, self._restored):
-            return await _first(STAND_BY, self._activated, client.expected_came)
-        return False
 
     async def _perform(self, client: Client, component: Component, movable: bool) -> EndReport:
         start, host = self._job.start, self._job.host
