@@ -50,9 +50,10 @@ class PtyLine:
     def unplug(self) -> None:
         if self.master >= 0:
             asyncio.get_running_loop().remove_reader(self.master)
+            # First: its number may be another terminal's as soon as it is closed.
+            self.link.unlink()
             os.close(self.master)
             self.master = -1
-            self.link.unlink()
 
     def _read(self) -> None:
         try:
