@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zscout.behaviors.teleop import FIRST, NEXT, SILENT, TURN, Pilot, Way
+from zscout.behaviors.teleop import FIRST, NEXT, STICK_TIMEOUT, TURN, Pilot, Way
 
 WAYS: tuple[Way, ...] = ("forward", "back", "left", "right")
 
@@ -54,7 +54,7 @@ def test_a_stick_counts_until_it_is_let_go_or_silent() -> None:
     pilot = Pilot(0.5)
     pilot.stick(0.0, 1.0, 0.0)
     assert pilot.wheels(0.5).left == 0.5
-    assert pilot.wheels(SILENT).still
+    assert pilot.wheels(STICK_TIMEOUT).still
     pilot.stick(2.0, 0.02, -0.05)
     assert pilot.wheels(2.0).still
     pilot.stick(3.0, math.nan, 7.0)

@@ -235,14 +235,14 @@ def test_no_packet_waits_longer_than_the_bound_however_holders_time_it(
     assert queue.waiting == 0
     if any(share.rate for share in wanted):
         assert commands
-    worst = max((out.through - out.entered for out in commands), default=Fraction(0))
+    worst = max((out.sent_by - out.entered for out in commands), default=Fraction(0))
     assert worst / SECOND <= longest_wait(rate, wanted) <= bound
     # And the line is never given more than it carries, one packet ahead.
     free = Fraction(0)
     for out, written in zip(told.outgoing, told.written, strict=True):
         assert free - written <= MAX_PACKET * SECOND / rate
         free = max(free, Fraction(written)) + len(encode(out.packet)) * SECOND / rate
-        assert free == out.through
+        assert free == out.sent_by
 
 
 def test_one_more_than_accepted_would_break_the_bound() -> None:
@@ -259,7 +259,7 @@ def test_one_more_than_accepted_would_break_the_bound() -> None:
     told = run(queue, SECOND)
     commands = [out for out in told.outgoing if isinstance(out.packet, DrivePacket)]
     assert len(commands) == 13
-    assert max(out.through - out.entered for out in commands) / SECOND > Fraction(9, 10) * BOUND
+    assert max(out.sent_by - out.entered for out in commands) / SECOND > Fraction(9, 10) * BOUND
 
 
 def test_a_faster_holder_replaces_its_own_waiting_packet_and_nobody_elses() -> None:

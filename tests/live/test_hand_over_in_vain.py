@@ -131,8 +131,8 @@ def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
 def test_what_comes_and_nobody_wants_or_does_not_come(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(handover, "CLAIM", 0.2)
-    monkeypatch.setattr(handover, "COME", 0.2)
+    monkeypatch.setattr(handover, "CLAIM_TIMEOUT", 0.2)
+    monkeypatch.setattr(handover, "EXPECT_TIMEOUT", 0.2)
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:

@@ -543,10 +543,10 @@ def test_publications_beyond_a_full_queue_are_counted_as_missed(play: Play) -> N
     play(story)
 
 
-def test_overhear_keeps_the_latest(play: Play) -> None:
+def test_poll_latest_keeps_the_latest(play: Play) -> None:
     async def story(world: World) -> None:
         a, b = await world.open("a", "b")
-        overheard = a.overhear(NEWS, Ping, depth=3)
+        polled = a.poll_latest(NEWS, Ping, depth=3)
         heard: list[int] = []
         a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
         await world.declared()
@@ -555,9 +555,9 @@ def test_overhear_keeps_the_latest(play: Play) -> None:
         b._transport.put(NEWS, b"no JSON", Ping)
         b.put(NEWS, Ping(6))
         await until(lambda: 6 in heard)
-        await until(lambda: list(overheard.each()) == [(NEWS, Ping(4)), (NEWS, Ping(6))])
-        assert overheard.take() == []
-        overheard.close()
+        await until(lambda: list(polled.each()) == [(NEWS, Ping(4)), (NEWS, Ping(6))])
+        assert polled.take() == []
+        polled.close()
 
     play(story)
 

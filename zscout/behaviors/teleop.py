@@ -23,8 +23,8 @@ PERIOD: Final = 0.05
 """Seconds between two looks at the pilot."""
 LONGEST: Final = 0.6
 """Seconds that one command drives at most: a robot whose operator is cut off stops after that."""
-AGAIN: Final = 1.0
-"""Seconds before it is asked for again after a refusal."""
+RETRY_AFTER: Final = 1.0
+"""Seconds before the robot is asked for again after a refusal."""
 
 ASKS_AGAIN: Final = frozenset({"preempted", "lost"})
 """Ends of a hold after which the robot is still wanted; others mean that somebody ended it on purpose."""
@@ -34,7 +34,7 @@ NEXT: Final = 0.25
 """Seconds that each repetition does."""
 REPEATS: Final = 0.55
 """Seconds within which the same key again is a repetition."""
-SILENT: Final = 1.0
+STICK_TIMEOUT: Final = 1.0
 """Seconds that a stick counts without a report."""
 TURN: Final = 0.5
 """Share of the speed at which the robot turns on the spot: a full turn would be too quick to aim."""
@@ -76,8 +76,8 @@ class Pilot:
     A terminal reports no releases: a key that is held down comes again and again, first after a delay of a
     quarter to half a second, then some 30 times a second. So a press drives for FIRST seconds, which bridges
     the delay, a repetition for NEXT, and a released key stops the robot by itself soon after. A stick reports
-    where it stands; that counts until it reports otherwise, and a pad without reports counts as released
-    after SILENT.
+    its position; that counts until it reports otherwise, and a pad without reports counts as released
+    after STICK_TIMEOUT.
     """
 
     def __init__(self, speed: float = 0.6) -> None:
@@ -126,10 +126,10 @@ class Pilot:
             return Wheels(self.speed * left / most, self.speed * right / most, lasts)
         if self._stick is not None:
             at, forward, across = self._stick
-            if now - at < SILENT and (forward or across):
+            if now - at < STICK_TIMEOUT and (forward or across):
                 left, right = forward + TURN * across, forward - TURN * across
                 most = max(1.0, abs(left), abs(right))
-                return Wheels(self.speed * left / most, self.speed * right / most, SILENT - (now - at))
+                return Wheels(self.speed * left / most, self.speed * right / most, STICK_TIMEOUT - (now - at))
         return STOP
 
 
@@ -183,10 +183,10 @@ class Teleop:
 
     async def run(self) -> None:
         """Takes, drives and gives back, until it is cancelled. Then the robot is given back, too."""
-        self.client.watch(self._on_word)
+        self.client.watch(self._on_notice)
         while True:
             await self._wanted.wait()
-            self._be("waiting", "for the RCM")
+            self._set_state("waiting", "for the RCM")
             why = ""
             try:
                 await self._while_wanted(self._drive())
@@ -195,26 +195,26 @@ class Teleop:
                     why = f"it was taken by {self._successor() or 'another'}"
                     self.give_back()
             except Revoked as revoked:
-                self._be("waiting", f"it was taken away: {revoked}")
+                self._set_state("waiting", f"it was taken away: {revoked}")
                 if revoked.outcome not in ASKS_AGAIN:
                     why = str(revoked)
                     self.give_back()
             except (CommandRefused, RequestRefused) as refused:
-                self._be("waiting", str(refused))
-                await asyncio.sleep(AGAIN)
+                self._set_state("waiting", str(refused))
+                await asyncio.sleep(RETRY_AFTER)
             finally:
                 self.robot = self.held = None
             if not self._wanted.is_set():
-                self._be("free", why)
+                self._set_state("free", why)
 
     def _successor(self) -> str:
-        """The ARC that has it now, as the last word about ours said."""
+        """The ARC that has the robot now, by the last notice of our ARC."""
         ending = self._arc.ending if self._arc is not None else None
         return ending.by or ending.reason if ending is not None else ""
 
-    def _on_word(self, arc: OpenArc) -> None:
+    def _on_notice(self, arc: OpenArc) -> None:
         if arc.name == self._name and arc.state == "queued" and self.state == "waiting" and arc.reason:
-            self._be("waiting", arc.reason)
+            self._set_state("waiting", arc.reason)
 
     async def _while_wanted(self, work: Coroutine[Any, Any, None]) -> None:
         """Does `work`, and ends it when the robot is not wanted any more."""
@@ -239,7 +239,7 @@ class Teleop:
         ) as held:
             robot = self.robot = HeldRobot(held, self.needs)
             self.held, self._arc = held, held.arc
-            self._be("driving", "")
+            self._set_state("driving", "")
             # The wheels go first: whoever takes over in a hurry does not wait for the camera.
             await self._steer(robot)
             while True:
@@ -257,7 +257,7 @@ class Teleop:
             self.takeover = (self.client.mesh.now() - self._asked_at) / SECOND
             self._changed()
 
-    def _be(self, state: State, why: str) -> None:
+    def _set_state(self, state: State, why: str) -> None:
         if (state, why) != (self.state, self.why):
             self.state, self.why = state, why
             self._changed()

@@ -31,8 +31,8 @@ MAX_DEPTH: Final = 8
 MAX_CHILDREN: Final = 64
 MAX_RATE: Final = 20
 """Publications of one client in a second; alerts and ends are always published."""
-AGAIN: Final = 5.0
-"""Seconds after which all that stands is published again."""
+REPUBLISH_EVERY: Final = 5.0
+"""Seconds after which the status of every behavior that has not ended is published again."""
 MAX_PATH: Final = 200
 MAX_WORD: Final = 64
 
@@ -164,7 +164,7 @@ class StatusPublisher:
         keys, me, self._now = client.mesh.keys, client.mesh.me, client.mesh.now
         self._publisher = client.mesh.publisher(keys.behavior(me), BehaviorSaid)
         self._published: deque[Ns] = deque(maxlen=MAX_RATE)
-        self._standing: dict[str, BehaviorSaid] = {}
+        self._current: dict[str, BehaviorSaid] = {}
 
     def __call__(self, status: BehaviorSaid) -> None:
         status = replace(
@@ -177,12 +177,12 @@ class StatusPublisher:
             boxes=status.boxes[:MAX_BOXES],
         )
         if status.doing:
-            self._standing[status.path] = replace(status, alert=False, boxes=[], camera="")
+            self._current[status.path] = replace(status, alert=False, boxes=[], camera="")
         else:
-            self._standing.pop(status.path, None)
+            self._current.pop(status.path, None)
         now = self._now()
         crowded = len(self._published) == MAX_RATE and now - self._published[0] < SECOND
-        # One that is withheld is published later, if it still stands then.
+        # One that is withheld is published later, if it is still the newest then.
         if not crowded or not status.doing or status.alert:
             self._published.append(now)
             self._publisher.put(status)
@@ -190,8 +190,8 @@ class StatusPublisher:
     async def keep_publishing(self) -> None:
         """Publishes now and then what each behavior does, for new subscribers."""
         while True:
-            await asyncio.sleep(AGAIN)
-            for status in list(self._standing.values()):
+            await asyncio.sleep(REPUBLISH_EVERY)
+            for status in list(self._current.values()):
                 self._publisher.put(status)
 
     def close(self) -> None:

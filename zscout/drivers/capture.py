@@ -81,7 +81,7 @@ class Capture:
         """How often an open source gave nothing for `read_timeout`."""
         self._open_timeout, self._read_timeout = open_timeout, read_timeout
         self._stop = threading.Event()
-        self._news = threading.Condition()
+        self._new_picture = threading.Condition()
         self._newest: CapturedFrame | None = None
         self._taken = True
         self._due = 0.0
@@ -94,8 +94,8 @@ class Capture:
         """Ends the reading, and waits at most `wait` seconds for it: a thread that OpenCV holds up ends by
         itself at the source's timeout."""
         self._stop.set()
-        with self._news:
-            self._news.notify_all()
+        with self._new_picture:
+            self._new_picture.notify_all()
         self._thread.join(wait)
 
     @property
@@ -106,8 +106,8 @@ class Capture:
     def wait(self, after: int, timeout: float) -> CapturedFrame | None:
         """The newest picture with a number above `after`, as soon as there is one; None if none came within
         `timeout` seconds, or when the capture was stopped."""
-        with self._news:
-            self._news.wait_for(lambda: self.number > after or self._stop.is_set(), timeout)
+        with self._new_picture:
+            self._new_picture.wait_for(lambda: self.number > after or self._stop.is_set(), timeout)
             if self._stop.is_set() or self.number <= after:
                 return None
             self._taken = True
@@ -171,14 +171,14 @@ class Capture:
     def _keep(self, picture: NDArray[np.uint8]) -> None:
         if self.health != "ok":
             log.info("%s gives pictures", shown(self.source))
-        with self._news:
+        with self._new_picture:
             if not self._taken:
                 self.dropped += 1
             self._taken = False
             self.number += 1
             self._newest = CapturedFrame(self.number, seconds(), picture)
             self.health = "ok"
-            self._news.notify_all()
+            self._new_picture.notify_all()
 
     def _ended(self, waited: float) -> None:
         """A source that was open gives no more pictures."""

@@ -13,7 +13,7 @@ from zscout.types import SECOND, Ns
 
 NODE: Final = "node"
 """The client name of a node."""
-LATELY: Final[Ns] = 10 * SECOND
+DEPARTED_RC_GRACE: Final[Ns] = 10 * SECOND
 """A node that ends sends its last command for an RC after the token of that RC has gone."""
 
 
@@ -123,7 +123,7 @@ class RcDirectory:
                 self._tokens.pop(token.name, None)
             now = self._mesh.now()
             self._recent = {key: until for key, until in self._recent.items() if until > now}
-            self._recent[token.host, token.name] = now + LATELY
+            self._recent[token.host, token.name] = now + DEPARTED_RC_GRACE
         if self._on_change is not None:
             self._on_change()
 

@@ -42,7 +42,7 @@ CHECK: Final = 0.2
 """Seconds from one look at the source to the next."""
 MAX_AGE: Final = 1.0
 """Seconds; an older picture is not published as if it were new."""
-PATIENCE: Final = 0.25
+FRAME_WAIT: Final = 0.25
 """Seconds from one look at whether it should stop to the next, where no pictures come."""
 EARLY: Final = Fraction(1, 2)
 """Share of the interval between two frames by which one may come early."""
@@ -346,7 +346,7 @@ class FramePump:
 
     def _run(self) -> None:
         while not self._stopped:
-            captured = self._capture.wait(self._after, PATIENCE)
+            captured = self._capture.wait(self._after, FRAME_WAIT)
             if captured is None:
                 if not self._capture.alive:
                     return

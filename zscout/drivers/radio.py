@@ -183,7 +183,7 @@ class RadioDriver(Driver):
                 self._outstanding += 1
             self._counts.update(packets=1, bytes=len(data), repeats=outgoing.repeat)
             if not outgoing.repeat:
-                self._waits.append(outgoing.through - outgoing.entered)
+                self._waits.append(outgoing.sent_by - outgoing.entered)
         if not self._air.urgent:
             self._quiet.set()
         at = self._air.wake(self._rc.mesh.now())

@@ -64,7 +64,7 @@ class WorkQueue:
         self._commands: deque[CommandQuery] = deque()
         self._early: list[tuple[str, CommandQuery]] = []
         """With the sender's host, in the order of arrival."""
-        self._news = asyncio.Event()
+        self._wakeup = asyncio.Event()
 
     @property
     def commands(self) -> int:
@@ -73,11 +73,11 @@ class WorkQueue:
 
     def put_change(self, change: HoldChange) -> None:
         self._changes.append(change)
-        self._news.set()
+        self._wakeup.set()
 
     def put_command(self, command: CommandQuery) -> None:
         self._commands.append(command)
-        self._news.set()
+        self._wakeup.set()
 
     def set_aside(self, command: CommandQuery, host: str) -> bool:
         """Keeps a command for `resume`. False: too many of this host are kept already."""
@@ -92,7 +92,7 @@ class WorkQueue:
         self._early = [early for early in self._early if early not in found]
         self._commands.extendleft(command for _, command in reversed(found))
         if found:
-            self._news.set()
+            self._wakeup.set()
 
     def drop_early(self) -> list[CommandQuery]:
         """Commands that are set aside still, which are no longer kept."""
@@ -102,8 +102,8 @@ class WorkQueue:
     async def get(self) -> HoldChange | CommandQuery:
         """The next change or command, once there is one."""
         while not (self._changes or self._commands):
-            self._news.clear()
-            await self._news.wait()
+            self._wakeup.clear()
+            await self._wakeup.wait()
         return self._changes.popleft() if self._changes else self._commands.popleft()
 
 

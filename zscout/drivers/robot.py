@@ -75,8 +75,8 @@ class RobotDriver(Driver):
         self._dead_man = dead_man
         self._waiting: deque[_Waiting] = deque()
         self._timer: asyncio.TimerHandle | None = None
-        self._standing_at: Ns | None = 0
-        """When the wheels stand by themselves; None: unknown, a drive command is under way."""
+        self._stopped_at: Ns | None = 0
+        """When the wheels stop by themselves; None: unknown, a drive command is under way."""
         self._unsure = asyncio.Event()
         self._unsure.set()
         self._wake = asyncio.Event()
@@ -166,13 +166,13 @@ class RobotDriver(Driver):
     async def _send(self, waiting: _Waiting) -> None:
         began, order = self._mesh.now(), waiting.order
         if isinstance(order, RadioDrive):
-            self._standing_at = None
+            self._stopped_at = None
         reply = await self._ask_radio(waiting.radio, order, waiting.grant, ANSWER)
         self._latencies.append((self._mesh.now() - began) / SECOND)
         if reply is not None and reply.message is not None:
             result = reply.message.result
-            if isinstance(order, RadioDrive) and self._standing_at is None:
-                self._standing_at = self._mesh.now() + round((_after(result) + order.lasts) * SECOND)
+            if isinstance(order, RadioDrive) and self._stopped_at is None:
+                self._stopped_at = self._mesh.now() + round((_after(result) + order.lasts) * SECOND)
             waiting.resolve(result)
             return
         self._counts["refused"] += 1
@@ -204,22 +204,22 @@ class RobotDriver(Driver):
         await self._send_urgent(RadioHalt(self._id, self._rc.name), HALT_TRIES)
 
     def _restart_dead_man(self, *, turns: bool) -> None:
-        """A command for the wheels arrived: the dead man's clock begins anew, or stands."""
+        """A command for the wheels arrived: the dead man's clock begins anew, or is stopped."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._standing_at = None if turns else 0
+        self._stopped_at = None if turns else 0
         if turns:
             self._timer = self._rc.supervisor.call_later(self._dead_man, self._stop_unattended)
 
     def _stop_unattended(self) -> None:
         """Commands ceased."""
         self._timer = None
-        if self._standing_at is not None and self._standing_at <= self._mesh.now():
+        if self._stopped_at is not None and self._stopped_at <= self._mesh.now():
             return
         self._counts["dead_man_stops"] += 1
         self._drop(Refused("stale", "it waited too long for the radio"), RadioDrive)
-        self._standing_at = 0
+        self._stopped_at = 0
         self._rc.supervisor.spawn(self._send_urgent(RadioStop(self._id, self._rc.name), HALT_TRIES))
 
     async def _send_urgent(self, order: RadioStop | RadioHalt, tries: int) -> bool:

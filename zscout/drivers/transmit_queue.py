@@ -6,7 +6,7 @@ replaced by the holder's next one for the same robot: the newest command is the 
 
 Stop, camera and halt packets go out several times, since nobody acknowledges. A repeat has the number of its
 original, so that the robot obeys once. Where something else went to the robot in between, it gets a number of
-its own: it then repeats what still stands. What a newer packet has overtaken is not repeated: after a drive
+its own: it then repeats what still applies. What a newer packet has overtaken is not repeated: after a drive
 command nothing of a halt is left but "transmitter off".
 """
 
@@ -49,24 +49,24 @@ class QueuedPacket:
 
     place: Place
     grant: Grant
-    order: RadioDrive | RadioCamera
+    command: RadioDrive | RadioCamera
     arrived: Ns
     entered: Fraction = Fraction(0)
     queued: bool = False
 
     @property
     def size(self) -> int:
-        return MAX_PACKET if isinstance(self.order, RadioDrive) else OVERHEAD + 1
+        return MAX_PACKET if isinstance(self.command, RadioDrive) else OVERHEAD + 1
 
 
 @dataclass(frozen=True, slots=True)
 class OutgoingPacket:
-    """A packet to be written now. `through`: when the line has carried it; `entered`: when it stood in the
+    """A packet to be written now. `sent_by`: when the line has carried it; `entered`: when it stood in the
     queue, its bucket passed; of a repeat, when it was due."""
 
     packet: Packet
     entered: Fraction
-    through: Fraction
+    sent_by: Fraction
     repeat: bool
 
 
@@ -117,7 +117,7 @@ class _Robot:
 
 
 def _remainder(repeat: _Repeat, newer: Packet) -> _Repeat | None:
-    """What of `repeat` still stands once `newer` was sent."""
+    """What of `repeat` still applies once `newer` was sent."""
     match repeat.packet, newer:
         case (
             (_, HaltPacket())
@@ -132,7 +132,7 @@ def _remainder(repeat: _Repeat, newer: Packet) -> _Repeat | None:
     return repeat
 
 
-class _Member:
+class _HolderQueue:
     """A holder: its bucket, what waits for it, and the robots that it has made do something."""
 
     def __init__(self, share: Share, now: Ns, *, full: bool) -> None:
@@ -166,7 +166,7 @@ class TransmitQueue:
         self._ahead = MAX_PACKET * self._ns_per_byte
         """How much earlier than the line is free the next packet is written: one waits in the kernel."""
         self._free_at = Fraction(0)
-        self.members: dict[Place, _Member] = {}
+        self.members: dict[Place, _HolderQueue] = {}
         self._queue: deque[QueuedPacket] = deque()
         self._urgent: dict[int, tuple[type[StopPacket] | type[HaltPacket], Ns]] = {}
         self._robots: dict[int, _Robot] = {}
@@ -181,7 +181,7 @@ class TransmitQueue:
     def join(self, place: Place, share: Share, now: Ns) -> None:
         """A holder begins. On a busy line it earns its first packet, so that the bound holds for all."""
         if place not in self.members:
-            self.members[place] = _Member(share, now, full=not self._queue and not self._urgent)
+            self.members[place] = _HolderQueue(share, now, full=not self._queue and not self._urgent)
             self._fit_reserve()
 
     def leave(self, place: Place) -> set[int]:
@@ -198,27 +198,27 @@ class TransmitQueue:
 
     # What is to be sent
 
-    def offer(self, place: Place, grant: Grant, order: RadioDrive | RadioCamera, now: Ns) -> Ns:
+    def offer(self, place: Place, grant: Grant, command: RadioDrive | RadioCamera, now: Ns) -> Ns:
         """A drive or camera packet of a holder that has joined. Returns in about how many ns it is through.
 
         Raises Refused where too much of the holder waits, or its share has no room for such a packet."""
         member = self.members[place]
-        waiting = QueuedPacket(place, grant, order, now)
+        waiting = QueuedPacket(place, grant, command, now)
         if member.bucket is None:
             raise Refused("bad_command", "this ARC asked for command_rate 0: only stops and halts go out")
         if waiting.size > member.share.size:
             sizes = f"{waiting.size} bytes, and this ARC asked for {float(member.share.size):g}"
             raise Refused("bad_command", f"this packet has {sizes}; ask for packet_size = {MAX_PACKET}")
         self._release(now)
-        if isinstance(order, RadioDrive):
+        if isinstance(command, RadioDrive):
             # Driven under a newer hold: the end of an older one that is learned of late halts it no more.
             for other in self.members.values():
-                other.robots.discard(order.robot)
-        member.robots.add(order.robot)
+                other.robots.discard(command.robot)
+        member.robots.add(command.robot)
         for earlier in chain(self._queue, member.waiting):
-            same = earlier.place == place and earlier.order.robot == order.robot
-            if same and type(earlier.order) is type(order):
-                earlier.order, earlier.grant = order, grant
+            same = earlier.place == place and earlier.command.robot == command.robot
+            if same and type(earlier.command) is type(command):
+                earlier.command, earlier.grant = command, grant
                 self.replaced += 1
                 waiting = earlier
                 break
@@ -242,7 +242,8 @@ class TransmitQueue:
         halt camera packets too. Returns in about how many ns it is through."""
         self.replaced += self._remove(
             lambda waiting: (
-                waiting.order.robot == robot and (kind is HaltPacket or isinstance(waiting.order, RadioDrive))
+                waiting.command.robot == robot
+                and (kind is HaltPacket or isinstance(waiting.command, RadioDrive))
             )
         )
         first, since = self._urgent.get(robot, (kind, now))
@@ -287,12 +288,12 @@ class TransmitQueue:
             if not stands(waiting.grant):
                 self.dropped += 1
                 continue
-            order, number = waiting.order, self._robot(waiting.order.robot).number()
+            command, number = waiting.command, self._robot(waiting.command.robot).number()
             packet: Packet
-            if isinstance(order, RadioDrive):
-                packet = DrivePacket(order.robot, number, order.left, order.right, order.lasts)
+            if isinstance(command, RadioDrive):
+                packet = DrivePacket(command.robot, number, command.left, command.right, command.lasts)
             else:
-                packet = CameraPacket(order.robot, number, order.channel)
+                packet = CameraPacket(command.robot, number, command.channel)
             return self._transmit(packet, waiting.entered, now)
         for member in self.members.values():
             # Nothing waits: whoever joined while something did may have its packet now.

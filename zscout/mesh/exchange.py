@@ -104,7 +104,7 @@ class Declaration:
             undeclare()
 
 
-class Overheard(Declaration, Generic[S]):
+class PolledSubscription(Declaration, Generic[S]):
     """The latest publications on a key, kept outside the event loop until they are taken."""
 
     def __init__(

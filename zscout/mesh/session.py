@@ -22,7 +22,7 @@ from zscout.mesh.exchange import (
     Backlog,
     Declaration,
     IncomingQuery,
-    Overheard,
+    PolledSubscription,
     Publisher,
     Refused,
     Reply,
@@ -38,8 +38,8 @@ INBOX_DEPTH = 20_000
 """Items of all kinds that may wait for the event loop."""
 BURST = 256
 """Items that are handled in one go at most, those included that arrive meanwhile."""
-OVERHEARD = 32
-"""Publications that `overhear` keeps."""
+RING_DEPTH = 32
+"""Publications that `poll_latest` keeps."""
 FINAL_SLACK = 0.5
 """Seconds after its timeout at which a query is over though the transport has not reported that."""
 
@@ -357,10 +357,10 @@ class Mesh:
 
         return self._transport.subscriber(key, on_sample)
 
-    def overhear(self, key: str, kind: type[S], *, depth: int = OVERHEARD) -> Overheard[S]:
+    def poll_latest(self, key: str, kind: type[S], *, depth: int = RING_DEPTH) -> PolledSubscription[S]:
         """Keeps the latest `depth` publications on `key`, without waking the event loop, until they are
         taken."""
-        return Overheard(*self._transport.ring(key, depth), kind, depth)
+        return PolledSubscription(*self._transport.ring(key, depth), kind, depth)
 
     # Frames
 
@@ -375,11 +375,12 @@ class Mesh:
     # Liveliness
 
     def alive(self, token: Token) -> Declaration:
-        """Declares a liveliness token, until it is closed or this process is gone."""
+        """Declares the liveliness token: it lives until the declaration is closed or this process is gone."""
         return Declaration(self._transport.token(self.keys.alive(token)))
 
     def watch(self, key: str, handler: Callable[[Token, bool], None]) -> Declaration:
-        """Calls `handler(token, alive)` for tokens on `key`, those that live already included."""
+        """Subscribes to liveliness: calls `handler(token, alive)` for each token on `key` that comes or
+        goes, and for those that live already."""
         state = Backlog()
 
         def on_token(text: str, alive: bool) -> None:
@@ -393,7 +394,7 @@ class Mesh:
         return _closing(state, self._transport.token_subscriber(key, on_token))
 
     async def living(self, key: str, *, timeout: float) -> list[Token]:
-        """The tokens on `key` that live now, sorted."""
+        """Queries liveliness once: the tokens on `key` that live now, sorted."""
         found: set[str] = set()
 
         def on_reply(text: str, *_: object) -> bool:

@@ -194,7 +194,7 @@ class StallWatch:
 
     def start(self) -> Self:
         self._last = self._now()
-        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD, self._beat)
+        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD, self._sample_clock)
         return self
 
     def stop(self) -> None:
@@ -221,6 +221,6 @@ class StallWatch:
         self.check()
         return bool(self.length) and self._now() - self.ended <= AFTERMATH
 
-    def _beat(self) -> None:
+    def _sample_clock(self) -> None:
         self.check()
-        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD, self._beat)
+        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD, self._sample_clock)

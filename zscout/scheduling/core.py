@@ -3,7 +3,7 @@
 Every decision of the RCM is made in this room, and this is its door; there is no clock, thread, socket or
 log inside. This module applies events and carries out what is decided; who starts, and who is preempted for
 it, is decided by the strategy's pass (`priority.py` has its steps), ARC by ARC, by the
-rule of `Arc.preemptible_by`; what RCs voted stands in `votes.py`, who holds what in `state.py`. The RCM
+rule of `Arc.preemptible_by`; what RCs voted is in `votes.py`, who holds what in `state.py`. The RCM
 service, `zscout replay`, the study and the forecast drive this one class:
 
     effects = core.handle(now, Requested(request), ...)
@@ -85,7 +85,7 @@ class Core:
         self._set_wake()
         return self._effects
 
-    # How things stand
+    # The present state
 
     def status(self, limit: int | None = None) -> Status:
         """The whole fleet as of the last batch, with the best-ranked `limit` of the queue (all: None)."""
@@ -128,17 +128,17 @@ class Core:
         state = self._state
         return [arc.id for arc in (*state.running.values(), *state.queued.values()) if arc.place == place]
 
-    def given(self, place: Place) -> bool:
-        """Whether `place` may have been given; of earlier terms the core does not know."""
+    def could_have_issued(self, place: Place) -> bool:
+        """Whether this core may have given out `place`; True for other terms, of which it does not know."""
         return place.term != self.term or place.arrival <= self._arrivals
 
     def as_events(self, term: Term) -> tuple[list[on.Event], on.LeadTaken]:
-        """The events by which another core comes to stand as this one does, in a term of its own."""
+        """The events that bring another core to the state of this one, in a term of its own."""
         state = self._state
         joined: list[on.Event] = [
             on.RcJoined(rc.name, rc.sharable) for rc in state.rcs.values() if rc.present
         ]
-        standing = tuple(
+        recovered_holds = tuple(
             on.RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
             for arc in state.running.values()
             if arc.hold is not None
@@ -146,7 +146,7 @@ class Core:
         waiting = tuple(
             on.RecoveredRequest(arc.request, arc.place, arc.since) for arc in state.queued.values()
         )
-        return joined, on.LeadTaken(term, standing, waiting)
+        return joined, on.LeadTaken(term, recovered_holds, waiting)
 
     def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
         """Whether an RC would accept these holders, by the votes that it has given; True if unknown."""
@@ -206,8 +206,8 @@ class Core:
                     self._end_request(lost, Outcome.CLIENT_LOST, why)
             case on.HandedOver(arc, to, renamed):
                 self._hand_over(arc, to, renamed)
-            case on.LeadTaken(term, standing, waiting):
-                self._take_lead(term, standing, waiting)
+            case on.LeadTaken(term, recovered_holds, waiting):
+                self._take_lead(term, recovered_holds, waiting)
             case on.Tick():
                 pass
 
@@ -252,19 +252,19 @@ class Core:
         self._votes.forget_rc(name)
 
     def _hand_over(self, arc_id: ArcId, to: str, renamed: ArcId) -> None:
-        arc, twin = self._state.arc(arc_id), self._state.arc(renamed)
-        if arc is None or arc is twin:
+        arc, existing = self._state.arc(arc_id), self._state.arc(renamed)
+        if arc is None or arc is existing:
             return
         reason = Reason(ReasonCode.HANDED_OVER, detail=to)
-        if twin is not None:
+        if existing is not None:
             # Where a change of RCM hid the outcome, both clients may have reported the one ARC.
-            if twin.place != arc.place:
+            if existing.place != arc.place:
                 return
-            if twin.hold is not None or arc.hold is None:
+            if existing.hold is not None or arc.hold is None:
                 self._end_request(arc_id, Outcome.HANDED_OVER, reason)
                 return
-            self._state.dequeue(twin)
-            self._forget(twin)
+            self._state.dequeue(existing)
+            self._forget(existing)
         if arc.hold is None:
             self._effects.append(Dropped(arc.id, arc.request.client, Outcome.HANDED_OVER, reason))
         else:
@@ -280,13 +280,16 @@ class Core:
             self._effects.append(Queued(arc.id, to, arc.reason))
 
     def _take_lead(
-        self, term: Term, standing: tuple[on.RecoveredHold, ...], waiting: tuple[on.RecoveredRequest, ...]
+        self,
+        term: Term,
+        recovered_holds: tuple[on.RecoveredHold, ...],
+        waiting: tuple[on.RecoveredRequest, ...],
     ) -> None:
         if term <= self.term:
             raise ValueError(f"the new term {term} is not above {self.term}")
         self.term, self.seq, self._arrivals = term, 0, 0
         # The newest grant is the truth where two claim one exclusive RC.
-        for held in sorted(standing, key=lambda held: held.grant, reverse=True):
+        for held in sorted(recovered_holds, key=lambda held: held.grant, reverse=True):
             if self._state.arc(held.request.arc) is not None:
                 continue
             arc = self._new_arc(held.request, held.place)
@@ -337,7 +340,7 @@ class Core:
         return arc.id in self._state.queued
 
     def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None:
-        # A reason given before stands while votes are out: it would change back and forth otherwise.
+        # An earlier reason is kept while proposals are open: it would change back and forth otherwise.
         if reason == arc.reason or (not settled and arc.reason):
             return
         arc.reason = reason

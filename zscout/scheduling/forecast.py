@@ -45,10 +45,10 @@ class Forecast:
 def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecast:
     """Plays `core` forward from `now`, with `newcomer` asking at once. `core` is not touched."""
     # A strategy may keep unfinished searches: the forecast must not meddle with them.
-    twin = Core(STRATEGIES[core.strategy.name](), core.policy)
+    copy = Core(STRATEGIES[core.strategy.name](), core.policy)
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
     result = Forecast()
-    ends = {held.request.arc: held.end for held in lead.standing}
+    ends = {held.request.arc: held.end for held in lead.recovered_holds}
     unserved = {one.request.arc for one in lead.waiting}
     """ARCs that are queued and have not started within what was played."""
 
@@ -57,12 +57,12 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
 
     def step(events: list[Event], preempting: ArcId | None = None) -> None:
         """One instant."""
-        for effect in itertools.chain.from_iterable(play_instant(twin, now, events, vote)):
+        for effect in itertools.chain.from_iterable(play_instant(copy, now, events, vote)):
             match effect:
                 case Granted(arc=arc, start=start):
                     result.starts.setdefault(arc, start)
                     unserved.discard(arc)
-                    running = twin.arc(arc)
+                    running = copy.arc(arc)
                     if running is not None and running.hold is not None:
                         ends[arc] = running.hold.end
                 case HoldEnded(arc=arc, outcome=outcome, by=by, requeued=requeued):
@@ -81,11 +81,11 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
     if newcomer is not None:
         unserved.add(newcomer.arc)
         step([Requested(newcomer)], newcomer.arc)
-        asking = twin.arc(newcomer.arc)
+        asking = copy.arc(newcomer.arc)
         result.reason = asking.reported if asking is not None else None
     checks = 0
     while ends and unserved:
-        checks += twin.waiting
+        checks += copy.waiting
         if checks > MAX_CHECKS:
             break
         now = max(now, min(ends.values()))

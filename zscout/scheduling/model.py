@@ -1,5 +1,5 @@
 """What the scheduling core takes, keeps and gives: requests and resource controllers (RCs); events that
-it is given, its effects, in the order in which they must be done, and how things stand.
+it is given, its effects, in the order in which they must be done, and the present state.
 
 Times are whole nanoseconds on one clock of the caller's choice; nothing here reads a clock. Bandwidth
 parameters are `Fraction`, so that sums are exact (0.1 + 0.2 is 0.3).
@@ -67,7 +67,7 @@ class Hold:
 
 
 class ArcState(StrEnum):
-    """Where an ARC stands. All between NEW and RUNNING are queued; `QueueIndex` says what follows."""
+    """The state of an ARC. All between NEW and RUNNING are queued; `QueueIndex` says what follows."""
 
     NEW = "new"
     READY = "ready"
@@ -305,7 +305,7 @@ class HandedOver:
 
 @dataclass(frozen=True, slots=True)
 class RecoveredHold:
-    """A hold that stood when an RCM took the lead: its grant is kept, `end` is on the core's clock."""
+    """A hold that was in force when an RCM took the lead: its grant is kept, `end` is on the core's clock."""
 
     request: ArcRequest
     place: Place
@@ -331,10 +331,10 @@ class RecoveredRequest(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LeadTaken:
-    """This RCM leads from now on, in `term`, over the holds and the queue that stood."""
+    """This RCM leads from now on, in `term`, over the holds and the queue that it recovered."""
 
     term: Term
-    standing: tuple[RecoveredHold, ...] = ()
+    recovered_holds: tuple[RecoveredHold, ...] = ()
     waiting: tuple[RecoveredRequest, ...] = ()
 
 
@@ -446,7 +446,7 @@ class WakeAt:
 Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | WakeAt
 
 
-# How things stand after the last batch of events
+# The state after the last batch of events
 
 
 @dataclass(frozen=True, slots=True)

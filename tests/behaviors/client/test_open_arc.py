@@ -205,7 +205,7 @@ def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_lat
         store.resumed.clear()
         gone = notice(9, "ended", outcome="handed_over", grant=FIRST)
         store.take(known, gone)
-        assert (known.state, store.standing) == ("running", [known])
+        assert (known.state, store.acknowledged) == ("running", [known])
         store.move(known, notice(10, "running", client="h/new", grant=SECOND_GRANT))
         assert (store.open, store.moved, known.last) == ([], {"id": known}, (TERM, 10))
         # What is expected is told of without a place: the RCs decide whose it is.

@@ -81,7 +81,7 @@ def test_a_placer_that_never_answers_is_given_up_after_the_patience() -> None:
         loop = asyncio.get_running_loop()
         before = loop.time()
         with pytest.raises(PlacerSilent, match="of fleet test did not answer for 15 s; see zscout status"):
-            await PlacerClient(placer.client, patience=15.0).request(ListPlacements(), Placements)
+            await PlacerClient(placer.client, timeout=15.0).request(ListPlacements(), Placements)
         assert 15 <= loop.time() - before <= 21
 
     run(story())

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from zscout.behaviors.sensor_net.net import PATIENCE, RETRY, Effect, SensorNet, StartRobot
+from zscout.behaviors.sensor_net.net import ABSENCE_TIMEOUT, RETRY, Effect, SensorNet, StartRobot
 
 STORIES = {
     "all that are wanted begin once they are there": """
@@ -133,7 +133,7 @@ def test_as_many_as_wanted_are_at_it_whenever_there_are_enough(seed: int) -> Non
 def _life(rng: random.Random, net: SensorNet, names: list[str]) -> Iterator[list[Effect]]:
     there = set(names)
     for step in range(300):
-        now = step * rng.choice((1.0, PATIENCE / 2)) if step % 50 else step * RETRY / 20
+        now = step * rng.choice((1.0, ABSENCE_TIMEOUT / 2)) if step % 50 else step * RETRY / 20
         match rng.randint(0, 5):
             case 0:
                 there ^= {rng.choice(names)}

@@ -15,7 +15,7 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.perception.lens import COLUMNS, ROWS
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.place_robot import PlaceRobot
-from zscout.behaviors.sensor_net.scout import PATIENCE, SILENT, Scout
+from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, NO_SIGNAL_TIMEOUT, Scout
 from zscout.drivers.packets import DrivePacket
 from zscout.mesh import clock
 from zscout.messages import BehaviorSaid
@@ -100,7 +100,7 @@ def test_jammed_and_silent_channels_are_left_and_a_dead_robot_is_lost(tmp_path: 
             jammed = building.time
             await placed.says("search", "pictures are jammed: waits", since=since)
             told, stood = building.time, await building.stands("scout33")
-            await placed.says("wait", f"no picture on {video} for {PATIENCE:g} s", since=since)
+            await placed.says("wait", f"no picture on {video} for {NO_PICTURE_TIMEOUT:g} s", since=since)
             left = building.time
             assert stood == await building.stands("scout33"), "it moved on in the dark"
             await placed.drives(left=channel)
@@ -143,11 +143,11 @@ def test_a_channel_without_any_picture_is_left_and_the_robot_not_blamed() -> Non
     for picture, silent in ((None, True), (snow, False)):
         scout = Scout()
         scout.held(100.0)
-        for tick in range(int(SILENT) + 2):
+        for tick in range(int(NO_SIGNAL_TIMEOUT) + 2):
             assert not scout.see(100.0 + tick, picture, "video/ch1").blind
         # The framegrabber has given up: the hold ends before the robot's own patience does.
-        scout.released(100.0 + SILENT + 1)
-        assert scout.silent == silent
+        scout.released(100.0 + NO_SIGNAL_TIMEOUT + 1)
+        assert scout.no_signal == silent
         assert not scout.blindness.dead
         asked = scout.blindness.choose(107.0, ["video/ch1", "video/ch2"])
         assert asked == ("video/ch2" if silent else None)

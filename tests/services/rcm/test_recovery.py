@@ -93,11 +93,11 @@ RUNS = client(asked(grant=Grant(TERM, 5)))
 
 def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
     """The names of what stands and what waits."""
-    return [held.request.name for held in found.standing], [one.request.name for one in found.waiting]
+    return [held.request.name for held in found.holds], [one.request.name for one in found.waiting]
 
 
 @pytest.mark.parametrize(
-    ("states", "clients", "standing", "waiting"),
+    ("states", "clients", "recovered_holds", "waiting"),
     [
         pytest.param([], [], [], [], id="nothing"),
         pytest.param(BOTH, [RUNS], ["gang"], [], id="a gang that is all there"),
@@ -167,15 +167,15 @@ def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
     ],
 )
 def test_recover(
-    states: list[RcState], clients: list[ClientRequests], standing: list[str], waiting: list[str]
+    states: list[RcState], clients: list[ClientRequests], recovered_holds: list[str], waiting: list[str]
 ) -> None:
     found = recover(states, clients, NOW)
-    assert summary(found) == (standing, waiting)
+    assert summary(found) == (recovered_holds, waiting)
     assert found.rcs == {state.rc: state for state in states}
 
 
 def test_a_standing_hold_is_carried_on_as_it_is() -> None:
-    (held,) = recover(BOTH, [RUNS], NOW).standing
+    (held,) = recover(BOTH, [RUNS], NOW).holds
     assert (held.grant, held.place) == (Grant(TERM, 5), PLACE)
     assert (held.start, held.end) == (NOW - 50 * SECOND, NOW + 10 * SECOND)
     request = held.request
@@ -186,12 +186,12 @@ def test_a_standing_hold_is_carried_on_as_it_is() -> None:
 
 def test_clocks_differ_a_little_and_the_earliest_end_counts() -> None:
     states = [rc("robot/a", hold(remaining=10)), rc("radio/b", hold(remaining=9.5))]
-    (held,) = recover(states, [], NOW).standing
+    (held,) = recover(states, [], NOW).holds
     assert held.end == NOW + 9_500_000_000
 
 
 def test_the_parameters_at_an_absent_rc_are_what_the_client_says() -> None:
-    (held,) = recover(BOTH[:1], [RUNS], NOW).standing
+    (held,) = recover(BOTH[:1], [RUNS], NOW).holds
     assert held.request.needs["radio/b"] == {"rate": Fraction(5, 2)}
 
 
@@ -228,13 +228,13 @@ def test_patterns_and_what_meets_them_are_restored(
     states: list[RcState], clients: list[ClientRequests]
 ) -> None:
     found = recover(states, clients, NOW)
-    (held,) = found.standing
+    (held,) = found.holds
     rate = {"rate": Fraction(5, 2)}
     assert held.request.needs == {"robot/*": {}, "radio/*": rate, "radio/*#2": rate}
     assert held.bound == BOUND
     core = Core(STRATEGIES["priority"]())
     joined = [RcJoined(state.rc, state.sharable) for state in states]
-    core.handle(NOW, *joined, LeadTaken(Term(4, "cc"), tuple(found.standing)))
+    core.handle(NOW, *joined, LeadTaken(Term(4, "cc"), tuple(found.holds)))
     arc = core.arc("h/one/gang-id")
     assert arc is not None
     if len(states) == len(THREE):
@@ -251,7 +251,7 @@ def test_an_rc_that_read_of_its_hold_in_a_snapshot_passes_on_its_binding() -> No
     )  # fmt: skip
     holding = HoldTable("robot/a", hold_lease=3 * SECOND)
     holding.apply_snapshot(RcmState(TERM, 5, "h", [view]), NOW, sharable=False)
-    (held,) = recover([rc("robot/a", *holding.holders(NOW))], [], NOW).standing
+    (held,) = recover([rc("robot/a", *holding.holders(NOW))], [], NOW).holds
     assert (held.request.needs, held.bound) == ({"robot/*": {}}, {"robot/*": "robot/a"})
 
 

@@ -289,7 +289,7 @@ class Client:
     def open_requests(self) -> list[OpenRequest]:
         """What is queued or running: what `hand_over_all` would hand over now."""
         now = self.mesh.now()
-        return [arc.open_request(now) for arc in self._store.standing]
+        return [arc.open_request(now) for arc in self._store.acknowledged]
 
     def expect(self, requests: Sequence[OpenRequest]) -> None:
         """These will be handed to this client: `request` then returns them, by name and needs. They replace

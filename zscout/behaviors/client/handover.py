@@ -23,11 +23,11 @@ log = logging.getLogger(__name__)
 
 HAND_OVER = 10.0
 """Seconds within which the outcome of a hand-over must be known."""
-COME = 2.0
+EXPECT_TIMEOUT = 2.0
 """Seconds for which a request waits for the ARC that is expected in its stead."""
-JUST_COME = 1.0
+TOKEN_GRACE = 1.0
 """Seconds within which the RCM sees the token of a client that sees the RCM's."""
-CLAIM = 10.0
+CLAIM_TIMEOUT = 10.0
 """Seconds after which an ARC that came and that nobody asked for is given back."""
 
 
@@ -91,18 +91,18 @@ class Handover:
             return None
         del self._unclaimed[arc.id]
         try:
-            async with asyncio.timeout(COME):
+            async with asyncio.timeout(EXPECT_TIMEOUT):
                 while arc.id in self.store.expected:
                     await self.store.changed(arc)
         except TimeoutError:
-            log.warning("%s was not handed over within %g s; it is asked for anew", name, COME)
+            log.warning("%s was not handed over within %g s; it is asked for anew", name, EXPECT_TIMEOUT)
         finally:
             if arc.id in self.store.expected:
                 self.store.forget(arc)
         return arc if arc.open else None
 
     async def _give_back_unwanted(self, arc: OpenArc) -> None:
-        await asyncio.sleep(CLAIM)
+        await asyncio.sleep(CLAIM_TIMEOUT)
         if self._unclaimed.get(arc.id) is arc:
             del self._unclaimed[arc.id]
             if arc.open:
@@ -122,7 +122,7 @@ class Handover:
             self._supervisor.spawn(self._ask_again(arc))
 
     async def _ask_again(self, arc: OpenArc) -> None:
-        """What stands is asked once; what was lost or taken back until there is an answer."""
+        """An acknowledged request is asked once; what was lost or taken back until there is an answer."""
         try:
             if arc.state != "asking":
                 await self.rcm.ask(arc)
@@ -136,7 +136,7 @@ class Handover:
         """As `Client.hand_over_all`."""
         if self.store.resumed.is_set():
             raise RuntimeError("pause() the client before it hands over all: it would ask for it again")
-        arcs = sorted(self.store.standing, key=lambda arc: arc.grant is None)
+        arcs = sorted(self.store.acknowledged, key=lambda arc: arc.grant is None)
         if len(arcs) > MAX_OTHERS + 1:
             raise RequestRefused(
                 Problem("too_many", f"{len(arcs)} ARCs can't be handed over at once; {MAX_OTHERS + 1} can")
@@ -153,7 +153,7 @@ class Handover:
         """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
         term = self.rcm.term
         pause, longest = BACKOFF
-        known_by = self.mesh.now() + round(JUST_COME * SECOND)
+        known_by = self.mesh.now() + round(TOKEN_GRACE * SECOND)
         while arcs := [arc for arc in arcs if arc.open]:
             first, *others = arcs
             operation = HandOver(id=first.id, to=str(to), others=[arc.id for arc in others])

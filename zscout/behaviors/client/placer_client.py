@@ -27,8 +27,8 @@ from zscout.types import NO_TERM, SECOND, ComponentId, HostName, Term
 
 TIMEOUT: Final = 5.0
 """Seconds of one query beyond its own `wait`: a placer that begins first asks all nodes what runs there."""
-PATIENCE: Final = 30.0
-AGAIN: Final = 0.2
+PLACER_TIMEOUT: Final = 30.0
+RETRY_AFTER: Final = 0.2
 REFRESH_EVERY: Final = 1.0
 
 R = TypeVar("R")
@@ -42,16 +42,16 @@ class PlacerSilent(RequestRefused):
 
 
 class PlacerClient:
-    """The component placer, as one program knows it. `patience`: seconds within which some placer answers,
+    """The component placer, as one program knows it. `timeout`: seconds within which some placer answers,
     though the lead changes meanwhile.
 
     As a context manager it follows `placements` (of the components in `only`, if given) by what is published
     and by each answer."""
 
     def __init__(
-        self, mesh: Mesh, only: Collection[ComponentId] | None = None, *, patience: float = PATIENCE
+        self, mesh: Mesh, only: Collection[ComponentId] | None = None, *, timeout: float = PLACER_TIMEOUT
     ) -> None:
-        self.mesh, self.only, self._patience = mesh, only, patience
+        self.mesh, self.only, self._timeout = mesh, only, timeout
         self.placements: dict[ComponentId, Placement] = {}
         self.cordoned: frozenset[HostName] = frozenset()
         self.term: Term = NO_TERM
@@ -71,7 +71,7 @@ class PlacerClient:
     # Requests
 
     async def place(self, component: ComponentId, spec: ComponentSpec, *, wait: float = 3.0) -> Placement:
-        """Has it run somewhere, or returns how it stands if it does. Raises RequestRefused."""
+        """Has it run somewhere, or returns its placement if it does. Raises RequestRefused."""
         return await self.request(PlaceComponent(component, spec, wait=wait), Placement)
 
     async def stop(self, component: ComponentId, *, wait: float = 0.0) -> Placement:
@@ -84,7 +84,7 @@ class PlacerClient:
         return await self._until(
             lambda: self._ask(operation, kind),
             f"the component placer of fleet {self.mesh.keys.fleet} did not answer for "
-            f"{self._patience:.0f} s; see zscout status, and the log of zscout-node where it leads",
+            f"{self._timeout:.0f} s; see zscout status, and the log of zscout-node where it leads",
         )
 
     async def request_once(
@@ -106,14 +106,14 @@ class PlacerClient:
         return await self._until(attempt, silent)
 
     async def _until(self, attempt: Callable[[], Awaitable[R | None]], silent: str) -> R:
-        deadline = self.mesh.now() + round(self._patience * SECOND)
+        deadline = self.mesh.now() + round(self._timeout * SECOND)
         while True:
             answer = await attempt()
             if answer is not None:
                 return answer
             if self.mesh.now() > deadline:
                 raise PlacerSilent(silent)
-            await asyncio.sleep(AGAIN)
+            await asyncio.sleep(RETRY_AFTER)
 
     # Placements
 

@@ -27,7 +27,7 @@ BACKOFF = (0.05, 1.0)
 """Seconds before a question that nobody answered is repeated: first, and at most."""
 END_TRIES = 3
 TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full"})
-LOOKS = 10
+CHECKS_PER_LEASE = 10
 """How often within a hold lease a client checks whether an RCM published."""
 
 
@@ -54,7 +54,7 @@ class RcmLink:
     def start(self) -> list[Declaration]:
         self._stall.start()
         keys, mesh = self.mesh.keys, self.mesh
-        self._published = mesh.overhear(keys.grants, _TermOnly)
+        self._published = mesh.poll_latest(keys.grants, _TermOnly)
         return [
             mesh.serve(keys.requests(mesh.me), RcAsk, self._on_requests),
             self._published,
@@ -103,13 +103,13 @@ class RcmLink:
         """Ends holds when no RCM published for the hold lease: their RCs have ended them as well."""
         lease = self.fleet.timing.hold_lease
         while True:
-            await asyncio.sleep(lease / SECOND / LOOKS)
+            await asyncio.sleep(lease / SECOND / CHECKS_PER_LEASE)
             now = self.mesh.now()
             # As at the RCs: an RCM that was replaced, or whose term is absurd, keeps no hold alive.
             terms = [one.term for one in self._published.take()]
             if any(term >= self.term and not absurd(term, self.term) for term in terms):
                 # It may have published right after the last check.
-                self._last_contact = now - lease // LOOKS
+                self._last_contact = now - lease // CHECKS_PER_LEASE
             if now - self._last_contact < lease or self._stall.fresh():
                 continue
             for arc in self.store.open:

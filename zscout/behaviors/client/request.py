@@ -1,4 +1,4 @@
-"""A client's requests: what was asked for, and how each stands by the newest notice. Time is passed in."""
+"""A client's requests: what was asked for, and the state of each by the newest notice. Time is passed in."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ class RequestStore:
         return [arc for arc in self.arcs.values() if arc.open]
 
     @property
-    def standing(self) -> list[OpenArc]:
+    def acknowledged(self) -> list[OpenArc]:
         """Those that the RCM has answered: queued or running."""
         return [arc for arc in self.open if arc.state != "asking"]
 

@@ -1,8 +1,8 @@
 """Which robots of a sensor net are active, and which replaces one that is lost. Pure; time is passed in.
 
 `wanted` robots are to be placed. They are started in the order in which they were named; one that is lost
-(its camera shows nothing, it is gone from the mesh for PATIENCE, or its behavior can't be had) is replaced by
-the next that is free. One that comes back is free again; whoever has replaced it stays.
+(its camera shows nothing, it is gone from the mesh for ABSENCE_TIMEOUT, or its behavior can't be had) is
+replaced by the next that is free. One that comes back is free again; whoever has replaced it stays.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal, TypeAlias
 
-PATIENCE: Final = 10.0
+ABSENCE_TIMEOUT: Final = 10.0
 """Seconds that a robot may be away from the mesh before it counts as lost."""
 GONE: Final = "it is not on the mesh"
 RETRY: Final = 60.0
@@ -20,9 +20,9 @@ RETRY: Final = 60.0
 HIDDEN: Final = frozenset({"hidden", "watch", "alert", "blind"})
 """Status of a robot that has found its place."""
 PAUSED: Final = frozenset({"wait", "lost", ""})
-"""Status that leaves open where it stands."""
+"""Status that does not show whether it is hidden."""
 
-Standing: TypeAlias = Literal["free", "active", "lost"]
+MemberStatus: TypeAlias = Literal["free", "active", "lost"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Member:
     """A robot of the net."""
 
     robot: str
-    standing: Standing = "free"
+    standing: MemberStatus = "free"
     doing: str = ""
     why: str = ""
     alerts: int = 0
@@ -110,7 +110,7 @@ class SensorNet:
                     member.standing, member.why = "free", ""
             elif member.away_since is None:
                 member.away_since = now
-            elif member.standing == "active" and now - member.away_since >= PATIENCE:
+            elif member.standing == "active" and now - member.away_since >= ABSENCE_TIMEOUT:
                 effects += self._lose(now, member, GONE)
         return effects + self._fill(now)
 

@@ -19,14 +19,14 @@ from zscout.behaviors.client.arc import Held, Revoked, holds
 from zscout.behaviors.client.client import CommandRefused, RequestRefused
 from zscout.behaviors.perception.lens import COLUMNS, ROWS, grey_picture
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
-from zscout.behaviors.sensor_net.scout import PATIENCE, Scout, Task
+from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, Scout, Task
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
 from zscout.mesh import FrameWatch
 from zscout.mesh.supervision import supervised
 
 LOOK: Final = 0.5
 """Seconds that a picture is waited for."""
-AGAIN: Final = 1.0
+RETRY_AFTER: Final = 1.0
 """Seconds before it asks again after a refusal."""
 GIVEN_UP: Final = 60.0
 """Seconds before a robot that was given up is tried again: its battery may have been changed."""
@@ -75,10 +75,10 @@ class PlaceRobot(Behavior):
                 except CameraBlind as blind:
                     lost = self.scout.blindness.dead
                     self.report("lost" if lost else "wait", str(blind), robot=self.needs.robot)
-                    await asyncio.sleep((GIVEN_UP if lost else AGAIN) / context.speed)
+                    await asyncio.sleep((GIVEN_UP if lost else RETRY_AFTER) / context.speed)
                 except (Revoked, CommandRefused, RequestRefused) as error:
                     self.report("wait", str(error), robot=self.needs.robot)
-                    await asyncio.sleep(AGAIN)
+                    await asyncio.sleep(RETRY_AFTER)
 
     async def _offer_safe_points(self, context: BehaviorContext) -> None:
         """While the robot is not held nothing changes here, however long that takes: a time to be moved."""
@@ -128,10 +128,10 @@ class RobotTask(Behavior):
                 # It may be about to be moved: nothing changes before that is over.
                 await context.safe_point()
                 await self._use(context, held, video)
-            if scout.silent and attempt.arc is not None and attempt.arc.open:
+            if scout.no_signal and attempt.arc is not None and attempt.arc.open:
                 # It was taken away because the receiver is dead: the same needs would be given the same one.
                 await context.client.end(attempt.arc)
-                scout.silent = False
+                scout.no_signal = False
                 raise CameraBlind(f"{channel} shows nothing at all")
 
     async def _use(self, context: BehaviorContext, held: Held, video: str | None) -> None:
@@ -162,7 +162,7 @@ class RobotTask(Behavior):
             picture = np.asarray(cv2.resize(picture, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA), np.uint8)
         step = self.place.scout.see(self.place.now(context), picture, robot.video)
         if step.blind:
-            raise CameraBlind(f"no picture on {robot.video} for {PATIENCE:g} s")
+            raise CameraBlind(f"no picture on {robot.video} for {NO_PICTURE_TIMEOUT:g} s")
         await robot.drive(step.left, step.right, step.lasts)
         self.report(
             step.doing,

@@ -15,7 +15,7 @@ from zscout.behaviors.perception.hiding.hider import Hider
 from zscout.behaviors.perception.lens import Picture, garbled
 from zscout.behaviors.perception.motion import Box, MotionDetector
 
-PATIENCE: Final = 10.0
+NO_PICTURE_TIMEOUT: Final = 10.0
 """Seconds from the beginning of a hold, or from the last picture, until the robot counts as not seen."""
 
 QUIET: Final = 2.0
@@ -24,7 +24,7 @@ SUSPECTS: Final = 2
 """Holds in a row without a picture that prove a robot dead."""
 BAD_FOR: Final = 60.0
 """Seconds for which a channel that showed nothing is avoided."""
-SILENT: Final = 4.0
+NO_SIGNAL_TIMEOUT: Final = 4.0
 """Seconds without any picture at the end of a hold that prove a receiver dead: framegrabbers give up after
 five."""
 REMIND: Final = 4.0
@@ -87,15 +87,15 @@ class Alerts:
 class Blindness:
     """Why there is no picture of a robot, over its holds: because of the channel, or of the robot.
 
-    A robot whose transmitter is on shows a picture within seconds. If none comes for `patience`, the channel
+    A robot whose transmitter is on shows a picture within seconds. If none comes for `timeout`, the channel
     may be jammed, its receiver dead, or the robot. So another channel is tried where there is one: a robot
     that is not seen on SUSPECTS in a row is dead; one that is seen had a bad channel, which is avoided for a
     while. A channel without any picture, not even snow, has no receiver that works: its framegrabber gives
-    up, the hold ends before `patience` is over, and the robot is not to blame.
+    up, the hold ends before `timeout` is over, and the robot is not to blame.
     """
 
-    def __init__(self, patience: float) -> None:
-        self.patience = patience
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
         """Seconds without a picture, warm-up included."""
         self._dark_since: float | None = None
         self._bad: dict[str, float] = {}
@@ -103,19 +103,19 @@ class Blindness:
         self._in_row = 0
         self._reminded = 0.0
         self._channel = ""
-        self._silent_since: float | None = None
+        self._no_signal_since: float | None = None
 
     def begin(self, now: float) -> None:
         """A hold has begun: the transmitter is being switched on."""
         self._dark_since = now
-        self._channel, self._silent_since = "", now
+        self._channel, self._no_signal_since = "", now
 
     def see(self, now: float, good: bool, channel: str, *, came: bool | None = None) -> bool:
         """Takes what a look showed; `came`: any picture, if not a good one. True: no good picture for too
         long on this channel."""
         self._channel = channel
         if good or came:
-            self._silent_since = now
+            self._no_signal_since = now
         if good:
             self._dark_since = None
             self._in_row = 0
@@ -123,7 +123,7 @@ class Blindness:
             return False
         if self._dark_since is None:
             self._dark_since = now
-        if now - self._dark_since < self.patience:
+        if now - self._dark_since < self.timeout:
             return False
         self._bad[channel] = now
         self._in_row += 1
@@ -140,8 +140,8 @@ class Blindness:
 
     def end(self, now: float) -> bool:
         """The hold is over. True: its channel gave nothing at all, and is to be left."""
-        since, self._silent_since = self._silent_since, None
-        if since is None or not self._channel or now - since < SILENT:
+        since, self._no_signal_since = self._no_signal_since, None
+        if since is None or not self._channel or now - since < NO_SIGNAL_TIMEOUT:
             return False
         self._bad[self._channel] = now
         return True
@@ -171,12 +171,12 @@ class Scout:
     def __init__(self, *, seed: int = 0) -> None:
         self.hider = Hider(seed=seed)
         self.alerts = Alerts()
-        self.blindness = Blindness(PATIENCE)
+        self.blindness = Blindness(NO_PICTURE_TIMEOUT)
         self._detector = MotionDetector()
         self._task: Task = "hide"
         """Of the present hold."""
-        self._held = self.silent = False
-        """Silent: the last hold ended without any picture, so its channel is to be left."""
+        self._held = self.no_signal = False
+        """The last hold ended without any picture, not even snow, so its channel is to be left."""
 
     @property
     def task(self) -> Task:
@@ -194,9 +194,9 @@ class Scout:
         self.blindness.begin(now)
 
     def released(self, now: float) -> None:
-        """The hold is over, for whatever reason: the robot stands, and somebody else may move it."""
+        """The hold is over, for whatever reason: the wheels are stopped, and others may move the robot."""
         self._held = False
-        self.silent = self.blindness.end(now)
+        self.no_signal = self.blindness.end(now)
         self.hider.interrupted(now)
         self.alerts.rest()
 

@@ -30,7 +30,7 @@ OVER: Final = frozenset({"ended", "given_up"})
 
 
 def placer_of(client: Client, only: Collection[str] | None = None) -> PlacerClient:
-    return PlacerClient(client.mesh, only, patience=PATIENCE)
+    return PlacerClient(client.mesh, only, timeout=PATIENCE)
 
 
 @asynccontextmanager

@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from zscout.behaviors.sensor_net.place_robot import AGAIN, GIVEN_UP, Slots
+from zscout.behaviors.sensor_net.place_robot import GIVEN_UP, RETRY_AFTER, Slots
 from zscout.behaviors.sensor_net.scout import Scout, Step
 from zscout.drivers.airtime import BITS_PER_BYTE, Share, line_rate, objection
 from zscout.drivers.packets import MAX_PACKET, OVERHEAD
@@ -290,7 +290,7 @@ class FieldRun:
         if (step.over or step.blind) and player.asked is not None:
             self._handle(Released(player.asked))
             if step.blind:
-                player.asks_at = now + (GIVEN_UP if player.scout.blindness.dead else AGAIN)
+                player.asks_at = now + (GIVEN_UP if player.scout.blindness.dead else RETRY_AFTER)
 
     def _drive(self, player: Player, step: Step) -> None:
         """At the rate that was asked for; wheels that are to stand are stopped once."""

@@ -44,7 +44,7 @@ class LoadBalancer:
 
     def start(self) -> None:
         keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
-        self._reports = mesh.overhear(keys.load_any, LoadReport, depth=DEPTH)
+        self._reports = mesh.poll_latest(keys.load_any, LoadReport, depth=DEPTH)
         for declared in (
             self._reports,
             mesh.watch(keys.alive_any(Role.LOAD), guard(self._on_reporter)),

@@ -1,10 +1,10 @@
 """A node's candidacy for the RCM: sees whether somebody leads, and takes over when nobody does.
 
 Taking over: ask the RCs whether they still see a leader; take a term above all that is known; ask all RCs
-and clients what stands, which binds the RCs to the new term; lead over that.
+and clients for their holds and requests, which binds the RCs to the new term; lead over that.
 
 When anything of it fails, a candidate steps down: its tokens go, so that others take over, and after a while
-it stands again.
+it becomes a candidate again.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ R = TypeVar("R")
 MAX_ATTEMPTS = 3
 """Terms tried in one go when RCs turn out to have promised higher ones."""
 BACKOFF, MAX_BACKOFF = 1.0, 30.0
-"""Seconds until a candidate that failed stands again: doubled each time, at most."""
-PROVEN: Ns = 60 * SECOND
-"""A candidate that failed no sooner than this begins with BACKOFF anew."""
+"""Seconds until a candidate that failed becomes one again: doubled each time, at most."""
+BACKOFF_RESET_AFTER: Ns = 60 * SECOND
+"""After a candidacy at least this long the next failure begins with BACKOFF anew."""
 
 
 class Candidate:
@@ -48,16 +48,16 @@ class Candidate:
         """The highest term seen anywhere."""
         self.rcm: Rcm | None = None
         self.ledger = PlacementLedger(mesh)
-        self._reign = ExitStack()
+        self._leading = ExitStack()
         """Ends the RCM, and the load balancer and the placer beside it, while this node leads."""
         self._candidacy = ExitStack()
-        """Takes back what is declared while it stands."""
+        """Undeclares what is declared while it is a candidate."""
         self._changed = asyncio.Event()
         self._failures = 0
         self._again: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
-        self._stand()
+        self._become_candidate()
 
     async def stop(self) -> None:
         if self._again is not None:
@@ -65,7 +65,7 @@ class Candidate:
         self._withdraw()
         await self._supervisor.close()
 
-    def _stand(self) -> None:
+    def _become_candidate(self) -> None:
         """Becomes a candidate: others see its token from now on."""
         keys, mesh = self.mesh.keys, self.mesh
         self._again, self._since = None, mesh.now()
@@ -89,15 +89,15 @@ class Candidate:
             self._supervisor.fail(error)
 
     def _failed(self, _: Exception) -> None:
-        """Steps down and withdraws; stands again, as a new candidate, after a while."""
+        """Steps down and withdraws; becomes a new candidate after a while."""
         if self._again is not None:
             return
-        if self.mesh.now() - self._since > PROVEN:
+        if self.mesh.now() - self._since > BACKOFF_RESET_AFTER:
             self._failures = 0
         delay = min(BACKOFF * 2**self._failures, MAX_BACKOFF)
         self._failures += 1
-        log.error("this candidate withdraws, and stands again in %g s", delay)
-        self._again = asyncio.get_running_loop().call_later(delay, self._stand)
+        log.error("this candidate withdraws, and becomes one again in %g s", delay)
+        self._again = asyncio.get_running_loop().call_later(delay, self._become_candidate)
         self._withdraw()
 
     def _withdraw(self) -> None:
@@ -107,7 +107,7 @@ class Candidate:
 
     def _stop_leading(self) -> None:
         self.rcm = None
-        self._reign.close()
+        self._leading.close()
 
     # What is seen
 
@@ -213,16 +213,16 @@ class Candidate:
             "leading in term %d: %d RCs, %d holds, %d waiting",
             term.counter,
             len(recovered.rcs),
-            len(recovered.standing),
+            len(recovered.holds),
             len(recovered.waiting),
         )
         rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed)
-        self._reign.callback(rcm.stop)
+        self._leading.callback(rcm.stop)
         rcm.start(recovered)
         balancer = LoadBalancer(self.mesh, self._failed)
-        self._reign.callback(balancer.stop)
+        self._leading.callback(balancer.stop)
         balancer.start()
         inherited = self.ledger.inherited()
         placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, inherited, self._failed)
-        self._reign.callback(placer.stop)
+        self._leading.callback(placer.stop)
         placer.start()

@@ -25,7 +25,7 @@ NEAR_END: Ns = SECOND // 20
 
 
 class Membership:
-    """Follows the clients and RCs of one fleet for one reign."""
+    """Follows the clients and RCs of one fleet for one term."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class Membership:
         """The RCs that count as there, as they reported themselves last."""
 
     def join(self, rcs: dict[RcName, RcState]) -> list[Event]:
-        """The RCs that promised to obey before the reign began."""
+        """The RCs that promised to obey before the term began."""
         self._joined.update(rcs)
         # One that died before its token was watched would never be seen to go.
         self._supervisor.call_later(self._lease, self._drop_unseen)
@@ -147,7 +147,7 @@ class Membership:
             await asyncio.sleep(self._timeout)
 
     def _is_wanted(self, token: Token) -> bool:
-        """Whether an RC lives and has not joined. A reign that is over asks nothing more."""
+        """Whether an RC lives and has not joined. Once the term is over, no RC is asked any more."""
         living = self._rc_tokens.get(token.name, {})
         return self._supervisor.active and token.instance in living and token.name not in self._joined
 

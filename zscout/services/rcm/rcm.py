@@ -75,8 +75,8 @@ MAX_REASON = 500
 
 
 class Rcm:
-    """One reign of one RCM, from taking the lead to giving it up. When any of its work fails, `on_failure` is
-    called with the error, once: the reign is to be stopped then."""
+    """One term of one RCM, from taking the lead to giving it up. When any of its work fails, `on_failure` is
+    called with the error, once: the term is to be ended then."""
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class Rcm:
         for request in recovered.requests:
             self.registry.enter(request.arc, request.name)
             self.membership.expect(request.client)
-        lead = LeadTaken(self.term, tuple(recovered.standing), tuple(recovered.waiting))
+        lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*joined, lead], named=recovered.rcs)
         limit = self.fleet.limits.max_payload
@@ -130,10 +130,10 @@ class Rcm:
             *self.membership.watch(),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
         ]
-        self.supervisor.spawn(self._beat())
+        self.supervisor.spawn(self._send_heartbeats())
 
     def stop(self) -> None:
-        """Stops leading. Nothing is revoked: what stands, stands for the next RCM."""
+        """Stops leading. Nothing is revoked: holds and requests stay for the next RCM."""
         for declared in reversed(self._declared):
             declared.close()
         self._declared = []
@@ -228,7 +228,7 @@ class Rcm:
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
         self._put(number, holders, revoked)
 
-    async def _beat(self) -> None:
+    async def _send_heartbeats(self) -> None:
         """Repeats the last number whenever nothing was published for a while."""
         while True:
             due = self._published + self._heartbeat - self.mesh.now()
@@ -272,7 +272,7 @@ class Rcm:
             log.warning("%s did not vote: %s", rc, reply.problem.message)
         self._receive(VoteOverdue(proposal))
 
-    # How things stand
+    # The present state
 
     def _on_state_asked(self, query: IncomingQuery[StateAsk]) -> None:
         asked, now = query.message, self.mesh.now()

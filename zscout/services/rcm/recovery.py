@@ -1,7 +1,7 @@
-"""What stands when a new RCM takes the lead, from the answers of RCs and clients. Pure.
+"""What is in force when a new RCM takes the lead, from the answers of RCs and clients. Pure.
 
-RCs know the holds, clients their requests and places. A hold stands if every RC of its gang is there and
-holds it under the same grant; a gang with an absent RC is broken, and queued again with its place. What a
+RCs know the holds, clients their requests and places. A hold is recovered if every RC of its gang is there
+and holds it under the same grant; a gang with an absent RC is broken, and queued again with its place. What a
 client that answers does not ask for any more is not carried on: it gave it up while nobody led.
 """
 
@@ -23,15 +23,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class RecoveredState:
-    """What stood when the lead was taken: the RCs that promised, holds, queue."""
+    """What was in force when the lead was taken: the RCs that promised, holds, queue."""
 
     rcs: dict[str, RcState] = field(default_factory=dict)
-    standing: list[RecoveredHold] = field(default_factory=list)
+    holds: list[RecoveredHold] = field(default_factory=list)
     waiting: list[RecoveredRequest] = field(default_factory=list)
 
     @property
     def requests(self) -> Iterator[ArcRequest]:
-        yield from (held.request for held in self.standing)
+        yield from (held.request for held in self.holds)
         yield from (one.request for one in self.waiting)
 
 
@@ -74,9 +74,9 @@ def recover(states: Iterable[RcState], clients: Iterable[ClientRequests], now: N
         except (BadName, ValueError) as error:
             log.warning("the request %s is not carried on: %s", arc, error)
     # A client that handed over a hold, and missed the answer, lists it as well: what the RCs hold counts.
-    stands = {(held.place, request_id(held.request.arc)) for held in result.standing}
+    held_requests = {(held.place, request_id(held.request.arc)) for held in result.holds}
     result.waiting = sorted(
-        (one for one in result.waiting if (one.place, request_id(one.request.arc)) not in stands),
+        (one for one in result.waiting if (one.place, request_id(one.request.arc)) not in held_requests),
         key=lambda one: one.place,
     )
     return result
@@ -106,7 +106,7 @@ def _recover_hold(
     if all(name in held or name not in result.rcs for name in some.rcs):
         remaining = min(holder.remaining for holder in held.values())
         end = now + round(remaining * SECOND)
-        result.standing.append(
+        result.holds.append(
             RecoveredHold(request, some.place, grant, end - request.min_runtime, end, some.bound)
         )
     else:

@@ -1,4 +1,4 @@
-"""How each request of one reign stands: its name and history, and the notices that its client gets.
+"""The state of each request of one term: its name and history, and the notices that its client gets.
 
 Every change that is not the answer to an operation is published on the client's key; requests that ended are
 remembered for a while. What happened to each ARC is kept as text, for `zscout why`, and written to the log.
@@ -65,7 +65,7 @@ def reason_info(reason: Reason | None) -> ReasonInfo | None:
 
 
 class RequestRegistry:
-    """The requests of one reign, those that ended lately included."""
+    """The requests of one term, those that ended lately included."""
 
     def __init__(self, mesh: Mesh, core: Core, term: Term, supervisor: Supervisor) -> None:
         self._mesh, self._core, self._term, self._supervisor = mesh, core, term, supervisor
@@ -101,7 +101,7 @@ class RequestRegistry:
     # Notices
 
     def notice(self, arc_id: ArcId) -> Notice:
-        """How a request stands now, or how it ended."""
+        """The present state of a request, or how it ended."""
         arc = self._core.arc(arc_id)
         if arc is None:
             if arc_id in self._ended:
@@ -167,7 +167,7 @@ class RequestRegistry:
                     pass
 
     def publish(self, arcs: Iterable[ArcId]) -> None:
-        """Publishes how these ARCs, as far as they are open, stand now."""
+        """Publishes the present state of these ARCs, as far as they are open."""
         for arc in arcs:
             if self._core.arc(arc) is not None:
                 self._changed.discard(arc)
@@ -213,7 +213,7 @@ class RequestRegistry:
     # Forecasts: one serves all that are wanted in the same instant
 
     def starts(self) -> Mapping[ArcId, Ns]:
-        """When each queued ARC will start as things stand; those that are left out will not, or too late."""
+        """When each queued ARC will start, forecast from the present state; absent: never, or too late."""
         if self._foreseen is None or self._foreseen[0] != self._core.batches:
             now = self._mesh.now()
             self._starts = forecast(self._core, now).starts

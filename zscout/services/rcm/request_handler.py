@@ -66,7 +66,7 @@ class RequestHandler:
         emit: Callable[..., None],
     ) -> None:
         self.mesh, self.limits, self.core = mesh, fleet.limits, core
-        self._patience = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
+        self._first_answer_timeout = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
         self._registry, self._membership, self._supervisor = registry, membership, supervisor
         self._flush_guarded = supervisor.guard(self.flush)
         self._emit = emit
@@ -192,7 +192,7 @@ class RequestHandler:
         undecided = [event.request.arc for event in asked if event.request.arc in self.waiting]
         if undecided:
             # Votes are out: they decide the first answer, if they come.
-            self._supervisor.call_later(self._patience, self._answer, undecided)
+            self._supervisor.call_later(self._first_answer_timeout, self._answer, undecided)
 
     def answer(self, effects: Iterable[Effect]) -> None:
         """Answers the operations that an instant's effects have decided."""
@@ -295,7 +295,7 @@ def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: Rc
     place = ask.place if isinstance(ask, Ask) else None
     if place is not None and place.term > core.term:
         raise Refused("bad_request", "place is of a term that has not been; leave it out")
-    if place is not None and (place.arrival < 1 or not core.given(place)):
+    if place is not None and (place.arrival < 1 or not core.could_have_issued(place)):
         raise Refused("bad_request", "place was never given; leave it out")
     try:
         check_name(ask.arc, "arc")
