@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
@@ -159,42 +159,24 @@ class Devices:
 
     async def ask(self) -> None:
         """Asks the RCs of which no state is known yet; waits ASK_RCS for their answers at most."""
-        living = self.living()
-        self._states = {rc: state for rc, state in self._states.items() if rc in living}
+        self._states = self.known()
 
         def all_known(reply: Reply[RcState] | None = None) -> bool:
             if reply is not None and reply.message is not None:
                 self._on_state(reply.key, reply.message)
-            return all(self.of(rc) is not None for rc in self.living())
+            return {token.name for token in self._fleet_view.tokens(Role.RC)} <= self.known().keys()
 
         if not all_known():
             key = self._mesh.keys.rc_state_any
             await self._mesh.ask(key, RcAsk(), RcState, timeout=ASK_RCS, enough=all_known)
 
-    def living(self) -> dict[str, set[str]]:
-        """Instances by RC."""
-        living: dict[str, set[str]] = {}
-        for token in self._fleet_view.tokens(Role.RC):
-            living.setdefault(token.name, set()).add(token.instance)
-        return living
-
-    def known(self) -> list[RcState]:
-        """All states, by RC."""
-        return [state for rc in sorted(self._states) if (state := self.of(rc)) is not None]
-
-    def of(self, rc: str) -> RcState | None:
-        """What this RC reported last, unless it is gone, or another has come in its place."""
-        state = self._states.get(rc)
-        return state if state is not None and state.instance in self.living().get(rc, ()) else None
-
-    def as_object(self, rc: str) -> dict[str, Any]:
-        """What `--json` prints of an RC; `health` is null where it did not answer."""
-        state = self.of(rc)
-        if state is None:
-            return {"health": None, "figures": {}, "capacity": {}}
-        return {"health": state.health, "figures": dict(state.figures), "capacity": dict(state.capacity)}
+    def known(self) -> dict[str, RcState]:
+        """What each RC reported last, in order of names, unless it is gone or was replaced by another."""
+        living = {(token.name, token.instance) for token in self._fleet_view.tokens(Role.RC)}
+        return {rc: state for rc, state in sorted(self._states.items()) if (rc, state.instance) in living}
 
     def _on_state(self, key: str, state: RcState) -> None:
         with suppress(BadName):
-            if key == self._mesh.keys.rc_state(state.rc) and state.rc in self.living():
+            named = any(token.name == state.rc for token in self._fleet_view.tokens(Role.RC))
+            if named and key == self._mesh.keys.rc_state(state.rc):
                 self._states[state.rc] = state

@@ -15,7 +15,7 @@ from zscout.cli import common
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.watching import Overview, show
 from zscout.keyexpr import Role, Token
-from zscout.messages import Notice, RcmState
+from zscout.messages import Notice, RcmState, RcView
 from zscout.terminal import Table, many, span
 from zscout.types import SECOND, Ns
 
@@ -101,7 +101,7 @@ class Standing:
 
     def _rcs(self, state: RcmState) -> Table:
         homes = self._homes()
-        lost = {device.rc for device in self.devices.known() if device.health != "ok"}
+        lost = {device.rc for device in self.devices.known().values() if device.health != "ok"}
         rows, styles = [], []
         for view in state.rcs:
             holders = [hold for hold in state.holds if view.rc in hold.needs]
@@ -150,7 +150,7 @@ class Standing:
 
     def _devices(self) -> Table:
         """Those that are not well; with `every` also those that report figures."""
-        known = self.devices.known()
+        known = self.devices.known().values()
         shown = [one for one in known if one.health != "ok" or (self.every and one.figures)]
         rows = [(one.rc, one.health, figures_text(one.figures)) for one in shown]
         styles = ["" if one.health == "ok" else "red" for one in shown]
@@ -162,21 +162,24 @@ class Standing:
         """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
         state, homes, now = self.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
+        known = self.devices.known()
 
-        def holders(rc: str) -> list[dict[str, str]]:
-            theirs = [hold for hold in holds if rc in hold.needs]
-            return [{"arc": hold.arc, "id": hold.id, "client": hold.client} for hold in theirs]
+        def rc_object(view: RcView) -> dict[str, Any]:
+            device = known.get(view.rc)
+            holders = [hold for hold in holds if view.rc in hold.needs]
+            return structs.asdict(view) | {
+                "host": homes.get(view.rc),
+                "holders": [{"arc": hold.arc, "id": hold.id, "client": hold.client} for hold in holders],
+                "health": device.health if device is not None else None,
+                "figures": device.figures if device is not None else {},
+                "capacity": device.capacity if device is not None else {},
+            }
 
         return {
             "fleet": self.fleet_view.client.fleet.name,
             "links": self.fleet_view.mesh.links(),
             "rcm": None if state is None else {"host": state.host, "term": state.term, "seq": state.seq},
-            "rcs": [
-                structs.asdict(view)
-                | {"host": homes.get(view.rc), "holders": holders(view.rc)}
-                | self.devices.as_object(view.rc)
-                for view in views
-            ],
+            "rcs": list(map(rc_object, views)),
             "holds": list(map(structs.asdict, holds)),
             "queue": list(map(structs.asdict, queue)),
             "more": state.more if state is not None else 0,
