@@ -280,7 +280,7 @@ def standing(wanted: ArcRequest, seq: int, *, start: int = 0, place: int = 1) ->
     return RecoveredHold(wanted, Place(OLD, place), Grant(OLD, seq), start, start + wanted.min_runtime)
 
 
-def test_a_hold_whose_time_ran_out_between_two_reigns_is_completed_at_once() -> None:
+def test_a_hold_whose_time_ran_out_between_two_terms_is_completed_at_once() -> None:
     core = Core()
     now = 60 * SECOND
     over = standing(request("over", "robot/a"), 1)

@@ -27,8 +27,8 @@ class SchedulingPolicy:
     patience: Ns | None = PATIENCE
     """`adaptive`: time in ns after which an ARC that waits is due (`reservations.py`); None: never."""
     promise: Promise = "equals"
-    """Whom those who are owed are protected from: equal and lower priority, or all but operators. With `all`,
-    what they are granted at last is theirs for its minimum runtime, too."""
+    """The ARCs that may not pass a due ARC: those of equal and lower priority, or all but operators. With
+    `all`, what a due ARC is granted at last is not preempted within its minimum runtime either."""
     max_running_per_host: int | None = None
     """ARCs that the clients of one host may have running at one time; None: any number."""
 

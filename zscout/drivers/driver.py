@@ -48,6 +48,7 @@ class Driver:
     """
 
     sharable = False
+    """Whether it takes several holders, by its vote."""
     relays = False
     """Whether, besides a holder's client, the nodes of other RCs of its gang may command under the grant: a
     robot's does so at its radio."""

@@ -118,7 +118,7 @@ class HoldTable:
         return change
 
     def apply_snapshot(self, state: RcmState, now: Ns, *, sharable: bool) -> HoldChange:
-        """Takes a snapshot: what was missed is added, what the snapshot does not know is presented."""
+        """Takes a snapshot: what was missed is added, what the snapshot does not know is announced."""
         change = HoldChange()
         if not self._accept(state, change, now):
             return change

@@ -25,6 +25,9 @@ RUNNING: Final = ("running", "stopping")
 
 
 class Reconciler:
+    """Compares what tokens, hosts and earlier placers report with the placer's records, and acts on each
+    difference."""
+
     def __init__(self, state: PlacementState, lifecycle: Lifecycle, migrations: Migrations) -> None:
         self.state, self.lifecycle, self.migrations = state, lifecycle, migrations
         self.surplus, self.probes = lifecycle.surplus, lifecycle.probes
@@ -262,7 +265,7 @@ class Reconciler:
                 state.wake(record, state.now + GRACE)
 
     def host_lost(self, host: HostName) -> None:
-        """What it had is gone with it, or, if its node was only silent, is probed when it is back."""
+        """Its components have ended with it, or, if its node was only silent, are probed once it is back."""
         state = self.state
         state.alive.discard(host)
         state.last_change.pop(host, None)

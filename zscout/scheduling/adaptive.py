@@ -16,8 +16,8 @@ is asked for at once, so that the RCM answers between two slices. A search works
 has changed, it starts again from what is left of the best set. A group has only so many slices and rounds of
 votes, whatever happens meanwhile; then the best set that needs no more votes is taken, or `priority` decides.
 
-In each pass the outcome is worth at least what that of `priority` is, among those whom no reservation holds
-back.
+In each pass the outcome is worth at least what that of `priority` is, among the ARCs that no reservation
+holds back.
 """
 
 from __future__ import annotations
@@ -138,8 +138,8 @@ class Adaptive(Strategy):
         self._seen = _situation(state)
 
     def _reserve(self, state: SchedulerState) -> Reservations | None:
-        """What is reserved for the starving in this pass; those who were held back by what is reserved no
-        more are checked again."""
+        """What is reserved for the starving ARCs in this pass. Where a reservation has ended or changed, the
+        ARCs that it held back are checked again."""
         patience = state.policy.patience
         if patience is None:
             return None

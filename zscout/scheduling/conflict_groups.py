@@ -28,8 +28,8 @@ from zscout.types import ArcId, Ns
 def undecided_arcs(
     state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None
 ) -> list[Arc] | None:
-    """Those who might start, best-ranked first, then those who might have to end; None: more than `limit`
-    might start."""
+    """The queued ARCs that might start, best-ranked first, then the running ones that might have to end;
+    None: more than `limit` might start."""
     if state.by_pattern:
         bind_all(state, reserved)
     return _Search(state, reserved).run(limit)
@@ -39,9 +39,9 @@ class _Search:
     def __init__(self, state: SchedulerState, reserved: Reservations | None) -> None:
         self.state, self.votes, self.reserved = state, state.votes, reserved
         self.preemptible: dict[ArcId, Arc] = {}
-        """Who runs and might have to end."""
+        """Running ARCs that might have to end."""
         self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
-        """Who is next, by itself or as a watcher of an RC."""
+        """The next ARCs to look at, each by itself or as a watcher of an RC."""
         self._called = 0
         """Bits of the RCs whose watchers come."""
         self._started: Counter[str] = Counter()
@@ -100,13 +100,13 @@ class _Search:
         return holder.id not in self.preemptible and not holder.preemptible_by(arc, self.state.now)
 
     def _refused(self, rc: Rc, arc: Arc) -> bool:
-        """Whether an RC has vetoed the ARC beside those who stay in any case, or is silent about that."""
+        """Whether an RC has vetoed the ARC beside the holders that stay in any case, or is unresponsive."""
         stay = (holder.id for holder in rc.holders.values() if self._stays(holder, arc))
         answer = self.votes.known(rc.name, frozenset((*stay, arc.id)))
         return rc.name in self.votes.unresponsive if answer is None else not answer.accept
 
     def _reserved_for_other(self, arc: Arc) -> bool:
-        """Whether what it would take is kept for another."""
+        """Whether an RC that it would take is reserved for another ARC."""
         reserved = self.reserved
         if reserved is None or not arc.mask & reserved.bits:
             return False
@@ -126,7 +126,7 @@ class _Search:
         return True
 
     def _note_preemptible(self, arc: Arc) -> None:
-        """Notes who might have to end for `arc`."""
+        """Notes the running ARCs that might have to end for `arc`."""
         for rc in arc.rcs:
             for holder in rc.holders.values():
                 if holder.id not in self.preemptible and holder.preemptible_by(arc, self.state.now):
@@ -182,7 +182,7 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
 def _level_key(arc: Arc, first: set[ArcId], now: Ns) -> tuple[int, int]:
     """What sorts ARCs into levels, the best smallest: first their priority. A protected hold counts for more,
     as only those from its protection upwards may end it. Where some are to go `first`, they go before their
-    equals, but not before those who run: equals are not preempted."""
+    equals, but not before running ones: equals are not preempted."""
     if (below := arc.protected_below(now)) is not None:
         return min(-arc.priority, 1 - below), 0
     if arc.hold is not None:
@@ -252,7 +252,7 @@ class ConflictGroup:
         ruled_out = False
         for rc in self.sharables:
             holders = frozenset(self._holders(rc, chosen))
-            # Who holds it now has been accepted; an RC that can't carry its holders any longer reports that.
+            # Its present holders have been accepted; an RC that can't carry them any longer reports that.
             if holders <= rc.holders.keys():
                 continue
             answer = self.votes.known(rc.name, holders)
@@ -266,7 +266,7 @@ class ConflictGroup:
         return None if ruled_out else proposals
 
     def take(self, chosen: int, actions: Actions) -> None:
-        """Carries the set out: ends who has to end, starts who is to start."""
+        """Carries the set out: preempts the running ARCs that it lacks, starts its queued ones."""
         taken = [chosen >> number & 1 for number in range(len(self.arcs))]
         starting = [arc for arc, one in zip(self.arcs, taken, strict=True) if one and arc.hold is None]
         ending = [arc for arc, one in zip(self.arcs, taken, strict=True) if not one and arc.hold is not None]
@@ -276,7 +276,7 @@ class ConflictGroup:
             actions.start(arc)
 
     def _vetoes(self, rc: Rc) -> Iterator[int]:
-        """The vetoes of `rc` that bear on these ARCs. Who else holds it stays."""
+        """The vetoes of `rc` that bear on these ARCs. Its other holders stay."""
         for holders in self.votes.vetoed(rc.name):
             if all(arc in self._number or arc in rc.holders for arc in holders) and (
                 nogood := self._bits(holders)
@@ -284,14 +284,14 @@ class ConflictGroup:
                 yield nogood
 
     def _probe(self, rc: Rc, holders: HolderSet) -> HolderSet:
-        """What to ask a contended RC: half of those whom it has not accepted yet, beside the others.
+        """What to ask a contended RC: half of the ARCs that it has not accepted yet, beside the others.
 
         A veto of few rules out far more sets than one of many; in a few rounds all are asked."""
         ranked, accepted = self._ranked(rc, holders)
         return frozenset(ranked[: (accepted + len(ranked) + 1) // 2])
 
     def _ranked(self, rc: Rc, holders: HolderSet) -> tuple[list[ArcId], int]:
-        """Those who hold `rc` already, then the others by rank; and how many of these it has accepted.
+        """The present holders of `rc`, then the others by rank; and how many of these it has accepted.
 
         Not all of `holders` are accepted."""
         newcomers = (arc.id for arc in self.arcs if arc.id in holders and arc.id not in rc.holders)
@@ -305,7 +305,7 @@ class ConflictGroup:
         return holders <= rc.holders.keys() or self.votes.accepts(rc.name, holders)
 
     def _holders(self, rc: Rc, chosen: int) -> Iterator[ArcId]:
-        """Who would hold `rc`."""
+        """The ARCs that would hold `rc`."""
         for holder in rc.holders:
             if holder not in self._number:
                 yield holder

@@ -1,4 +1,4 @@
-"""When will mine run: the core played forward from how things stand, as if nothing else were to come.
+"""When will mine run: the core played forward from its present state, as if no further event were to come.
 
 The forecast runs the very core and strategy that decide. RCs are taken to vote as they have voted; a question
 that was never asked is taken to be a yes. Higher priority that comes later makes it wrong, of course, and so
@@ -36,7 +36,7 @@ class Forecast:
     """What is to be expected: when who waits starts, and whom a newcomer would preempt at once."""
 
     starts: dict[ArcId, Ns] = field(default_factory=dict)
-    """Those that are not in it never start as things stand, or not within what was played."""
+    """ARCs that are missing never start from the present state, or not within what was played."""
     preempts: list[ArcId] = field(default_factory=list)
     reason: Reason | None = None
     """What the newcomer waits for at first; None if it starts at once."""

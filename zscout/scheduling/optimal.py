@@ -166,7 +166,7 @@ class Optimal(Strategy):
         for group in conflict_groups(state):
             if not decide(group, actions):
                 held |= group.mask
-        # Nothing is left for it to start; it reports to those who wait what they wait for.
+        # Nothing is left for it to start; it reports to the waiting ARCs what they wait for.
         priority.run_pass(state, actions, off_limits=held)
 
 

@@ -3,21 +3,21 @@
 A pass:
 
 1. Take the changes since the last pass: RCs freed, joined or lost, votes that came or fell.
-2. Collect whom to check: those who are ready, and the first watcher of each RC that was freed.
+2. Collect the ARCs to check: the ready ones, and the first watcher of each RC that was freed.
 3. Check them in rank order (`AdmissionCheck`). For each, `a`:
    a. An RC of `a` is absent, or held by one that is not preempted for `a`: `a` waits.
    b. Every sharable RC that `a` needs must accept `a` beside all who would still hold it if the exclusive
       victims (who hold an exclusive RC that `a` needs) and the preemptible sharers (who hold a sharable RC
-      that `a` needs) were gone. Otherwise `a` waits, and nobody is preempted.
+      that `a` needs) were gone. Otherwise `a` waits, and nothing is preempted.
    c. Reprieve: preemptible sharers stay, in rank order, as long as the votes allow; others are preempted.
    d. `a` starts.
-4. Index `a` by what it waits for, or preempt its victims and start it; what that changes calls others.
+4. Index `a` by what it waits for, or preempt its victims and start it; ARCs that this concerns are checked.
 
 A vote that is not known yet leaves a check undecided. What an undecided check would take or free is *off
 limits* for lower ranks, and so is what a check stopped by that would take or free; all others go on.
 
 **Why a pass can be run again at any time.** What a lower rank takes never makes a higher one possible (a
-lower rank only preempts those who would have been preempted for the higher one as well, and votes are
+lower rank only preempts holders that would have been preempted for the higher one as well, and votes are
 monotone). So an answer that arrives simply runs the next pass, and the outcome is that of votes given on
 the spot.
 
@@ -30,8 +30,8 @@ nothing:
   RC instead ranks above all that still watch it below, so it is not preempted for them either: after the
   first watcher that takes the RC, the others need no check. (c) A sharable RC that vetoed it beside the
   holders that are not preempted: until one of them goes or passes its minimum runtime, or the RC's rules
-  change; more holders leave a veto standing, because what an RC accepts it accepts of every subset. (d) An
-  RC that is reserved for another (`reservations.py`): until other reservations stand there. When the RC
+  change; more holders leave a veto in force, because what an RC accepts it accepts of every subset. (d) An
+  RC that is reserved for another (`reservations.py`): until its reservations change. When the RC
   becomes off limits, its watchers below are checked.
 - It is PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked
   when anything within changes, is answered or becomes off limits, and when that RC may be asked again.
@@ -83,7 +83,7 @@ class Admissible:
 
 
 class AdmissionCheck:
-    """Who is in the way of a queued ARC, what it would take and free, what the RCs vote."""
+    """The holders in the way of a queued ARC, the RCs that it would take and free, how the RCs vote."""
 
     def __init__(self, state: SchedulerState, arc: Arc) -> None:
         self.state, self.arc = state, arc
@@ -165,8 +165,7 @@ class AdmissionCheck:
         return Admissible(sorted(victims, key=lambda arc: arc.rank))
 
     def refusal(self) -> Reason | None:
-        """The veto that keeps the ARC out beside those who would stay, before the silence of an RC that does
-        not answer; None if there is neither."""
+        """The veto that keeps the ARC out, else that an RC does not answer; None if there is neither."""
         unresponsive = None
         for rc in self._sharables:
             answer = self._answer(rc)
@@ -177,11 +176,11 @@ class AdmissionCheck:
         return unresponsive
 
     def _answer(self, rc: Rc) -> Answer | None:
-        """What `rc` votes on the ARC beside those who would stay."""
+        """What `rc` votes on the ARC beside its holders that are not preempted for it."""
         return self.votes.known(rc.name, self._with_non_preemptible(rc))
 
     def _with_non_preemptible(self, rc: Rc) -> HolderSet:
-        """The ARC beside those who would stay."""
+        """The ARC and the holders of `rc` that are not preempted for it."""
         return frozenset(
             (*(holder.id for holder in rc.non_preemptible_holders(self.arc, self.now)), self.arc.id)
         )
@@ -216,8 +215,8 @@ VOTING: Final = Reason(ReasonCode.VOTING)
 MAX_BINDINGS: Final = 16
 """Bindings that one check tries."""
 MAX_REPORTED: Final = 4
-"""How many of those who watch an RC have a new holder reported at once; `Core.arc` gives it to the rest. In a
-long queue every grant would else be news to everyone."""
+"""To how many of an RC's watchers a new holder is reported at once; for the others `Core.arc` has it. In a
+long queue every grant would else be reported to every ARC."""
 
 _Verdict: TypeAlias = (
     Inadmissible | VotesNeeded | Admissible | ReservationConflict | Literal["off limits", "over quota"]
@@ -236,7 +235,7 @@ class Priority(Strategy):
 def run_pass(
     state: SchedulerState, actions: Actions, *, off_limits: int = 0, reserved: Reservations | None = None
 ) -> None:
-    """One pass over the queue, as far as something has changed for those who wait.
+    """One pass over the queue, as far as something has changed for the queued ARCs.
 
     `off_limits`: bits of RCs that another strategy is still deciding about. `reserved`: what is reserved for
     starving ARCs; the paper's own strategy knows no such thing."""
@@ -244,7 +243,7 @@ def run_pass(
 
 
 class Pass:
-    """Checks in rank order: those who are ready, and those who watch what has been freed."""
+    """Checks in rank order the ready ARCs, and the watchers of RCs that have been freed."""
 
     def __init__(self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None) -> None:
         self.state, self.actions, self.reserved = state, actions, reserved
@@ -253,7 +252,7 @@ class Pass:
         self.changed = 0
         """Bits of the RCs at which something is new since the last pass began."""
         self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
-        """Who is next, beside the ready ones. By way of an RC come its watchers, one after the other."""
+        """The next ARCs to check, beside the ready ones; the watchers of an RC one after the other."""
         self._reports_left: dict[int, int] = {}
         """By bit of each RC whose watchers come: to how many more of them a new holder is reported."""
         self._changed_here = 0
@@ -331,7 +330,7 @@ class Pass:
         return bits & arc.mask & ~arc.named_mask
 
     def _verdict(self, arc: Arc, check: AdmissionCheck) -> _Verdict:
-        """What a check comes to, as things stand."""
+        """The outcome of a check in the present state."""
         obstacle = check.obstacle(self.off_limits)
         if obstacle is not None:
             return obstacle

@@ -3,12 +3,12 @@
 Shortest-first starves, and so does the larger set of ARCs where it is preferred to a smaller one. The remedy
 is that of batch schedulers, reservation with conservative backfill (Mu'alem and Feitelson, IEEE TPDS 12(6),
 2001), on distinct RCs instead of many equal processors, and with a date: what is reserved is the time from
-which the ARC is due, so that until then nobody is held back who would be over by then. Minimum runtimes are
+which the ARC is due, so that no ARC is held back that would be over by then. Minimum runtimes are
 exact, so reservations are.
 
-From half its patience on, an ARC is *starving*. In the order of priority, then of waiting, each of the
-starving is given the earliest time, from when it is due, at which its RCs are free of those who hold them
-and are not preempted for it, and of those who were starving before it. An ARC of equal or lower priority
+From half its patience on, an ARC is *starving*. In the order of priority, then of waiting, each
+starving ARC is given the earliest time, from when it is due, at which its RCs are free of the holders
+that are not preempted for it, and of the ARCs that were starving before it. An ARC of equal or lower priority
 that shares an RC with it may start only if it is over by then, or if the RC is sharable and accepts it
 beside everyone concerned.
 

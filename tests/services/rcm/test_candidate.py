@@ -78,13 +78,13 @@ def test_a_leader_steps_down_for_a_higher_term_and_asks_nothing_more() -> None:
         fleet = FakeFleet()
         candidate = fleet.candidate("x")
         await until(lambda: candidate.rcm)
-        (reign,) = await living(fleet, Role.RCM)
+        (leading,) = await living(fleet, Role.RCM)
         # An RC that comes has promised a higher term: it refuses this one, however often it is asked.
         robot = fleet.rc("robot/a", term=Term(7, "other"), leader=True)
         await until(lambda: candidate.rcm is None)
         assert candidate.known == Term(7, "other")
         await asyncio.sleep(5)
-        assert [asked.promise for asked in robot.asked if asked.promise] == [Term(1, reign[1])]
+        assert [asked.promise for asked in robot.asked if asked.promise] == [Term(1, leading[1])]
         robot.leader = False
         await until(lambda: candidate.rcm)
         assert robot.term.counter == 8
@@ -186,7 +186,7 @@ def test_a_candidate_that_always_fails_tries_less_and_less(
     assert set(gaps[6:]) == {MAX_BACKOFF}
 
 
-def test_a_reign_that_is_over_asks_nothing_more() -> None:
+def test_a_term_that_is_over_asks_nothing_more() -> None:
     async def story() -> None:
         fleet = FakeFleet()
         rcm = fleet.rcm()

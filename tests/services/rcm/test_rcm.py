@@ -1,4 +1,4 @@
-"""A reign from request to notice: the real RCM and core on a mesh in memory."""
+"""A term from request to notice: the real RCM and core on a mesh in memory."""
 
 from __future__ import annotations
 
