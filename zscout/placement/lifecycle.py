@@ -120,10 +120,14 @@ class Lifecycle:
             self._start_on(record, untried)
         elif not hosts:
             tried.clear()
-            reason = f"no host will do: {why_none}"
-            # The figures in it change all the time: for them alone it is not published again.
-            if FIGURES.sub("", reason) != FIGURES.sub("", record.reason):
-                record.reason = reason
+            # The figures change all the time: for them alone it is not published again.
+            causes = FIGURES.sub("", why_none)
+            if record.no_host is None and _explains(record.reason, causes):
+                # Inherited: all that is known of the causes then is the reason.
+                record.no_host = causes, record.reason
+            if record.no_host != (causes, record.reason):
+                record.reason = f"no host will do: {why_none}"
+                record.no_host = causes, record.reason
             self.state.wake(record, self.state.now + TRY_AGAIN)
         elif all(tried[one.host] for one in hosts):
             refusals = list(dict.fromkeys(tried[one.host] for one in hosts))
@@ -378,6 +382,15 @@ def _cause(end: Termination, host: HostName) -> str:
             return f"it was stopped on {host}, and not by the placer"
         case _:
             return end.reason
+
+
+def _explains(reason: str, causes: str) -> bool:
+    """Whether a reason of before names these hosts and causes, or no host is known now."""
+    known = [one.partition(": ") for one in causes.split("; ") if ": " in one]
+    before = FIGURES.sub("", reason)
+    return before.startswith("no host will do") and all(
+        f"{host}: " in before and cause in before for host, _, cause in known
+    )
 
 
 def _seconds(pause: Ns) -> str:

@@ -142,6 +142,8 @@ class ComponentRecord:
     """Its host reported that it runs, and whether it is movable."""
     probed: bool = False
     """A probe is sent, and not answered."""
+    no_host: tuple[str, str] | None = None
+    """Why no host would do, without its figures, and the reason given for that."""
     tried: dict[HostName, str] = field(default_factory=dict)
     """Hosts that did not start it in this round, with the reason if another try there would not help."""
     whereabouts_unknown: bool = False
