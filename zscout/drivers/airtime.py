@@ -2,11 +2,11 @@
 
 A holder asks for `command_rate` packets a second of at most `packet_size` bytes. Its packets pass a token
 bucket with room for one packet: in any `t` seconds at most `L (1 + r t)` bytes of it come out (`L` bytes a
-packet, `r` packets a second). They then stand in one queue, first come first served, before a line of `C`
+packet, `r` packets a second). They then wait in one queue, first come first served, before a line of `C`
 bytes a second. Halts and stops go ahead of them. These and everything that is sent again together keep to a
 bucket of their own of `U` bytes, filled at `s C`: the reserve.
 
-The bound (network calculus; Le Boudec and Thiran, "Network Calculus", section 1.4: FIFO server, leaky
+The delay bound (network calculus; Le Boudec and Thiran, "Network Calculus", section 1.4: FIFO server, leaky
 buckets). Let a packet enter the queue at `t`, be through the line at `t + d`, and let the line have been busy
 since `b <= t`. What it carried in between came in after `b`, or was under way then (`M` bytes, one packet):
 
@@ -78,7 +78,7 @@ def urgent_burst(holders: int) -> int:
 
 
 def longest_wait(rate: Fraction, shares: Iterable[Share]) -> Fraction:
-    """Seconds from when a packet enters the queue until it is through the line, at most: the bound above."""
+    """Seconds from when a packet enters the queue until it is through the line: the delay bound above."""
     sizes = [share.size for share in shares]
     return (MAX_PACKET + sum(sizes) + urgent_burst(len(sizes))) / (rate * (1 - RESERVE))
 

@@ -70,7 +70,7 @@ class Capture:
         self.source = source
         self.kind = kind_of(source)
         self.health = "not open yet"
-        """`ok` while pictures come; or in words what is wrong, without passwords that stand in a URL."""
+        """`ok` while pictures come; or in words what is wrong, without passwords that are in a URL."""
         self.number = 0
         """Of the newest picture; 0 while there was none."""
         self.opened = 0
@@ -236,7 +236,7 @@ def kind_of(source: str) -> Literal["device", "file", "url"]:
 
 
 def shown(source: str) -> str:
-    """A source as it may be shown and logged: a URL without user, password and query, where secrets stand."""
+    """A source as it may be shown and logged: a URL without user, password and query, where secrets are."""
     if kind_of(source) != "url":
         return source
     try:

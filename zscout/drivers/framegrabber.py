@@ -1,6 +1,6 @@
 """A framegrabber: pictures of an OpenCV source, published as JPEG while it is held and has subscribers.
 
-It is tuned to the video RC that stands in the gang of its holder. Three things happen side by side: a capture
+It is tuned to the video RC that is in the gang of its holder. Three things happen side by side: a capture
 reads the source (`capture.py`), a pump encodes and publishes in a thread of its own, and the event loop
 supervises both: a framegrabber that has no picture for LOST_AFTER while it is held reports itself lost,
 goes on trying, and is back with the first picture.
@@ -59,7 +59,7 @@ class FramegrabberDriver(Driver):
     """`sources` are what `Capture` takes, by the video RC that each shows; {"": source} where there is only
     one, whatever it shows. At most `rate` frames a second are published, with JPEG `quality` 1..100.
 
-    Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (how things stand).
+    Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state).
     """
 
     _rc: RcHandle

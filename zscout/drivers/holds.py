@@ -88,7 +88,7 @@ class HoldTable:
         self.held: dict[Grant, HoldEntry] = {}
         self._ended: OrderedDict[Grant, str] = OrderedDict()
         self._awaited: set[Grant] = set()
-        """Grants that a snapshot names while another hold stands: their publication is still to come."""
+        """Grants that a snapshot names while another hold is in force: their publication is still to come."""
 
     # Publications and snapshots
 

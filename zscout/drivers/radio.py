@@ -42,7 +42,7 @@ class RadioDriver(Driver):
     relays = True
 
     def __init__(self, port: str, *, baud: int, bound: float) -> None:
-        """`port` for `serial.serial_for_url`; `bound` in seconds: how long a packet may wait at most."""
+        """`port` for `serial.serial_for_url`; `bound` in seconds: the delay bound of a packet."""
         self._port, self._baud = port, baud
         self._rate = line_rate(baud)
         self._bound = Fraction(str(bound))

@@ -1,7 +1,7 @@
 """A resource controller (RC) on the mesh: the part that every driver shares.
 
 A driver (`driver.py`) controls its device; `ResourceController` owns the keys, checks every command against
-the hold that stands when it is carried out, votes, and puts the device into its safe state when its holder is
+the hold in force when it is carried out, votes, and puts the device into its safe state when its holder is
 gone.
 """
 

@@ -264,8 +264,8 @@ class TransmitQueue:
 
     # Going out
 
-    def next(self, now: Ns, stands: Callable[[Grant], bool]) -> OutgoingPacket | None:
-        """The packet to be written now, if there is one and the line has room. `stands` is whether the
+    def next(self, now: Ns, in_force: Callable[[Grant], bool]) -> OutgoingPacket | None:
+        """The packet to be written now, if there is one and the line has room. `in_force` is whether the
         hold behind a packet is still in force: that is what counts when it goes out."""
         if self._free_at - now > self._ahead:
             return None
@@ -285,7 +285,7 @@ class TransmitQueue:
             return self._transmit(robot.repeat(repeat, now), Fraction(at), now, repeat=True)
         while self._queue:
             waiting = self._queue.popleft()
-            if not stands(waiting.grant):
+            if not in_force(waiting.grant):
                 self.dropped += 1
                 continue
             command, number = waiting.command, self._robot(waiting.command.robot).number()

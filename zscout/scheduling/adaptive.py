@@ -194,7 +194,7 @@ class Adaptive(Strategy):
 
     def _ask(self, group: ConflictGroup, search: _Search, chosen: int, actions: Actions) -> _Asked:
         """Asks what is not known yet about a set. NO: a silent RC rules it out; that is barred now."""
-        proposals = group.ask(chosen)
+        proposals = group.missing_votes(chosen)
         if proposals == []:
             return YES
         sets = None if proposals is None else [(rc.name, holders) for rc, holders in proposals]

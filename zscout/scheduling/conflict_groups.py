@@ -246,8 +246,8 @@ class ConflictGroup:
     def problem(self) -> PackingProblem:
         return PackingProblem(self.items, sorted(self.nogoods))
 
-    def ask(self, chosen: int) -> list[tuple[Rc, HolderSet]] | None:
-        """What has to be asked before this set can be taken. None: a veto, now in `nogoods`, rules it out."""
+    def missing_votes(self, chosen: int) -> list[tuple[Rc, HolderSet]] | None:
+        """The proposals to make before the set can be taken. None: a veto, now in `nogoods`, rules it out."""
         proposals: list[tuple[Rc, HolderSet]] = []
         ruled_out = False
         for rc in self.sharables:
@@ -284,7 +284,7 @@ class ConflictGroup:
                 yield nogood
 
     def _probe(self, rc: Rc, holders: HolderSet) -> HolderSet:
-        """What to ask a contended RC: half of the ARCs that it has not accepted yet, beside the others.
+        """To propose to a contended RC: half of the ARCs that it has not accepted yet, beside the others.
 
         A veto of few rules out far more sets than one of many; in a few rounds all are asked."""
         ranked, accepted = self._ranked(rc, holders)

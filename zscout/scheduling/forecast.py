@@ -1,7 +1,7 @@
 """When will mine run: the core played forward from its present state, as if no further event were to come.
 
-The forecast runs the very core and strategy that decide. RCs are taken to vote as they have voted; a question
-that was never asked is taken to be a yes. Higher priority that comes later makes it wrong, of course, and so
+The forecast runs the very core and strategy that decide. RCs are taken to vote as they have voted; a proposal
+that was never made is taken to be a yes. Higher priority that comes later makes it wrong, of course, and so
 does who releases early: it is an estimate, and is shown as one.
 """
 

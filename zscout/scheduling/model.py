@@ -255,7 +255,7 @@ class Vote:
 
 @dataclass(frozen=True, slots=True)
 class VoteOverdue:
-    """No answer to a proposal in time, or the question could not be delivered."""
+    """No answer to a proposal in time, or it could not be delivered."""
 
     proposal: int
 

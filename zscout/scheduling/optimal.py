@@ -173,14 +173,14 @@ class Optimal(Strategy):
 def decide(group: ConflictGroup, actions: Actions) -> bool:
     """Takes the best set of a group, or leaves it to `priority`. False: votes are out; nothing changes
     yet."""
-    questions = None
-    while questions is None:
+    proposals = None
+    while proposals is None:
         if len(group.nogoods) > MAX_VETOES:
             return True
         # None: a veto that was known ruled it out, and each round bars at least one more set.
-        questions = group.ask(chosen := best(group.problem()))
-    if questions:
-        for rc, holders in questions:
+        proposals = group.missing_votes(chosen := best(group.problem()))
+    if proposals:
+        for rc, holders in proposals:
             actions.propose(rc, holders)
         return False
     group.take(chosen, actions)

@@ -45,7 +45,7 @@ class Binder:
 
     def bind(self, arc: Arc, without: int = 0) -> bool:
         """Binds `arc` to the best RCs there are but those of `without`, a bit mask. False: there is no such
-        binding; the old one stands."""
+        binding; the old one stays."""
         chosen = self._choose(arc, without)
         if chosen is None:
             return False

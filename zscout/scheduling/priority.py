@@ -70,7 +70,7 @@ class Inadmissible:
 
 @dataclass(frozen=True, slots=True)
 class VotesNeeded:
-    """The check can't be decided before these are answered."""
+    """The check can't be decided before these proposals are answered."""
 
     proposals: list[tuple[Rc, HolderSet]]
 
@@ -91,7 +91,7 @@ class AdmissionCheck:
         self.non_preemptible: list[tuple[Rc, Arc]] = []
         """Exclusive RCs that it needs, with holders that are not preempted for it."""
         self.exclusive_victims: dict[ArcId, Arc] = {}
-        """Holders of exclusive RCs that it needs: preempted if it starts."""
+        """Holders of exclusive RCs that it needs, preemptible for it: they end if it starts."""
         self._sharables: list[Rc] = []
         for rc in arc.rcs:
             if rc.sharable:
@@ -146,14 +146,14 @@ class AdmissionCheck:
     def decide(self) -> Inadmissible | VotesNeeded | Admissible:
         """Steps 3b and 3c, with the votes that are known. Only for a check without an obstacle."""
         kept = {rc.name: self._with_non_preemptible(rc) for rc in self._sharables}
-        verdict = self._ask([(rc, kept[rc.name]) for rc in self._sharables])
+        verdict = self._votes_on([(rc, kept[rc.name]) for rc in self._sharables])
         if verdict is not None:
             return verdict
         victims = list(self.exclusive_victims.values())
         for sharer in self._preemptible_sharers():
             shared = [rc for rc in self._sharables if sharer.id in rc.holders]
             beside = [(rc, kept[rc.name] | {sharer.id}) for rc in shared]
-            verdict = self._ask(beside)
+            verdict = self._votes_on(beside)
             match verdict:
                 case None:
                     for rc, holders in beside:
@@ -195,8 +195,8 @@ class AdmissionCheck:
         }
         return sorted(found.values(), key=lambda arc: arc.rank)
 
-    def _ask(self, sets: list[tuple[Rc, HolderSet]]) -> Inadmissible | VotesNeeded | None:
-        """None if all RCs accept. A veto settles it whatever else is unknown."""
+    def _votes_on(self, sets: list[tuple[Rc, HolderSet]]) -> Inadmissible | VotesNeeded | None:
+        """None if all RCs accept these sets. One veto decides, whatever else is unknown."""
         unknown: list[tuple[Rc, HolderSet]] = []
         for rc, holders in sets:
             answer = self.votes.known(rc.name, holders)

@@ -282,7 +282,7 @@ class SchedulerState:
         return self._clients.get(client, {}).values()
 
     def hand_over(self, arc: Arc, to: ClientId, renamed: ArcId) -> None:
-        """An ARC goes on under another client, by another name. Its hold stands, or its wait goes on."""
+        """An ARC goes on under another client, by another name. Its hold or its wait goes on."""
         if arc.hold is None:
             self.dequeue(arc)
             self._rename(arc, to, renamed)

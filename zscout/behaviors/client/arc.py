@@ -68,7 +68,7 @@ class Held:
 
     @property
     def active(self) -> bool:
-        """Whether the hold still stands, as far as this client knows."""
+        """Whether the hold is still in force, as far as this client knows."""
         return self.arc.grant == self.grant
 
     @property

@@ -316,7 +316,7 @@ class Client:
         """The client to which all was handed is gone: this one goes on, and asks anew for each, at its place.
 
         Bodies are interrupted as by any other lost hold. What was not handed over after all, where that was
-        unknown, simply stands."""
+        unknown, simply stays."""
         self._may_end.set()
         self._handover.take_back()
 

@@ -24,7 +24,7 @@ QUERY_TIMEOUT = 1.0
 ASK_AGAIN = 5.0
 """Seconds between two askings of an open request, give or take a fifth."""
 BACKOFF = (0.05, 1.0)
-"""Seconds before a question that nobody answered is repeated: first, and at most."""
+"""Seconds before a query without an answer is repeated: first, and at most."""
 END_TRIES = 3
 TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full"})
 CHECKS_PER_LEASE = 10

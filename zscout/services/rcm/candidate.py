@@ -1,4 +1,4 @@
-"""A node's candidacy for the RCM: sees whether somebody leads, and takes over when nobody does.
+"""A node's candidacy for the RCM: sees whether an RCM leads, and takes over when none does.
 
 Taking over: ask the RCs whether they still see a leader; take a term above all that is known; ask all RCs
 and clients for their holds and requests, which binds the RCs to the new term; lead over that.
@@ -179,10 +179,10 @@ class Candidate:
             if self.election.sees_leader(self.mesh.now()):
                 return False
             term = Term(self.known.counter + 1, new_instance())
-            question = RcAsk(promise=term)
+            promise_query = RcAsk(promise=term)
             rcs, clients = await asyncio.gather(
-                self.mesh.ask(keys.rc_state_any, question, RcState, timeout=timeout),
-                self.mesh.ask(keys.requests_any, question, ClientRequests, timeout=timeout),
+                self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=timeout),
+                self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=timeout),
             )
             problems = [*(reply.problem for reply in rcs), *(reply.problem for reply in clients)]
             for problem in problems:

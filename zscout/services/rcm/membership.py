@@ -67,7 +67,7 @@ class Membership:
     # Clients
 
     def expect(self, client: ClientId) -> None:
-        """A client with requests must live; one that nobody has seen yet gets a lease to show itself."""
+        """A client with requests must live; one that was not seen yet gets a lease to show itself."""
         if client not in self.clients and client not in self._unseen:
             self._unseen[client] = self._supervisor.call_later(self._lease, self._client_lost, client)
 
@@ -143,7 +143,7 @@ class Membership:
                         self._emit(RcJoined(token.name, state.sharable))
                     self._on_reported(token.name, state)
                     return
-            # No answer can come at once, and again and again: a token may stand for nothing.
+            # No answer can come at once, and again and again: a token may outlive its RC.
             await asyncio.sleep(self._timeout)
 
     def _is_wanted(self, token: Token) -> bool:
