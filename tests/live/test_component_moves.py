@@ -155,7 +155,7 @@ def test_what_waits_for_its_arc_moves_with_its_place(tmp_path: Path) -> None:
 
 def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Path) -> None:
     async def story() -> None:
-        async with ComponentLab(tmp_path) as lab:
+        async with ComponentLab(tmp_path, candidates=["a"]) as lab:
             lab.node("a", "robot/x")
             lab.node("b")
             client = await lab.client()
