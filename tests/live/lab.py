@@ -24,6 +24,10 @@ from zscout.messages import RcAsk, RcmState, RcState
 from zscout.types import Ns
 
 
+PATIENT = 10.0
+"""Seconds of leases where none is to end: on a busy machine a process may not run for a second or two."""
+
+
 class Lab:
     """Nodes of one fleet on this machine, apart from every other mesh by name and multicast port.
 
@@ -34,7 +38,7 @@ class Lab:
         self,
         folder: Path,
         *,
-        lease: float = 1.0,
+        lease: float | None = None,
         candidates: Sequence[str] = (),
         extra: str = "",
         strategy: StrategyName = "adaptive",
@@ -47,8 +51,12 @@ class Lab:
         self.fleet_file = folder / "fleet.toml"
         names = ", ".join(f'"{name}"' for name in candidates)
         port = random.randint(20_000, 60_000)  # noqa: S311
+        if lease is None:
+            lease = 1.0 if "hold_lease" in extra else PATIENT
         if "[placement]" not in extra:
             extra += f"\n[placement]\nstart_timeout = {HANG}"
+        if "[timing]" not in extra:  # as much longer as in the default fleet
+            extra += f"\n[timing]\nhold_lease = {3 * lease}"
         self.fleet_file.write_text(
             f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\nstrategy = "{strategy}"\n'
             f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\n'

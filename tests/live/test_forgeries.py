@@ -149,7 +149,7 @@ def test_a_client_does_not_fall_for_forged_notices(tmp_path: Path) -> None:
 
 def test_a_token_that_only_claims_to_lead_stops_no_takeover(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, candidates=("a", "b")) as lab:
+        async with Lab(tmp_path, lease=1.0, candidates=("a", "b")) as lab:
             lab.node("c", "robot/a", "radio/a:rate=10", extra="candidate = false")
             lab.node("a")
             lab.node("b")

@@ -22,7 +22,7 @@ ROUNDS = 10
 
 def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path) as lab:
+        async with Lab(tmp_path, lease=1.0) as lab:
             lab.node("a")
             lab.node("b", "robot/x", extra="candidate = false")
             client = await lab.client()

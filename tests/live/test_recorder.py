@@ -253,7 +253,7 @@ def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path: Path
     runs = tmp_path / "runs"
 
     async def story() -> None:
-        async with Lab(tmp_path, candidates=["a"]) as lab:
+        async with Lab(tmp_path, lease=1.0, candidates=["a"]) as lab:
             lab.node("a")
             lab.node("b", "robot/b", extra="candidate = false\n" + recorder())
             client = await lab.client("crew")
