@@ -55,7 +55,7 @@ class Placing:
             while True:
                 reply = await self.client.mesh.ask_one(key, operation, kind, timeout=HANG)
                 answer = None if reply is None else reply.message or reply.problem
-                if isinstance(answer, Problem) and answer.code == "not_leading":
+                if isinstance(answer, Problem) and answer.code in ("not_leading", "busy"):
                     answer = None
                 if answer is not None:
                     return answer

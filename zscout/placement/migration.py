@@ -59,6 +59,9 @@ class Migrations:
             state.refuse(component, "not_running", message)
         elif to == record.host:
             state.mark_changed(component, always=True)
+        elif not record.movable and not record.confirmed:
+            message = f"{component} has just started: {record.host} has not said yet whether it can be moved"
+            state.refuse(component, "busy", f"{message}; ask again")
         elif not record.movable:
             state.refuse(component, "not_movable", f"{component} gives no checkpoint: it can't be moved")
         else:
