@@ -13,7 +13,7 @@ import time
 import urllib.request
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -32,8 +32,6 @@ from tests.services.recorder.paper_run import (
     play_table1,
     second_by_second,
 )
-from zscout.cli.common import Failed
-from zscout.cli.fleet import view
 from zscout.services.recorder.timeline import Timeline
 
 OPEN = re.compile(rb"^Open (http://\S+)", re.MULTILINE)
@@ -137,25 +135,6 @@ def test_as_json_it_says_once_where_all_is(recording: Path, tmp_path: Path) -> N
         process.send_signal(signal.SIGINT)
         assert process.wait(HANG) == 130
     assert (tmp_path / "view.log").read_text().count("\n") == 1
-
-
-def test_a_port_that_another_takes_just_then_is_not_insisted_on(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def served(port: int | None) -> int:
-        async with AsyncExitStack() as stack:
-            return (await view._serve_web(stack, "127.0.0.1", port, str(recording)))[1]
-
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        taken, free_port = other.getsockname()[1], view.free_port
-
-        def late(bind: str, *ports: int) -> int:
-            return int(taken) if ports in ((view.WEB_PORT, 0), (taken,)) else free_port(bind, *ports)
-
-        monkeypatch.setattr(view, "free_port", late)
-        assert asyncio.run(served(None)) != taken
-        with pytest.raises(Failed, match="Address already in use"):
-            asyncio.run(served(taken))
 
 
 def said_as_json(folder: Path, process: subprocess.Popen[bytes]) -> dict[str, Any]:

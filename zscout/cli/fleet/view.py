@@ -12,7 +12,7 @@ import socket
 import sys
 from collections import deque
 from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, suppress
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -32,7 +32,6 @@ from zscout.services.recorder.process import BAD_SETTINGS, RecorderJob, Recordin
 WEB_PORT: Final = 9090
 MAGIC: Final = b"RRF"
 """How every recording begins."""
-TAKEN: Final = "Address already in use"
 HOSTING: Final = "Hosting a web-viewer at"
 START: Final = 20.0
 """Seconds within which a recorder or a viewer has come up, on a busy machine."""
@@ -92,53 +91,36 @@ async def view(file: Path | None, web: bool, bind: str, port: int | None, out: P
             "no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser"
         )
     # The page comes last, so what it shows needs its own port first.
-    async with AsyncExitStack() as stack:
-        recording, recorder = await stack.enter_async_context(_source(file, bind, None if web else port, out))
+    async with _source(file, bind, None if web else port, out) as (recording, recorder):
         shown = recording.url or recording.file
         if not as_json and recorder is not None:
             terminal.print_line(f"Recording to {recording.file}")
             terminal.print_line(f"Live at {recording.url}")
         address: str | None = None
         if web:
-            window, page, stream = await _serve_web(stack, bind, port, shown)
-            source = shown if file is None else f"rerun+http://{_host(bind)}:{stream}/proxy"
-            url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
-            address = f"http://{_host(bind)}:{page}/?url={url}&renderer=webgl&hide_welcome_screen=1"
+            page = free_port(bind, port) if port is not None else free_port(bind, WEB_PORT, 0)
+            stream = free_port(bind, 0)
+            ports = ("--web-viewer-port", str(page), "--port", str(stream))
+            started = viewer("--serve-web", "--bind", bind, *ports, shown, log="info")
         else:
-            connect = ["--connect"] if file is None else []
-            window = await stack.enter_async_context(viewer(*WINDOW, *connect, shown))
-        if as_json:
-            terminal.print_json({"url": address, "live": recording.url, "file": recording.file})
-        elif web:
-            terminal.print_line(f"Open {address}")
-            terminal.print_line("Ctrl-C ends")
-        children = [window] + ([recorder] if recorder is not None else [])
-        ended = await common.first_of(*(one.process.wait() for one in children))
-        for one, over in zip(children, ended, strict=True):
-            # The viewer may be closed.
-            if over and (one is not window or one.process.returncode != 0):
-                raise await one.failed()
-
-
-async def _serve_web(
-    stack: AsyncExitStack, bind: str, port: int | None, shown: str
-) -> tuple[Child, int, int]:
-    """The viewer as a web page, its port and its stream's. Raises BadInput and Failed."""
-    wanted = [(port,)] if port is not None else [(WEB_PORT, 0), (0,)]
-    while True:
-        page, stream = free_port(bind, *wanted.pop(0)), free_port(bind, 0)
-        ports = ("--web-viewer-port", str(page), "--port", str(stream))
-        window = await stack.enter_async_context(
-            viewer("--serve-web", "--bind", bind, *ports, shown, log="info")
-        )
-        try:
-            await window.says(HOSTING)
-        except common.Failed as failed:
-            # Another program was quicker to take the port that was free.
-            if not wanted or TAKEN not in str(failed):
-                raise
-        else:
-            return window, page, stream
+            started = viewer(*WINDOW, *(["--connect"] if file is None else []), shown)
+        async with started as window:
+            if web:
+                await window.says(HOSTING)
+                source = shown if file is None else f"rerun+http://{_host(bind)}:{stream}/proxy"
+                url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
+                address = f"http://{_host(bind)}:{page}/?url={url}&renderer=webgl&hide_welcome_screen=1"
+            if as_json:
+                terminal.print_json({"url": address, "live": recording.url, "file": recording.file})
+            elif web:
+                terminal.print_line(f"Open {address}")
+                terminal.print_line("Ctrl-C ends")
+            children = [window] + ([recorder] if recorder is not None else [])
+            ended = await common.first_of(*(one.process.wait() for one in children))
+            for one, over in zip(children, ended, strict=True):
+                # The viewer may be closed.
+                if over and (one is not window or one.process.returncode != 0):
+                    raise await one.failed()
 
 
 @asynccontextmanager
