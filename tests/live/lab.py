@@ -23,7 +23,6 @@ from zscout.mesh import clock
 from zscout.messages import RcAsk, RcmState, RcState
 from zscout.types import Ns
 
-
 PATIENT = 10.0
 """Seconds of leases where none is to end: on a busy machine a process may not run for a second or two."""
 
