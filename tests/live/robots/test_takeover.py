@@ -98,7 +98,10 @@ def test_takeover(tmp_path: Path) -> None:
 
                 took = []
                 for _ in range(ROUNDS):
+                    said = len(looking.events)
                     took.append(await shift.taken(looking))
+                    # The robot obeys before its operator knows.
+                    await looking.says("driving", since=said)
                     looking.type(b"g")
                     await shift.goes_on()
                 p50, worst = 1000 * statistics.median(took), 1000 * max(took)
@@ -120,8 +123,10 @@ def test_takeover(tmp_path: Path) -> None:
                 assert "Traceback" not in hung_up.text
                 events = [one["event"] for one in looking.events]
                 assert events[0] == "picture"
-                for event, count in (("taken", ROUNDS + 1), ("driving", ROUNDS + 1), ("free", ROUNDS)):
+                for event, count in (("taken", ROUNDS + 1), ("free", ROUNDS)):
                     assert events.count(event) == count, event
+                # The last one ended it perhaps before that was known.
+                assert events.count("driving") in (ROUNDS, ROUNDS + 1)
                 assert events[-1] == "ended"
                 assert all(one["takeover"] > 0 for one in looking.events if one["event"] == "driving")
                 assert await unknown.ended() == 2
