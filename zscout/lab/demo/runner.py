@@ -96,8 +96,10 @@ class DemoRunner(ABC):
         self._ends = {host: f"tcp/127.0.0.1:{port}" for host, port in zip(HOSTS, ports, strict=True)}
         self._fleet_file.write_text(
             f'[fleet]\nname = "demo-{new_instance()}"\ncandidates = {_list(HOSTS)}\n'
-            '[mesh]\nmulticast = false\nlisten = ["tcp/127.0.0.1:0"]\n'
+            '[mesh]\nmulticast = false\nlease = 5\nlisten = ["tcp/127.0.0.1:0"]\n'
             f"connect = {_list(list(self._ends.values()))}\n"
+            # Nobody fails here unnoticed, and a process of a busy machine may not run for a second.
+            "[timing]\nhold_lease = 10\n"
         )
 
     async def start_nodes(self, extra: Mapping[str, str], node_table: str = "") -> None:
