@@ -58,9 +58,7 @@ class BareQuery:
         return fastest
 
     def _answered(self) -> bool:
-        return any(
-            reply.ok is not None for reply in self._session.get(KEY, payload=self._payload, timeout=1.0)
-        )
+        return any(reply.ok is not None for reply in self._session.get(KEY, payload=self._payload, timeout=1.0))
 
     def _blocking(self) -> float:
         start = time.perf_counter()

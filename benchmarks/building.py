@@ -74,9 +74,7 @@ def measure(building: str, robots: int, seconds: float) -> list[Row]:
     plan = load_plan(shipped_plans()[building])
     plan_robots = plan.robots[:robots]
     if len(plan_robots) < robots:
-        raise SystemExit(
-            f"{building} has {len(plan.robots)} robots; write --robots {len(plan.robots)} or less"
-        )
+        raise SystemExit(f"{building} has {len(plan.robots)} robots; write --robots {len(plan.robots)} or less")
     bare = bare_picture(plan, robots)
     with ExitStack() as stack:
         process, told = stack.enter_context(simulating(building, robots))
@@ -97,9 +95,7 @@ def measure(building: str, robots: int, seconds: float) -> list[Row]:
     return [
         Row("bare picture, CPU", render * 1e3, "ms", rounds=len(bare + again)),
         Row("building, nobody watches", idle * 100, "% of a core"),
-        Row(
-            f"building, {robots} cameras watched", busy * 100, "% of a core", aim=AIM if robots == 4 else None
-        ),
+        Row(f"building, {robots} cameras watched", busy * 100, "% of a core", aim=AIM if robots == 4 else None),
         Row("frames read", frames / seconds, "frames/s", aim=9.5 * robots, at_least=True),
         Row(
             "frame served, CPU",

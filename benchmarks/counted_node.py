@@ -46,11 +46,7 @@ async def main(file: Path) -> None:
     ready()
     while await asyncio.to_thread(sys.stdin.readline):
         spent = process.cpu_times()
-        told = {
-            "reports": count.calls,
-            "cpu": spent.user + spent.system,
-            "memory": process.memory_info().rss,
-        }
+        told = {"reports": count.calls, "cpu": spent.user + spent.system, "memory": process.memory_info().rss}
         print(json.dumps(told), flush=True)
     stop.set()
     await task

@@ -52,12 +52,7 @@ GRANTED = Notice(
 
 
 async def crowd(
-    lab: Lab,
-    folder: Path,
-    rounds: int,
-    seconds: float,
-    progress: Callable[[str], None],
-    programs: int = PROGRAMS,
+    lab: Lab, folder: Path, rounds: int, seconds: float, progress: Callable[[str], None], programs: int = PROGRAMS
 ) -> list[Row]:
     """Rows for the grants a second, as a share of what the empty queryable answers."""
     empty = Lab(folder)

@@ -84,9 +84,7 @@ class Pictures:
     def __init__(self, lab: Lab, client: Client, count: int) -> None:
         self._lab, self._client = lab, client
         self.read: dict[int, list[float]] = {robot: [] for robot in ROBOTS}
-        self._tasks = [
-            asyncio.create_task(self._follow(f"framegrabber/fgrab{number + 1}")) for number in range(count)
-        ]
+        self._tasks = [asyncio.create_task(self._follow(f"framegrabber/fgrab{number + 1}")) for number in range(count)]
 
     async def _follow(self, framegrabber: str) -> None:
         robots: dict[Any, int] = {}
@@ -207,9 +205,7 @@ def spent(processes: list[psutil.Process]) -> float:
     return total
 
 
-async def measure(
-    seconds: float, progress: Callable[[str], None], counts: tuple[int, ...] = (1, 2, 4)
-) -> list[Row]:
+async def measure(seconds: float, progress: Callable[[str], None], counts: tuple[int, ...] = (1, 2, 4)) -> list[Row]:
     """All rows; `progress` is told what is measured next."""
     rows: list[Row] = []
     for robots in counts:

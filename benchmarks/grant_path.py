@@ -33,8 +33,7 @@ async def trace(folder: Path) -> dict[str, list[Call]]:
     hook.mkdir()
     traces.mkdir()
     (hook / "sitecustomize.py").write_text(
-        "from pathlib import Path\nfrom benchmarks.grant_trace import install\n"
-        f"install(Path({str(traces)!r}))\n"
+        f"from pathlib import Path\nfrom benchmarks.grant_trace import install\ninstall(Path({str(traces)!r}))\n"
     )
     async with Lab(folder, candidates=["lead"]) as lab:
         lab.env = lab.env | {"PYTHONPATH": f"{hook}:{Path(__file__).parents[1]}"}
@@ -53,9 +52,7 @@ async def trace(folder: Path) -> dict[str, list[Call]]:
             node.send_signal(signal.SIGTERM)
             await asyncio.to_thread(node.wait, HANG)
         sides = {"client": command, **sides}
-        return {
-            side: json.loads((traces / f"{process.pid}.json").read_text()) for side, process in sides.items()
-        }
+        return {side: json.loads((traces / f"{process.pid}.json").read_text()) for side, process in sides.items()}
 
 
 def path(calls: dict[str, list[Call]]) -> list[tuple[float, str, str, str]]:
@@ -65,11 +62,7 @@ def path(calls: dict[str, list[Call]]) -> list[tuple[float, str, str, str]]:
     end = calls["client"][-1][0]
     found = []
     for side, some in calls.items():
-        idle = {
-            (module, name)
-            for at, module, name in some
-            if side != "client" and start - IDLE * 1e9 < at < start
-        }
+        idle = {(module, name) for at, module, name in some if side != "client" and start - IDLE * 1e9 < at < start}
         seen = set()
         for at, module, name in some:
             if start <= at < end and (module, name) not in idle and module not in seen:
@@ -83,9 +76,7 @@ def main() -> None:
         calls = asyncio.run(trace(Path(name)))
     hops = path(calls)
     for at, side, module, function in hops:
-        print(
-            f"{at:7.1f} ms  {side:7}{module.removeprefix('zscout.').replace('.', '/') + '.py':46} {function}"
-        )
+        print(f"{at:7.1f} ms  {side:7}{module.removeprefix('zscout.').replace('.', '/') + '.py':46} {function}")
     before = {module for at, module, _ in calls["client"]} - {"", *(module for _, _, module, _ in hops)}
     print(f"{len({module for _, _, module, _ in hops})} modules from the query to the body")
     print(f"{len(before)} more in the command before its query: {', '.join(sorted(before))}")

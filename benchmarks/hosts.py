@@ -42,9 +42,7 @@ END = 10.0
 QUIET, ASKED = 4.0, 8.0
 """Seconds in which nobody asks the balancer, and in which it is asked."""
 MEGA = 1e6
-ANSWER = HostRanking(
-    [RankedHost(f"host{n}", 0.5, "x" * 75) for n in range(RankAsk().at_most)], "composite", "as asked"
-)
+ANSWER = HostRanking([RankedHost(f"host{n}", 0.5, "x" * 75) for n in range(RankAsk().at_most)], "composite", "as asked")
 """As long as an answer is."""
 
 
@@ -203,9 +201,7 @@ def rows(found: Figures) -> list[Row]:
 
 def table(all_found: list[Figures]) -> str:
     times_of, rest = ("answer", "p99", "bare", "p99"), f"{'ratio':>8}{'p99':>8}{'node CPU':>10}{'RSS':>8}"
-    lines = [
-        f"{'hosts':>7}" + "".join(f"{name:>10}" for name in times_of) + rest + f"{'sent':>9}{'missed':>8}"
-    ]
+    lines = [f"{'hosts':>7}" + "".join(f"{name:>10}" for name in times_of) + rest + f"{'sent':>9}{'missed':>8}"]
     for one in all_found:
         times = "".join(f"{t * 1e3:>7.2f} ms" for t in (one.answer, one.answer_p99, one.bare, one.bare_p99))
         ratios = f"{one.ratio:>8.1f}{one.answer_p99 / one.bare_p99:>8.1f}"
@@ -230,9 +226,7 @@ def main() -> None:
     parser.add_argument("--hosts", type=int, help="only so many (default: 1,000, doubled until it ends)")
     args = parser.parse_args()
     if args.hosts is not None and not 1 <= args.hosts <= MAX_HOSTS:
-        parser.error(
-            f"--hosts: {args.hosts} is not from 1 to {MAX_HOSTS}, which is all that a balancer takes"
-        )
+        parser.error(f"--hosts: {args.hosts} is not from 1 to {MAX_HOSTS}, which is all that a balancer takes")
     found: list[Figures] = []
     hosts = args.hosts or 1_000
     while True:
@@ -254,9 +248,7 @@ def main() -> None:
         print(json.dumps({"machine": machine, "hosts": points}, indent=2))
         return
     print(table(found))
-    print(
-        f"{os.cpu_count()} cores, Python {platform.python_version()}, load average {os.getloadavg()[0]:.1f}."
-    )
+    print(f"{os.cpu_count()} cores, Python {platform.python_version()}, load average {os.getloadavg()[0]:.1f}.")
 
 
 if __name__ == "__main__":

@@ -100,9 +100,7 @@ async def latencies(lab: Lab, paper: Lab, rounds: int, progress: Callable[[str],
 
     async def face_query() -> float:
         start = time.perf_counter()
-        reply = await client.mesh.ask_one(
-            face.key(client.mesh.keys), StateAsk(arc="x" * ask), Notice, timeout=5
-        )
+        reply = await client.mesh.ask_one(face.key(client.mesh.keys), StateAsk(arc="x" * ask), Notice, timeout=5)
         took = time.perf_counter() - start
         assert reply is not None, "the face did not answer"
         return took

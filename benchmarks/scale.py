@@ -99,9 +99,7 @@ class Fleet:
             for name in rng.sample(self.names, rng.randint(1, 4))
         }
         runtime = rng.randint(10 * SECOND, 100 * SECOND)
-        return Requested(
-            ArcRequest(f"a{self.number}", f"h/{self.number % 100}", needs, rng.randrange(4), runtime)
-        )
+        return Requested(ArcRequest(f"a{self.number}", f"h/{self.number % 100}", needs, rng.randrange(4), runtime))
 
     def send(self, kind: str, *events: Event) -> None:
         """One instant, timed, and then each vote and each further pass that it takes."""
@@ -209,9 +207,7 @@ def main() -> None:
         parser.error(f"--rounds is {args.rounds}; give 10 to 100000")
     sizes = [(rcs, queue) for rcs in RCS for queue in QUEUES]
     speed = _million_additions()
-    points = [
-        point for rcs, queue in sizes for point in measure(rcs, queue, args.rounds, args.seed, args.strategy)
-    ]
+    points = [point for rcs, queue in sizes for point in measure(rcs, queue, args.rounds, args.seed, args.strategy)]
     largest = {point.kind: point for point in points if (point.rcs, point.queue) == (RCS[-1], QUEUES[-1])}
     met = {kind: largest[kind].samples.median <= aim for kind, aim in AIMS.items() if kind in largest}
     if args.json:

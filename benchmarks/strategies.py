@@ -84,9 +84,7 @@ def decide(strategy: str, rcs: int, requests: list[ArcRequest]) -> Decided:
     return Decided(sum(len(arc.needs) for arc in core.status().running), sum(took), max(took))
 
 
-def rows(
-    rcs: int, arcs: int, seeds: int, best: list[float], names: tuple[str, ...], paper: bool = False
-) -> list[Row]:
+def rows(rcs: int, arcs: int, seeds: int, best: list[float], names: tuple[str, ...], paper: bool = False) -> list[Row]:
     """Measures each strategy; `best` is what each seed's shares are taken of."""
     found = []
     for name in names:
@@ -195,9 +193,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("--seeds", type=int, default=100, help="of the paper's experiment (default: 100)")
     parser.add_argument("--large", type=int, default=5, help="seeds of the larger ones (default: 5)")
-    parser.add_argument(
-        "--solver", type=float, default=60, help="seconds for CP-SAT at 300x600 (default: 60)"
-    )
+    parser.add_argument("--solver", type=float, default=60, help="seconds for CP-SAT at 300x600 (default: 60)")
     args = parser.parse_args()
     if args.seeds < 1 or args.large < 1 or args.solver <= 0:
         parser.error("at least one seed of each, and some time for the solver")

@@ -20,24 +20,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.stats import Row, table
-from tests.behaviors.perception.recordings import (
-    EMPTY_LAWN,
-    GARDEN,
-    HAND,
-    PASSERS_BY,
-    PEOPLE,
-    covered,
-    pictures,
-)
+from tests.behaviors.perception.recordings import EMPTY_LAWN, GARDEN, HAND, PASSERS_BY, PEOPLE, covered, pictures
 from zscout.behaviors.perception.motion import MotionDetector
 from zscout.lab.building.plan_file import shipped_plans
 from zscout.lab.study.process_pool import answers
-from zscout.lab.trials.watch import (
-    DRAWN,
-    Watched,
-    cases,
-    watch_case,
-)
+from zscout.lab.trials.watch import DRAWN, Watched, cases, watch_case
 
 AIM = 95.0
 """Percent of the crossings alerted within a second."""
@@ -47,9 +34,7 @@ LEARNED = 10
 """Pictures of PASSERS_BY until the background is learned."""
 
 
-def simulated(
-    buildings: list[str], seeds: int, seconds: float, processes: int
-) -> dict[tuple[str, float], Watched]:
+def simulated(buildings: list[str], seeds: int, seconds: float, processes: int) -> dict[tuple[str, float], Watched]:
     """By building and level of noise."""
     todo = cases(buildings, seeds=seeds, seconds=seconds)
     sums: dict[tuple[str, float], Watched] = {}
@@ -115,9 +100,7 @@ def recorded() -> Iterator[Row]:
     told = [(time, detector.see(time, picture).moving) for time, picture in pictures(GARDEN)]
     before = [moves for time, moves in told if time < HAND]
     after = [moves for time, moves in told if time >= HAND]
-    yield Row(
-        "tree in the wind: pictures with motion", 100 * sum(before) / len(before), "%", rounds=len(before)
-    )
+    yield Row("tree in the wind: pictures with motion", 100 * sum(before) / len(before), "%", rounds=len(before))
     yield Row("hand before it: pictures with motion", 100 * sum(after) / len(after), "%", rounds=len(after))
 
 
@@ -141,8 +124,7 @@ def main() -> None:
     rows = [*rows_of(sums), *recorded()]
     if args.json:
         told: list[Any] = [
-            {"building": building, "noise": noise, **asdict(watched)}
-            for (building, noise), watched in sums.items()
+            {"building": building, "noise": noise, **asdict(watched)} for (building, noise), watched in sums.items()
         ]
         print(json.dumps({"rows": [row.as_json() for row in rows], "simulated": told}))
     else:

@@ -13,9 +13,7 @@ import pytest
 import zscout
 
 ROOT = Path(__file__).parents[1]
-MODULES = {
-    path.relative_to(ROOT): ast.parse(path.read_text()) for path in sorted((ROOT / "zscout").rglob("*.py"))
-}
+MODULES = {path.relative_to(ROOT): ast.parse(path.read_text()) for path in sorted((ROOT / "zscout").rglob("*.py"))}
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SOURCES = {path.name for tree in ("zscout", "tests", "benchmarks") for path in (ROOT / tree).rglob("*.py")}
 WROTE = re.compile(r"`([\w./]+)`")
@@ -50,11 +48,7 @@ def test_nothing_but_the_command_line_imports_the_lab() -> None:
         and (found := [name for name in imports(tree) if f"{name}.".startswith("zscout.lab.")])
     }
     assert outside == {}
-    users = {
-        path.parts[1]
-        for path, tree in MODULES.items()
-        if any("zscout.lab." in name for name in imports(tree))
-    }
+    users = {path.parts[1] for path, tree in MODULES.items() if any("zscout.lab." in name for name in imports(tree))}
     assert users == {"lab", "cli"}
 
 

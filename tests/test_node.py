@@ -34,8 +34,7 @@ class Faulty(ExclusiveDriver):
 def node(tmp_path: Path) -> Node:
     file = tmp_path / "node.toml"
     file.write_text(
-        '[node]\nhost = "anvil"\ncandidate = false\nload = false\n'
-        '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
+        '[node]\nhost = "anvil"\ncandidate = false\nload = false\n[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
     )
     return load_node(file)
 

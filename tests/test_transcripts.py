@@ -11,10 +11,7 @@ from tests.placement.transcript import PlacerPlayer
 from tests.scheduling.transcript import CorePlayer
 from tests.transcripts import Player, check, play
 
-PLAYERS: dict[str, tuple[Callable[[], Player], int]] = {
-    "scheduling": (CorePlayer, 12),
-    "placement": (PlacerPlayer, 10),
-}
+PLAYERS: dict[str, tuple[Callable[[], Player], int]] = {"scheduling": (CorePlayer, 12), "placement": (PlacerPlayer, 10)}
 """By folder: who plays, and how many stories there are at least."""
 
 
@@ -37,8 +34,7 @@ def test_the_transcripts_are_found(folder: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("folder", "text"),
-    [("scheduling", "join robot/a\njion robot/b\n"), ("placement", "host h1\njion robot/b\n")],
+    ("folder", "text"), [("scheduling", "join robot/a\njion robot/b\n"), ("placement", "host h1\njion robot/b\n")]
 )
 def test_a_command_that_is_not_understood_is_named_with_its_line(folder: str, text: str) -> None:
     with pytest.raises(ValueError, match=r"story.txt:2: .*no such command: jion"):

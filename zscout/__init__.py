@@ -15,12 +15,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from zscout.behaviors.client.arc import (
-        Held,
-        Revoked,
-        hold,
-        holds,
-    )
+    from zscout.behaviors.client.arc import Held, Revoked, hold, holds
     from zscout.behaviors.client.blocking import Lab, connect
     from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
     from zscout.behaviors.components.component import Component, ComponentContext, Stage

@@ -139,9 +139,7 @@ def main(file: Path | None, log_level: str) -> None:
       zscout-node
       zscout-node /etc/zscout/node.toml
     """
-    logging.basicConfig(
-        level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr
-    )
+    logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     try:
         node = load_node(file) if file is not None else default_node()
         uvloop.run(_main(node))

@@ -62,11 +62,7 @@ def span(seconds: float) -> str:
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)
-    for big, small, big_unit, small_unit in (
-        (86_400, 3600, "d", "h"),
-        (3600, 60, "h", "min"),
-        (60, 1, "min", "s"),
-    ):
+    for big, small, big_unit, small_unit in ((86_400, 3600, "d", "h"), (3600, 60, "h", "min"), (60, 1, "min", "s")):
         if whole >= big:
             rest = whole % big // small
             return f"{whole // big} {big_unit}" + (f" {rest} {small_unit}" if rest else "")
@@ -97,8 +93,7 @@ class Table:
         table = [self.columns, *([clean(cell) for cell in row] for row in self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in table
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table
         ]
         return [self.title, *lines] if self.title else lines
 

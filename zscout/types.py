@@ -37,13 +37,7 @@ MAX_CHANNEL: Final = 15
 
 Metric: TypeAlias = Literal["load_average", "processor_speed", "available_memory", "composite", "auto"]
 Policy: TypeAlias = Literal["least_loaded", "randomized", "two_choices", "pending"]
-METRICS: Final[tuple[Metric, ...]] = (
-    "load_average",
-    "processor_speed",
-    "available_memory",
-    "composite",
-    "auto",
-)
+METRICS: Final[tuple[Metric, ...]] = ("load_average", "processor_speed", "available_memory", "composite", "auto")
 POLICIES: Final[tuple[Policy, ...]] = ("least_loaded", "randomized", "two_choices", "pending")
 
 

@@ -80,10 +80,7 @@ class Bench:
                 taken = work.latencies(self._home, away, self._query, args.rounds, args.seconds, progress)
                 for kind, samples in taken.items():
                     figures.append(samples.figure(kind, peer.name, away=True))
-                    for mine, new in (
-                        (self._ours[kind].home, samples.home),
-                        (self._ours[kind].bare, samples.bare),
-                    ):
+                    for mine, new in ((self._ours[kind].home, samples.home), (self._ours[kind].bare, samples.bare)):
                         mine.values += new.values
                 progress(f"{peer.name}: 20 behaviors")
                 ours, theirs = work.crowds([self._home, away], args.crowds, 2.0)

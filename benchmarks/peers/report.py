@@ -49,9 +49,7 @@ class Report:
             rows = [figure for figure in self.figures if figure.work == work]
             if not rows:
                 continue
-            lines.append(
-                f"{meaning}\n  {'':{width}}  {'median':>9}  {'p99':>9}  {'x zscout':>8}  {'x bare':>7}"
-            )
+            lines.append(f"{meaning}\n  {'':{width}}  {'median':>9}  {'p99':>9}  {'x zscout':>8}  {'x bare':>7}")
             for row in rows:
                 cells = f"{_number(row.value):>9}  {_number(row.p99):>9}  {_number(row.to_zscout):>8}"
                 line = f"  {row.who:{width}}  {cells}  {_number(row.to_bare):>7}  {row.note}"

@@ -14,18 +14,7 @@ from labgrid.remote.generated import labgrid_coordinator_pb2 as words
 from labgrid.remote.generated.labgrid_coordinator_pb2_grpc import CoordinatorStub
 from labgrid.util import labgrid_version
 
-from benchmarks.peers.peer import (
-    HOST,
-    RCS,
-    START,
-    Peer,
-    Session,
-    Waiters,
-    Waiting,
-    free_port,
-    package,
-    server,
-)
+from benchmarks.peers.peer import HOST, RCS, START, Peer, Session, Waiters, Waiting, free_port, package, server
 
 EXPORTERS = {"left": RCS[0::2], "right": RCS[1::2]}
 

@@ -194,9 +194,7 @@ def _crowd(team: Team, seconds: float, hold: float) -> list[int]:
             if start < end:
                 raise DoubleBooked(f"{rc} was held twice at once")
     # Who still waited when time was up got a turn as well, which does not count.
-    return [
-        sum(start < report["until"] for start, _ in spans) for report in reports for spans in report["held"]
-    ]
+    return [sum(start < report["until"] for start, _ in spans) for report in reports for spans in report["held"]]
 
 
 def killed(team: Team, progress: Progress) -> Figure:

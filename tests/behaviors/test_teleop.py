@@ -76,9 +76,7 @@ def test_stop_stops_and_speed_keeps_its_bounds() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.4), st.sampled_from(WAYS)), max_size=30), st.floats(0.1, 1.0))
-def test_no_wheel_turns_faster_than_asked_or_without_end(
-    hands: list[tuple[float, Way]], speed: float
-) -> None:
+def test_no_wheel_turns_faster_than_asked_or_without_end(hands: list[tuple[float, Way]], speed: float) -> None:
     pilot, now = Pilot(speed), 0.0
     for pause, way in hands:
         now += pause

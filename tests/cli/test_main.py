@@ -101,9 +101,7 @@ def test_a_mesh_without_an_rcm_is_3(tmp_path: Path) -> None:
 def test_a_closed_pipe_is_quiet() -> None:
     read, write = os.pipe()
     os.close(read)
-    process = subprocess.Popen(
-        [*tools.COMMAND, "completion", "fish"], stdout=write, stderr=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([*tools.COMMAND, "completion", "fish"], stdout=write, stderr=subprocess.PIPE, text=True)
     os.close(write)
     _, errors = process.communicate(timeout=HANG)
     assert (process.returncode, errors) == (1, "")
@@ -155,9 +153,7 @@ def test_durations(text: str, seconds: str) -> None:
     assert parse_duration(text, "--timeout") == Decimal(seconds)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "5x", "-1", "1e3", "nan", "1_0", "٣", "5 s", "mm", "0", "1ss", "99999999h"]
-)
+@pytest.mark.parametrize("text", ["", "5x", "-1", "1e3", "nan", "1_0", "٣", "5 s", "mm", "0", "1ss", "99999999h"])
 def test_what_is_no_duration_is_refused(text: str) -> None:
     with pytest.raises(BadInput, match="--timeout"):
         parse_duration(text, "--timeout")

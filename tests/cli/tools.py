@@ -30,9 +30,7 @@ OWN_TERMINAL = (
 _ESCAPE = re.compile(r"\x1b(\[[0-9;?]*[A-Za-z]|[=>])")
 
 
-def zscout(
-    *args: object, env: Mapping[str, str] | None = None, stdin: str = ""
-) -> subprocess.CompletedProcess[str]:
+def zscout(*args: object, env: Mapping[str, str] | None = None, stdin: str = "") -> subprocess.CompletedProcess[str]:
     """Runs it in a pipe, to its end."""
     command = [*COMMAND, *map(str, args)]
     return subprocess.run(command, env=env, input=stdin, capture_output=True, text=True, timeout=HANG)

@@ -38,9 +38,7 @@ def radio(**keys: str) -> str:
 
 BAD = {
     table("radio/r"): 'rc[0].port (radio/r): is missing; add it, as in port = "/dev/ttyUSB0"',
-    radio(port='""'): (
-        'rc[0].port (radio/r): "" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'
-    ),
+    radio(port='""'): ('rc[0].port (radio/r): "" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'),
     radio(port=r'"\u0000"'): (
         'rc[0].port (radio/r): "\\x00" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'
     ),
@@ -59,8 +57,7 @@ BAD = {
         'rc[0].port (radio/r): the driver "capacity" has none; remove it, or write driver = "radio"'
     ),
     table("mast/r", driver="radio", port='"/dev/x"'): (
-        'rc[0].name: "mast/r" is no radio, as driver = "radio" says; '
-        "name it radio/r, or choose another driver"
+        'rc[0].name: "mast/r" is no radio, as driver = "radio" says; name it radio/r, or choose another driver'
     ),
     table("robot/a", radio='"radio/r"'): (
         "rc[0].id (robot/a): is missing; add the id that its packets carry, as in id = 33"
@@ -82,9 +79,7 @@ BAD = {
     ),
     robot(dead_man="0"): "rc[0].dead_man (robot/a): is 0 s; write 0.05 to 5 seconds",
     robot(warm_up="61"): "rc[0].warm_up (robot/a): is 61 s; write 0 to 60 seconds",
-    robot(port='"/dev/x"'): (
-        'rc[0].port (robot/a): the driver "robot" has none; remove it, or write driver = "radio"'
-    ),
+    robot(port='"/dev/x"'): ('rc[0].port (robot/a): the driver "robot" has none; remove it, or write driver = "radio"'),
     robot(warmup="1"): "rc[0].warmup (robot/a): unknown key; did you mean warm_up?",
     table("video/1", quality="1"): (
         'rc[0].quality (video/1): the driver "video" has none; remove it, or write driver = "framegrabber"'
@@ -122,9 +117,7 @@ def test_what_a_table_says_and_what_it_leaves_out() -> None:
     assert device(radio(port='"socket://mast:4001"', baud="1200", bound="1.5")) == RadioRc(
         name="radio/r", port="socket://mast:4001", baud=1200, bound=3 * SECOND // 2
     )
-    plain = RobotRc(
-        name="robot/a", id=33, radio="radio/r", channels={}, warm_up=2 * SECOND, dead_man=SECOND // 2
-    )
+    plain = RobotRc(name="robot/a", id=33, radio="radio/r", channels={}, warm_up=2 * SECOND, dead_man=SECOND // 2)
     assert device(robot()) == plain
     channels = {"video/1": 1, "video/2": 15}
     told = robot(channels='{ "video/1" = 1, "video/2" = 15 }', warm_up="0", dead_man="0.3")
@@ -133,9 +126,7 @@ def test_what_a_table_says_and_what_it_leaves_out() -> None:
     grabber = device(table("framegrabber/f", source='"/dev/video0"'))
     assert isinstance(grabber, FramegrabberRc)
     assert (grabber.by_video, grabber.rate, grabber.quality) == ({"": "/dev/video0"}, 10.0, 80)
-    grabber = device(
-        table("framegrabber/f", sources='{ "video/1" = "http://a/1" }', rate="2.5", quality="60")
-    )
+    grabber = device(table("framegrabber/f", sources='{ "video/1" = "http://a/1" }', rate="2.5", quality="60"))
     assert isinstance(grabber, FramegrabberRc)
     assert (grabber.by_video, grabber.rate, grabber.quality) == ({"video/1": "http://a/1"}, 2.5, 60)
     assert device(table("robot/a", driver="exclusive")) == ExclusiveRc(name="robot/a")

@@ -31,9 +31,7 @@ BAD_FLEETS = {
     "x = " + "1" * 5000: "a whole number has thousands of digits; shorten it",
     "x = " + "[" * 5000: "is nested too deep; no key goes deeper than a few tables",
     "\n" + ".".join(["a"] * 300_000) + " = 1": "line 2 has a dotted key of more than 32 parts; shorten it",
-    "["
-    + " . ".join(['"\\""', "'b'"] * 60_000)
-    + "]": "line 1 has a dotted key of more than 32 parts; shorten it",
+    "[" + " . ".join(['"\\""', "'b'"] * 60_000) + "]": "line 1 has a dotted key of more than 32 parts; shorten it",
     # Keys and tables
     "[flet]": "flet: unknown key; did you mean fleet?",
     "[fleet]\ncandiates = []": "fleet.candiates: unknown key; did you mean candidates?",
@@ -55,9 +53,7 @@ BAD_FLEETS = {
         'fleet.candidates[2]: "a" stands at fleet.candidates[0] already; rename or remove one of the two'
     ),
     f"[fleet]\ncandidates = {['a'] * 1001}": "fleet.candidates: has 1,001 entries; at most 1,000 are allowed",
-    '[fleet]\nstrategy = "fifo"': (
-        'fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"'
-    ),
+    '[fleet]\nstrategy = "fifo"': ('fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"'),
     '[fleet]\npreempt = "never"': 'fleet.preempt: is the text "never"; write "after_min_runtime" or "always"',
     "[fleet]\npatience = -1": "fleet.patience: is -1 s; write 0 to 31622400 seconds",
     "[fleet]\npatience = nan": "fleet.patience: is not a finite number; write a number",
@@ -72,12 +68,8 @@ BAD_FLEETS = {
     "[limits]\nmax_running_per_host = -1": (
         "limits.max_running_per_host: is -1; write a whole number from 0 to 100000"
     ),
-    "[fleet]\noperator_priority = -1": (
-        "fleet.operator_priority: is -1; write a whole number from 0 to 1000000000"
-    ),
-    "[fleet]\noperator_priority = 1.0": (
-        "fleet.operator_priority: is 1.0; write a whole number from 0 to 1000000000"
-    ),
+    "[fleet]\noperator_priority = -1": ("fleet.operator_priority: is -1; write a whole number from 0 to 1000000000"),
+    "[fleet]\noperator_priority = 1.0": ("fleet.operator_priority: is 1.0; write a whole number from 0 to 1000000000"),
     "[fleet]\noperator_priority = true": (
         "fleet.operator_priority: is true; write a whole number from 0 to 1000000000"
     ),
@@ -86,18 +78,10 @@ BAD_FLEETS = {
     "[mesh]\nlease = nan": "mesh.lease: is not a finite number; write a number from 0.2 to 30",
     "[mesh]\nlease = 1979-05-27": "mesh.lease: is a date or a time; write a number from 0.2 to 30",
     '[mesh]\nlease = "1"': 'mesh.lease: is the text "1"; write a number from 0.2 to 30',
-    '[mesh]\nlisten = ["tcp/127.0.0.1"]': (
-        f'mesh.listen[0]: "tcp/127.0.0.1" is not an endpoint; {ENDPOINT_RULE}'
-    ),
-    '[mesh]\nlisten = ["tcp/a:0", "ipx/a:1"]': (
-        f'mesh.listen[1]: "ipx/a:1" is not an endpoint; {ENDPOINT_RULE}'
-    ),
-    '[mesh]\nconnect = ["tcp/1.2.3:7"]': (
-        f'mesh.connect[0]: "tcp/1.2.3:7" is not an endpoint; {ENDPOINT_RULE}'
-    ),
-    '[mesh]\nconnect = ["tcp/[::g]:7"]': (
-        f'mesh.connect[0]: "tcp/[::g]:7" is not an endpoint; {ENDPOINT_RULE}'
-    ),
+    '[mesh]\nlisten = ["tcp/127.0.0.1"]': (f'mesh.listen[0]: "tcp/127.0.0.1" is not an endpoint; {ENDPOINT_RULE}'),
+    '[mesh]\nlisten = ["tcp/a:0", "ipx/a:1"]': (f'mesh.listen[1]: "ipx/a:1" is not an endpoint; {ENDPOINT_RULE}'),
+    '[mesh]\nconnect = ["tcp/1.2.3:7"]': (f'mesh.connect[0]: "tcp/1.2.3:7" is not an endpoint; {ENDPOINT_RULE}'),
+    '[mesh]\nconnect = ["tcp/[::g]:7"]': (f'mesh.connect[0]: "tcp/[::g]:7" is not an endpoint; {ENDPOINT_RULE}'),
     '[mesh]\nconnect = ["tcp/[::fff1:1:2:3:4:5:6:7:8]:7"]': (
         f'mesh.connect[0]: "tcp/[::fff1:1:2:3:4:5:6:7:8]:7" is not an endpoint; {ENDPOINT_RULE}'
     ),
@@ -120,9 +104,7 @@ BAD_FLEETS = {
     '[mesh]\ninterface = ""': 'mesh.interface: "" names no interface; write "auto", or as in "eth0"',
     # [limits]
     "[limits]\nmax_needs = 0": "limits.max_needs: is 0; write a whole number from 1 to 1000",
-    "[limits]\nmax_payload = 1e400": (
-        "limits.max_payload: is 1E+400; write a whole number from 1024 to 16777216"
-    ),
+    "[limits]\nmax_payload = 1e400": ("limits.max_payload: is 1E+400; write a whole number from 1024 to 16777216"),
     # [timing]
     "[timing]\nheartbeat = 0": "timing.heartbeat: is 0 s; write 0.05 to 10 seconds",
     "[timing]\nrebuild = -0.1": "timing.rebuild: is -0.1 s; write 0.01 to 10 seconds",
@@ -130,15 +112,11 @@ BAD_FLEETS = {
     "[timing]\nrebuild = 1e99999999999999999999": "timing.rebuild: is not a finite number; write a number",
     "[timing]\nrebuild = 1e30": "timing.rebuild: is too large; write a number below 1e18",
     "[timing]\nrebuild = 1e-200": "timing.rebuild: has more than 100 decimal places; round it",
-    "[timing]\nheartbeat = 1.5": (
-        "timing.hold_lease: is 3 s; write more than 2 * timing.heartbeat, which is 3 s"
-    ),
+    "[timing]\nheartbeat = 1.5": ("timing.hold_lease: is 3 s; write more than 2 * timing.heartbeat, which is 3 s"),
     "[timing]\nhold_lease = 1.2": (
         "timing.hold_lease: is 1.2 s; write more than mesh.lease + timing.rebuild, which is 1.2 s"
     ),
-    "[mesh]\nlease = 2.9": (
-        "timing.hold_lease: is 3 s; write more than mesh.lease + timing.rebuild, which is 3.1 s"
-    ),
+    "[mesh]\nlease = 2.9": ("timing.hold_lease: is 3 s; write more than mesh.lease + timing.rebuild, which is 3.1 s"),
     # [placement]
     "[placement]\nback_off = 0": "placement.back_off: is 0 s; write 0.05 to 3600 seconds",
     "[placement]\ngain = 0": "placement.gain: is 0; write a number from 0.05 to 100",
@@ -160,20 +138,10 @@ def test_bad_fleet_file(text: str, line: str) -> None:
 def test_an_empty_fleet_file_means_the_defaults() -> None:
     made = fleet("")
     assert made == default_fleet()
-    assert (made.name, made.candidates, made.strategy, made.operator_priority) == (
-        "zscout",
-        (),
-        "adaptive",
-        10,
-    )
+    assert (made.name, made.candidates, made.strategy, made.operator_priority) == ("zscout", (), "adaptive", 10)
     assert made.scheduling == SchedulingPolicy()
     assert made.mesh == MeshConfig(
-        listen=(),
-        connect=(),
-        multicast=True,
-        multicast_address="224.0.0.224:7446",
-        interface="auto",
-        lease=1.0,
+        listen=(), connect=(), multicast=True, multicast_address="224.0.0.224:7446", interface="auto", lease=1.0
     )
     assert made.limits == RcmLimits(10_000, 64, 256, 65_536)
     assert made.timing == Timing(500_000_000, 3_000_000_000, 250_000_000, 200_000_000)

@@ -41,12 +41,8 @@ BAD_NODES = {
     "rc = [1]": "rc[0]: is 1; write a table",
     '[[rc]]\ndriver = "exclusive"': "rc[0].name: is missing; add it",
     '[[rc]]\nname = "robot/a"': "rc[0].driver (robot/a): is missing; add it",
-    '[[rc]]\nname = "robot"\ndriver = "exclusive"': (
-        f'rc[0].name: "robot" is not the name of an RC; {RC_RULE}'
-    ),
-    '[[rc]]\nname = "a/b/c"\ndriver = "exclusive"': (
-        f'rc[0].name: "a/b/c" is not the name of an RC; {RC_RULE}'
-    ),
+    '[[rc]]\nname = "robot"\ndriver = "exclusive"': (f'rc[0].name: "robot" is not the name of an RC; {RC_RULE}'),
+    '[[rc]]\nname = "a/b/c"\ndriver = "exclusive"': (f'rc[0].name: "a/b/c" is not the name of an RC; {RC_RULE}'),
     '[[rc]]\nname = "robot/a"\ndriver = "fast"': (
         'rc[0].driver (robot/a): is the text "fast"; '
         'write "capacity", "exclusive", "framegrabber", "radio", "robot" or "video"'
@@ -57,16 +53,12 @@ BAD_NODES = {
     ROBOT + "capacity = {}": (
         'rc[0].capacity (robot/a): the driver "exclusive" has none; remove it, or write driver = "capacity"'
     ),
-    ROBOT + RADIO: (
-        "rc[1].capacity (radio/r): is missing or empty; add one, as in capacity = { command_rate = 10 }"
-    ),
+    ROBOT + RADIO: ("rc[1].capacity (radio/r): is missing or empty; add one, as in capacity = { command_rate = 10 }"),
     RADIO + "capacity = {}": (
         "rc[0].capacity (radio/r): is missing or empty; add one, as in capacity = { command_rate = 10 }"
     ),
     RADIO + "capacity = { rate = -1 }": "rc[0].capacity.rate (radio/r): is -1; write 0 or more",
-    RADIO + "capacity = { rate = nan }": (
-        "rc[0].capacity.rate (radio/r): is not a finite number; write a number"
-    ),
+    RADIO + "capacity = { rate = nan }": ("rc[0].capacity.rate (radio/r): is not a finite number; write a number"),
     RADIO + 'capacity = { rate = "10" }': 'rc[0].capacity.rate (radio/r): is the text "10"; write a number',
     RADIO + 'capacity = { "a b" = 1 }': f'rc[0].capacity (radio/r): "a b" is not a name; {NAME_RULE}',
     ROBOT + "activation = -1": "rc[0].activation (robot/a): is -1 s; write 0 to 3600 seconds",
@@ -76,9 +68,7 @@ BAD_NODES = {
         'recorder.bind: "0.0.0.0" shows the recording to other hosts; '
         'write "127.0.0.1", or add allow_remote = true if that is meant'
     ),
-    '[recorder]\nbind = "anvil"': (
-        'recorder.bind: "anvil" is not an IP address; write one, as in "127.0.0.1"'
-    ),
+    '[recorder]\nbind = "anvil"': ('recorder.bind: "anvil" is not an IP address; write one, as in "127.0.0.1"'),
     "[recorder]\nport = 0": "recorder.port: is 0; write a whole number from 1 to 65535",
     '[recorder]\npath = ""': 'recorder.path: "" is no folder; name one, as in path = "runs"',
 }
@@ -96,9 +86,7 @@ def test_bad_node_file(text: str, line: str) -> None:
 
 
 def test_every_key_of_a_node_file() -> None:
-    write(
-        "lab.toml", '[fleet]\nname = "lab"\n[mesh]\nlisten = ["tcp/a:1"]\nconnect = ["tcp/a:2"]\nlease = 0.5'
-    )
+    write("lab.toml", '[fleet]\nname = "lab"\n[mesh]\nlisten = ["tcp/a:1"]\nconnect = ["tcp/a:2"]\nlease = 0.5')
     Path("hosts").mkdir()
     path = write(
         "hosts/node.toml",
@@ -129,9 +117,7 @@ def test_every_key_of_a_node_file() -> None:
     )
     made = load_node(path)
     assert made.fleet.name == "lab"
-    assert made.fleet.mesh == MeshConfig(
-        listen=("tcp/a:1",), connect=("tcp/b:3",), interface="eth1", lease=0.5
-    )
+    assert made.fleet.mesh == MeshConfig(listen=("tcp/a:1",), connect=("tcp/b:3",), interface="eth1", lease=0.5)
     assert (made.host, made.candidate, made.load) == ("anvil", False, False)
     assert made.labels == ("gpu", "arm64")
     assert made.rcs == (
@@ -159,8 +145,7 @@ def test_an_empty_recorder_table_records_on_loopback() -> None:
 
 
 @pytest.mark.parametrize(
-    ("hostname", "host"),
-    [("anvil.lab", "anvil.lab"), ("my host!", "my-host-"), ("x" * 70, "x" * 64), ("", "unnamed")],
+    ("hostname", "host"), [("anvil.lab", "anvil.lab"), ("my host!", "my-host-"), ("x" * 70, "x" * 64), ("", "unnamed")]
 )
 def test_the_host_is_named_by_its_hostname(hostname: str, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket, "gethostname", lambda: hostname)

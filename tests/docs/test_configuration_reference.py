@@ -66,6 +66,4 @@ def test_every_key_stands_in_the_reference_with_its_default(file: type, text: st
             known_default = field.default
             if isinstance(field.type, inspect.Metadata) and "low" in (field.type.extra or {}):
                 known_default = Decimal(known_default) / 1_000_000_000  # a duration: held in ns
-            assert default == (
-                Decimal(repr(known_default)) if isinstance(known_default, float) else known_default
-            ), key
+            assert default == (Decimal(repr(known_default)) if isinstance(known_default, float) else known_default), key

@@ -55,9 +55,7 @@ class MjpegServer:
     "404". `clients` bounds how many are served at once; others are refused with 503.
     """
 
-    def __init__(
-        self, *, rate: float = 30.0, clients: int = 8, picture: Callable[[int], bytes] | None = None
-    ):
+    def __init__(self, *, rate: float = 30.0, clients: int = 8, picture: Callable[[int], bytes] | None = None):
         self.rate = rate
         self.mode = "run"
         self.clients = clients

@@ -85,9 +85,7 @@ class Rcm:
 
     def publish(self, *holders: Holder, rc: str = "robot/x") -> None:
         self.seq += 1
-        self._publisher.put(
-            Grants(term=TERM, seq=self.seq, prev=self.seq - 1, every=0.5, rcs={rc: list(holders)})
-        )
+        self._publisher.put(Grants(term=TERM, seq=self.seq, prev=self.seq - 1, every=0.5, rcs={rc: list(holders)}))
 
     def view(self, number: int) -> HoldView:
         return HoldView(
@@ -115,9 +113,7 @@ async def answer(mesh: Mesh, grant: Grant | None, do: Mapping[str, Any] = ECHO, 
 
 async def started(network: MemoryNetwork, driver: Driver, **how: Any) -> ResourceController:
     mesh = network.open("f", Sender("host", "node"))
-    rc = ResourceController(
-        mesh, "robot/x", driver, hold_lease=LEASE, stall=StallWatch(mesh.now).start(), **how
-    )
+    rc = ResourceController(mesh, "robot/x", driver, hold_lease=LEASE, stall=StallWatch(mesh.now).start(), **how)
     await rc.start()
     return rc
 

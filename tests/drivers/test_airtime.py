@@ -16,16 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.thorough import times
-from zscout.drivers.airtime import (
-    MAX_RATE,
-    Bucket,
-    Share,
-    line_rate,
-    longest_wait,
-    objection,
-    share_of,
-    urgent_burst,
-)
+from zscout.drivers.airtime import MAX_RATE, Bucket, Share, line_rate, longest_wait, objection, share_of, urgent_burst
 from zscout.drivers.commands import RadioCamera, RadioDrive
 from zscout.drivers.packets import (
     MAX_PACKET,
@@ -39,13 +30,7 @@ from zscout.drivers.packets import (
 )
 from zscout.drivers.transmit_queue import MAX_WAITING, OutgoingPacket, TransmitQueue
 from zscout.mesh import Refused
-from zscout.types import (
-    NO_TERM,
-    SECOND,
-    Grant,
-    Ns,
-    Place,
-)
+from zscout.types import NO_TERM, SECOND, Grant, Ns, Place
 
 BOUND = Fraction(1, 4)
 
@@ -81,9 +66,7 @@ def fill(queue: TransmitQueue, holders: int) -> None:
 
 def test_what_a_holder_must_say() -> None:
     assert share_of({"command_rate": Decimal(5)}) == Share(Fraction(5), Fraction(MAX_PACKET))
-    assert share_of({"command_rate": Decimal("0.1"), "packet_size": Decimal(8)}).bytes_per_second == Fraction(
-        4, 5
-    )
+    assert share_of({"command_rate": Decimal("0.1"), "packet_size": Decimal(8)}).bytes_per_second == Fraction(4, 5)
     for params, word in (
         ({}, "command_rate is missing"),
         ({"packet_size": Decimal(10)}, "command_rate is missing"),
@@ -121,9 +104,7 @@ def test_sums_are_exact() -> None:
 
 @settings(max_examples=times(100))
 @given(shares, bauds, st.data())
-def test_what_is_accepted_is_accepted_of_every_part(
-    wanted: list[Share], baud: int, data: st.DataObject
-) -> None:
+def test_what_is_accepted_is_accepted_of_every_part(wanted: list[Share], baud: int, data: st.DataObject) -> None:
     rate = line_rate(baud)
     while wanted and objection(rate, BOUND, wanted):
         wanted = wanted[:-1]
@@ -229,9 +210,7 @@ def test_no_packet_waits_longer_than_the_bound_however_holders_time_it(
         at += SECOND if greedy else rng.randrange(SECOND)
     actions.sort(key=lambda action: action[0])
     told = run(queue, 20 * SECOND, actions)
-    commands = [
-        out for out in told.outgoing if isinstance(out.packet, DrivePacket | CameraPacket) and not out.repeat
-    ]
+    commands = [out for out in told.outgoing if isinstance(out.packet, DrivePacket | CameraPacket) and not out.repeat]
     assert queue.waiting == 0
     if any(share.rate for share in wanted):
         assert commands

@@ -9,14 +9,7 @@ import pytest
 
 from zscout.drivers.holds import REMEMBERED, HoldChange, HoldTable
 from zscout.messages import MAX_JUMP, Grants, Holder, HoldView, RcmState, Revocation
-from zscout.types import (
-    NO_TERM,
-    SECOND,
-    Grant,
-    Ns,
-    Place,
-    Term,
-)
+from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
 
 RC = "robot/x"
 LEASE: Ns = 3 * SECOND
@@ -27,13 +20,7 @@ SAME_COUNTER = Term(5, "n")
 
 
 def holder(
-    seq: int,
-    client: str = "h/one",
-    *,
-    term: Term = TERM,
-    remaining: float = 60,
-    keep: bool = False,
-    place: int = 0,
+    seq: int, client: str = "h/one", *, term: Term = TERM, remaining: float = 60, keep: bool = False, place: int = 0
 ) -> Holder:
     return Holder(
         id=f"id{seq}",
@@ -48,9 +35,7 @@ def holder(
     )
 
 
-def view(
-    seq: int, client: str = "h/one", *, rc: str = RC, term: Term = TERM, remaining: float = 60
-) -> HoldView:
+def view(seq: int, client: str = "h/one", *, rc: str = RC, term: Term = TERM, remaining: float = 60) -> HoldView:
     return HoldView(
         id=f"id{seq}",
         arc=f"arc{seq}",
@@ -76,14 +61,10 @@ def said(
     words = []
     if revoked is not None:
         words = [
-            Revocation(
-                revoked.id, revoked.arc, revoked.client, revoked.grant, [RC], "preempted", "by an operator"
-            )
+            Revocation(revoked.id, revoked.arc, revoked.client, revoked.grant, [RC], "preempted", "by an operator")
         ]
     rcs = {RC: list(holders)} if touches else {"robot/other": []}
-    return Grants(
-        term=term, seq=seq, prev=seq - 1 if prev is None else prev, every=0.5, rcs=rcs, revoked=words
-    )
+    return Grants(term=term, seq=seq, prev=seq - 1 if prev is None else prev, every=0.5, rcs=rcs, revoked=words)
 
 
 def state(seq: int, *holds: HoldView, term: Term = TERM) -> RcmState:
@@ -124,12 +105,8 @@ HELD = said(2, ONE)
         pytest.param(said(1, ONE, term=NEW), [2], False, True, id="a new term that carries the hold on"),
         pytest.param(said(1, term=NEW), [], False, True, id="a new term that ends it"),
         pytest.param(said(1, touches=False, term=NEW), [2], False, True, id="a new term that does not say"),
-        pytest.param(
-            said(1, TWO, term=SAME_COUNTER), [3], False, True, id="of one counter the instance decides"
-        ),
-        pytest.param(
-            said(1, TWO, term=Term(TERM.counter + MAX_JUMP + 1, "x")), [2], False, False, id="an absurd term"
-        ),
+        pytest.param(said(1, TWO, term=SAME_COUNTER), [3], False, True, id="of one counter the instance decides"),
+        pytest.param(said(1, TWO, term=Term(TERM.counter + MAX_JUMP + 1, "x")), [2], False, False, id="an absurd term"),
         pytest.param(
             said(1, TWO, term=Term(TERM.counter + MAX_JUMP, "x")), [3], False, True, id="the highest believed"
         ),
@@ -175,9 +152,7 @@ def test_only_an_rcm_that_is_obeyed_keeps_holds_alive(heard: Grants, refreshed: 
         pytest.param(state(9, view(4), term=OLD), True, [2], False, id="of an older term"),
         pytest.param(state(1, view(2), term=NEW), False, [2], False, id="of a new term"),
         pytest.param(state(1, term=NEW), False, [2], True, id="of a new term that knows nothing of it"),
-        pytest.param(
-            state(1, view(9), term=Term(10**9, "x")), True, [2], False, id="of a term that is absurd"
-        ),
+        pytest.param(state(1, view(9), term=Term(10**9, "x")), True, [2], False, id="of a term that is absurd"),
     ],
 )
 def test_read(read: RcmState, sharable: bool, now_holds: list[int], presents: bool) -> None:
@@ -289,16 +264,8 @@ def heard(grants: Grants) -> Prepare:
         pytest.param(heard(said(3)), Grant(TERM, 2), "h/one", "ended", id="revoked"),
         pytest.param(heard(said(3)), Grant(TERM, 1), "h/one", "free", id="nobody holds it"),
         pytest.param(lambda rc: rc.fail("smoke"), Grant(TERM, 2), "h/one", "ended", id="failed"),
-        pytest.param(
-            lambda rc: rc.expire(NOW + LEASE), Grant(TERM, 2), "h/one", "ended", id="the lease is over"
-        ),
-        pytest.param(
-            heard(said(1, ONE, term=NEW)),
-            Grant(TERM, 2),
-            "h/one",
-            None,
-            id="carried on",
-        ),
+        pytest.param(lambda rc: rc.expire(NOW + LEASE), Grant(TERM, 2), "h/one", "ended", id="the lease is over"),
+        pytest.param(heard(said(1, ONE, term=NEW)), Grant(TERM, 2), "h/one", None, id="carried on"),
     ],
 )
 def test_check(prepare: Prepare | None, grant: Grant, client: str, code: str | None) -> None:

@@ -67,9 +67,7 @@ def test_a_packet_is_found_in_noise(packet: Packet, before: bytes, after: bytes)
 
 
 @given(packets, packets, st.data())
-def test_one_spoiled_bit_loses_one_packet_and_no_more(
-    one: Packet, other: Packet, data: st.DataObject
-) -> None:
+def test_one_spoiled_bit_loses_one_packet_and_no_more(one: Packet, other: Packet, data: st.DataObject) -> None:
     raw = bytearray(encode(one))
     bit = data.draw(st.integers(0, len(raw) * 8 - 1))
     raw[bit // 8] ^= 1 << bit % 8

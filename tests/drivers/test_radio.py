@@ -15,12 +15,7 @@ from tests.live.bench import answer, comes_to, until
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import CommandRefused
 from zscout.drivers.generic import VideoDriver
-from zscout.drivers.packets import (
-    CameraPacket,
-    DrivePacket,
-    HaltPacket,
-    StopPacket,
-)
+from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, StopPacket
 from zscout.drivers.radio import RadioDriver
 from zscout.types import SECOND
 
@@ -85,9 +80,7 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
                 since=since,
             )
             replaced = sum(answered.result == {"replaced": True} for answered in done)
-            assert replaced + driver.figures()["replaced"] >= 40 - sum(
-                isinstance(p, DrivePacket) for p in last
-            )
+            assert replaced + driver.figures()["replaced"] >= 40 - sum(isinstance(p, DrivePacket) for p in last)
             # Handed over, the robot goes on driving: no safe state between, and only the heir is obeyed.
             heir, since = await lab.client(), len(line.heard)
             await client.command("robot/r1", grant, TURN)
@@ -108,18 +101,10 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
 
             # What a gang must have for a robot to do as it is told.
             for needs, do, word in (
-                (
-                    {"robot/r1": {}},
-                    TURN,
-                    "your ARC holds no radio: nothing reaches the robot; ask also for radio/rf0",
-                ),
+                ({"robot/r1": {}}, TURN, "your ARC holds no radio: nothing reaches the robot; ask also for radio/rf0"),
                 ({"robot/r1": {}, **RADIO}, {"name": "camera", "on": True}, "ask also for video/*"),
                 (GANG | {"video/ch2": {}}, {"name": "camera", "on": True}, "one transmitter"),
-                (
-                    {"robot/r1": {}, "video/ch3": {}, **RADIO},
-                    {"name": "camera", "on": True},
-                    "no channel of video/ch3",
-                ),
+                ({"robot/r1": {}, "video/ch3": {}, **RADIO}, {"name": "camera", "on": True}, "no channel of video/ch3"),
             ):
                 arc, grant = await held(client, "poor", needs)
                 with pytest.raises(CommandRefused, match=re.escape(word)):
@@ -130,16 +115,8 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             slow = {"radio/rf0": {"command_rate": 5}}
             many = [await held(client, f"s{number}", slow) for number in range(12)]
             for name, params, word in (
-                (
-                    "late",
-                    {"command_rate": 1},
-                    "radio/rf0 refuses: a packet could wait 0.267 s, the bound is 0.25 s",
-                ),
-                (
-                    "fast",
-                    {"command_rate": 50},
-                    "refuses: its holders would send 110 of 86.4 packets/s of 10 bytes",
-                ),
+                ("late", {"command_rate": 1}, "radio/rf0 refuses: a packet could wait 0.267 s, the bound is 0.25 s"),
+                ("fast", {"command_rate": 50}, "refuses: its holders would send 110 of 86.4 packets/s of 10 bytes"),
                 ("vague", {}, "refuses: vague: command_rate is missing"),
             ):
                 asked = await client.request(name, {"radio/rf0": params}, min_runtime=600)
@@ -149,17 +126,13 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
                 for robot_id, (_, under) in enumerate(many, 100):
                     assert (
                         await answer(
-                            client.command(
-                                "radio/rf0", under, drive | {"robot": robot_id, "left": (number - 100) / 10}
-                            )
+                            client.command("radio/rf0", under, drive | {"robot": robot_id, "left": (number - 100) / 10})
                         )
                         == "done"
                     )
             await until(lambda: driver.figures()["waiting"] == 0)
             wait = driver.figures()["longest_wait_ms"]
-            print(
-                f"twelve holders at 5 packets/s: {wait} ms at most; {line.backlog / 1e6:.1f} ms in the system"
-            )
+            print(f"twelve holders at 5 packets/s: {wait} ms at most; {line.backlog / 1e6:.1f} ms in the system")
             assert 0 < wait <= 250
             assert line.backlog < SECOND // 4
             for asked, _ in many:

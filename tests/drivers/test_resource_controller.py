@@ -77,10 +77,7 @@ def test_the_safe_state_goes_before_commands_that_wait() -> None:
 def test_early_commands_are_obeyed_in_their_order_once_the_grant_is_known() -> None:
     async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
         rcm.hangs = True
-        told = [
-            asyncio.create_task(answer(client, grant(2), {"name": "echo", "value": number}))
-            for number in range(3)
-        ]
+        told = [asyncio.create_task(answer(client, grant(2), {"name": "echo", "value": number})) for number in range(3)]
         await until(lambda: rc.queue.commands == 3)
         assert await answer(client, grant(1)) == "done"  # nothing else waits for them
         rcm.publish(holder(2))
@@ -109,9 +106,7 @@ def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:
     async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
         ended: list[str] = []
         client.subscribe(
-            client.keys.rc_state_any,
-            RcState,
-            lambda _key, state: ended.extend(hold.why for hold in state.ended),
+            client.keys.rc_state_any, RcState, lambda _key, state: ended.extend(hold.why for hold in state.ended)
         )
         begun = rcm.mesh.now()
         await until(lambda: device.calls[-1] == "safe")
@@ -175,9 +170,7 @@ def test_figures_are_published_when_they_change() -> None:
         figures = {"packets": 1.0}
         device.figures = figures.copy  # type: ignore[method-assign]
         rc = await started(network, device)
-        watcher.subscribe(
-            watcher.keys.rc_state_any, RcState, lambda _key, state: seen.append(state.figures["packets"])
-        )
+        watcher.subscribe(watcher.keys.rc_state_any, RcState, lambda _key, state: seen.append(state.figures["packets"]))
         await asyncio.sleep(5)
         assert seen == []
         figures["packets"] = 2.0

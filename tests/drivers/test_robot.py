@@ -15,13 +15,7 @@ from tests.drivers.ptys import PtyLine
 from tests.hang import HANG
 from tests.live.bench import answer
 from tests.live.lab import Lab
-from zscout.drivers.packets import (
-    CameraPacket,
-    DrivePacket,
-    HaltPacket,
-    Packet,
-    StopPacket,
-)
+from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet, StopPacket
 from zscout.mesh import clock
 from zscout.types import SECOND, Grant, Ns
 

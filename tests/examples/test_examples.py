@@ -32,9 +32,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
 )
 def test_a_program_holds_and_commands(fleet: CliFleet, program: str, words: list[str]) -> None:
     command = [sys.executable, str(EXAMPLES / program)]
-    done = subprocess.run(
-        command, env=fleet.lab.env, capture_output=True, text=True, check=False, timeout=HANG
-    )
+    done = subprocess.run(command, env=fleet.lab.env, capture_output=True, text=True, check=False, timeout=HANG)
     assert done.returncode == 0, done.stderr
     for word in words:
         assert word in done.stdout

@@ -77,8 +77,7 @@ class Crew:
     async def assemble(self, lab: Lab, rcs: list[str], *, waiting: int) -> None:
         self.clients = await asyncio.gather(*(lab.client(f"crew{number}") for number in range(len(rcs))))
         self.bodies = [
-            Body(client, f"run-{number}", rc)
-            for number, (client, rc) in enumerate(zip(self.clients, rcs, strict=True))
+            Body(client, f"run-{number}", rc) for number, (client, rc) in enumerate(zip(self.clients, rcs, strict=True))
         ]
         await asyncio.gather(*(body.entered() for body in self.bodies))
         for number in range(waiting):
@@ -93,9 +92,7 @@ class Crew:
 
     async def checked(self, lab: Lab, client: Client, stood: Stand, *, since: Ns) -> RcmState:
         """Nothing that stood may have suffered under the RCM that leads now; bodies went on after `since`."""
-        after = await lab.state(
-            client, lambda state: state.term > stood.term and len(state.queue) == len(stood.queue)
-        )
+        after = await lab.state(client, lambda state: state.term > stood.term and len(state.queue) == len(stood.queue))
         now = Stand(after)
         assert now.holds == stood.holds
         assert now.queue == stood.queue

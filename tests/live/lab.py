@@ -140,9 +140,7 @@ class Lab:
         """An RC's own word about itself."""
         async with asyncio.timeout(HANG):
             while True:
-                reply = await client.mesh.ask_one(
-                    client.mesh.keys.rc_state(name), RcAsk(), RcState, timeout=0.5
-                )
+                reply = await client.mesh.ask_one(client.mesh.keys.rc_state(name), RcAsk(), RcState, timeout=0.5)
                 if reply is not None and reply.message is not None:
                     return reply.message
 
@@ -172,9 +170,7 @@ class Lab:
 
     async def ready(self, client: Client, *rcs: str) -> RcmState:
         """Waits until somebody leads and all these RCs are there."""
-        return await self.state(
-            client, lambda state: set(rcs) <= {view.rc for view in state.rcs if view.present}
-        )
+        return await self.state(client, lambda state: set(rcs) <= {view.rc for view in state.rcs if view.present})
 
     async def __aenter__(self) -> Self:
         return self

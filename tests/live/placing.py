@@ -66,9 +66,7 @@ class Placing:
         assert not isinstance(answer, Problem), answer
         return answer
 
-    async def place(
-        self, component: str, kind: str, params: Mapping[str, Any] | None = None, **spec: Any
-    ) -> Placement:
+    async def place(self, component: str, kind: str, params: Mapping[str, Any] | None = None, **spec: Any) -> Placement:
         """Has it run; returns how it stands when it does, or can't."""
         return await self.get(
             PlaceComponent(component, ComponentSpec(kind, dict(params or {}), **spec), wait=15), Placement
@@ -97,9 +95,7 @@ class Placing:
         """Waits until the balancer ranks so many hosts."""
         async with asyncio.timeout(HANG):
             while True:
-                reply = await self.client.mesh.ask_one(
-                    self.client.mesh.keys.rank, RankAsk(), HostRanking, timeout=1
-                )
+                reply = await self.client.mesh.ask_one(self.client.mesh.keys.rank, RankAsk(), HostRanking, timeout=1)
                 if reply is not None and reply.message is not None and len(reply.message.hosts) == count:
                     return
                 await asyncio.sleep(0.05)
@@ -159,11 +155,7 @@ class WitnessRc:
         self._stall = StallWatch().start()
         self._mesh = await ZenohMesh.open(fleet.name, Sender("devices", "node"), fleet.mesh)
         self._rc = ResourceController(
-            self._mesh,
-            self.name,
-            self.witness,
-            hold_lease=fleet.timing.hold_lease / SECOND,
-            stall=self._stall,
+            self._mesh, self.name, self.witness, hold_lease=fleet.timing.hold_lease / SECOND, stall=self._stall
         )
         await self._rc.start()
         return self
@@ -190,9 +182,7 @@ class Stepper(Component):
     async def run(self, context: ComponentContext) -> None:
         while True:
             with suppress(Revoked, CommandRefused):
-                async for attempt in holds(
-                    context.client, context.component, {self.rc: {}}, min_runtime=3600
-                ):
+                async for attempt in holds(context.client, context.component, {self.rc: {}}, min_runtime=3600):
                     async with attempt as held:
                         while True:
                             await held.command(self.rc, {"name": "echo", "value": self.count + 1})

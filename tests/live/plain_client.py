@@ -25,9 +25,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 # Protocol, "Joining": with few receiving threads one cut-off host stalls every link.
-os.environ.setdefault(
-    "ZENOH_RUNTIME", "(rx:(worker_threads:16),net:(worker_threads:4),tx:(worker_threads:4))"
-)
+os.environ.setdefault("ZENOH_RUNTIME", "(rx:(worker_threads:16),net:(worker_threads:4),tx:(worker_threads:4))")
 
 import zenoh
 
@@ -351,9 +349,7 @@ def main() -> None:
     with zenoh.open(settings(multicast, float(lease))) as session:
         client = PlainClient(session, fleet, host, name, float(more[0]) if more else 3.0)
         declared = client.declare()
-        threads = [
-            threading.Thread(target=run, daemon=True) for run in (client.carry_out, client.watch_lease)
-        ]
+        threads = [threading.Thread(target=run, daemon=True) for run in (client.carry_out, client.watch_lease)]
         for thread in threads:
             thread.start()
         tell("ready", imported=sorted(module for module in sys.modules if module.split(".")[0] == "zscout"))

@@ -82,9 +82,7 @@ class Stranger:
 
     def state(self) -> Json:
         answers = [answer for kind, answer in self.get("rcm/state", b"{}") if kind == "ok"]
-        return max(
-            answers, key=lambda state: state["term"], default={"term": [0, ""], "rcs": [], "holds": []}
-        )
+        return max(answers, key=lambda state: state["term"], default={"term": [0, ""], "rcs": [], "holds": []})
 
     def ready(self) -> None:
         self.await_(
@@ -95,9 +93,7 @@ class Stranger:
     def serves(self) -> None:
         """A good request is granted, confirmed and obeyed; and the log holds no traceback."""
         self.number += 1
-        request = good_ask(
-            id=f"good-{self.number}", needs={"robot/a": {}, "radio/a": {"rate": 10}}, priority=9
-        )
+        request = good_ask(id=f"good-{self.number}", needs={"robot/a": {}, "radio/a": {"rate": 10}}, priority=9)
         notice = self.ask("rcm/schedule/t/good", request)
         assert notice["state"] == "running", notice
         command = {"grant": notice["grant"], "do": {"name": "echo", "value": self.number}}
@@ -129,14 +125,7 @@ def beside_a_node(folder: Path) -> Iterator[Stranger]:
 
 
 def good_ask(**changes: Any) -> Json:
-    ask = {
-        "op": "request",
-        "id": "x",
-        "arc": "bad",
-        "needs": {"robot/a": {}},
-        "priority": 0,
-        "min_runtime": 1,
-    }
+    ask = {"op": "request", "id": "x", "arc": "bad", "needs": {"robot/a": {}}, "priority": 0, "min_runtime": 1}
     return {name: value for name, value in (ask | changes).items() if value is not ...}
 
 

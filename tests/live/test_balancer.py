@@ -51,9 +51,7 @@ async def _ranks(tmp_path: Path) -> None:
         assert some.left_out == {"h9": "no report of it"}
         none = await ranked(client, RankAsk(labels=["gpu"]), set())
         assert set(none.left_out.values()) == {"it has no label gpu"}
-        reply = await client.mesh.ask_one(
-            client.mesh.keys.rank, RankAsk(at_most=1), HostRanking, timeout=HANG
-        )
+        reply = await client.mesh.ask_one(client.mesh.keys.rank, RankAsk(at_most=1), HostRanking, timeout=HANG)
         assert reply is not None
         assert reply.message is not None
         assert (len(reply.message.hosts), reply.message.more) == (1, 2)

@@ -23,10 +23,7 @@ def test_what_is_asked_and_given_up_in_one_burst_is_gone(tmp_path: Path) -> None
             holder = await client.request("holder", {"robot/a": {}}, min_runtime=60)
             assert holder.state == "running"
             key = client.mesh.keys.schedule(client.mesh.me)
-            asked = [
-                asyncio.create_task(client.request(f"w{n}", {"robot/a": {}}, min_runtime=1))
-                for n in range(40)
-            ]
+            asked = [asyncio.create_task(client.request(f"w{n}", {"robot/a": {}}, min_runtime=1)) for n in range(40)]
             arcs = [await task for task in asked]
             assert {arc.state for arc in arcs} == {"queued"}
             # Each waiting request, asked again and cancelled without waiting for the answer in between.

@@ -8,13 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from tests.behaviors.components.kit import (
-    ComponentLab,
-    Hosts,
-    counts,
-    counts_on,
-    gone,
-)
+from tests.behaviors.components.kit import ComponentLab, Hosts, counts, counts_on, gone
 from tests.hang import HANG
 from zscout.behaviors.client.client import Client
 from zscout.messages import (
@@ -40,9 +34,7 @@ from zscout.messages import (
 QUICK: dict[str, Any] = {"period": 0.02}
 
 
-async def move(
-    hosts: Hosts, source: str, target: str, incarnation: int, kind: str, params: dict[str, Any]
-) -> Moved:
+async def move(hosts: Hosts, source: str, target: str, incarnation: int, kind: str, params: dict[str, Any]) -> Moved:
     """Moves "c" as a placer does."""
     view = await hosts.start(target, "c", kind, params, incarnation=incarnation + 1, standby=True)
     assert view.phase == "standby", view
@@ -186,9 +178,7 @@ def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Path) -> 
             assert "b did not answer" in await fails("b", 4)
 
             lost = [
-                line
-                for line in (await hosts.get("a", ReadOutput("c"), Output)).text.splitlines()
-                if "lost" in line
+                line for line in (await hosts.get("a", ReadOutput("c"), Output)).text.splitlines() if "lost" in line
             ]
             assert lost == []
             numbers = await counts(hosts, "a")
@@ -222,8 +212,7 @@ def test_a_target_that_is_killed_while_it_is_moved_to_leaves_one_that_counts(tmp
             # Wherever in the move the other node dies: it goes on where it was, or is started there again.
             moving = asyncio.create_task(placer(client, MigrateComponent("c", target)))
             await lab.state(
-                client,
-                lambda state: moving.done() or any(hold.client.startswith(target) for hold in state.holds),
+                client, lambda state: moving.done() or any(hold.client.startswith(target) for hold in state.holds)
             )
             lab.signal(target, signal.SIGKILL)
             answer = await moving

@@ -6,12 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-from tests.behaviors.components.kit import (
-    ComponentLab,
-    Hosts,
-    counts,
-    counts_on,
-)
+from tests.behaviors.components.kit import ComponentLab, Hosts, counts, counts_on
 from zscout.behaviors.client.client import Client
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token

@@ -10,12 +10,7 @@ from pathlib import Path
 
 import psutil
 
-from tests.behaviors.components.kit import (
-    ComponentLab,
-    Hosts,
-    gone,
-    lives,
-)
+from tests.behaviors.components.kit import ComponentLab, Hosts, gone, lives
 from tests.behaviors.components.odd import TOO_LARGE
 from tests.hang import HANG
 from zscout.keyexpr import Role, Token
@@ -50,9 +45,7 @@ def test_a_component_is_started_once_listed_read_checkpointed_and_stopped(tmp_pa
             client = await lab.client()
             hosts = Hosts(client)
             loads: asyncio.Queue[LoadReport] = asyncio.Queue()
-            client.mesh.subscribe(
-                client.mesh.keys.load_any, LoadReport, lambda _, load: loads.put_nowait(load)
-            )
+            client.mesh.subscribe(client.mesh.keys.load_any, LoadReport, lambda _, load: loads.put_nowait(load))
             # Asked for twice at once, and again: there is one process.
             start = StartComponent("c", 7, COUNTER)
             first, second = await asyncio.gather(
@@ -82,9 +75,7 @@ def test_a_component_is_started_once_listed_read_checkpointed_and_stopped(tmp_pa
             async with asyncio.timeout(HANG):
                 while not (load := await loads.get()).components:
                     pass
-            assert [(use.component, use.kind, use.incarnation) for use in load.components] == [
-                ("c", "counter", 7)
-            ]
+            assert [(use.component, use.kind, use.incarnation) for use in load.components] == [("c", "counter", 7)]
             assert load.components[0].memory > 10_000_000
             listed = await hosts.get("a", ListComponents(), ComponentList)
             assert [(view.component, view.phase) for view in listed.components] == [("c", "running")]

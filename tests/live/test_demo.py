@@ -15,14 +15,7 @@ import psutil
 import pytest
 
 from tests.hang import HANG
-from tests.services.recorder.paper_run import (
-    RCS,
-    TABLE2,
-    colours,
-    events,
-    lanes,
-    rows,
-)
+from tests.services.recorder.paper_run import RCS, TABLE2, colours, events, lanes, rows
 from zscout.lab.demo.tables import Observed, differences, paper
 from zscout.services.recorder.timeline import OPERATOR_MARK
 from zscout.types import SECOND

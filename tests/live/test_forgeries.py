@@ -58,15 +58,7 @@ def test_nobody_falls_for_a_bad_publication(stranger: Stranger, key: str, payloa
 
 
 @pytest.mark.parametrize(
-    "tail",
-    [
-        "t",
-        "t/rc/robot/1",
-        "t/client/a b/1",
-        "t/rc/robot/a/b/c",
-        "t/client/x/1/2",
-        "t/rcm/" + "x" * 300 + "/1",
-    ],
+    "tail", ["t", "t/rc/robot/1", "t/client/a b/1", "t/rc/robot/a/b/c", "t/client/x/1/2", "t/rcm/" + "x" * 300 + "/1"]
 )
 def test_a_malformed_token_is_nobody(stranger: Stranger, tail: str) -> None:
     token = stranger.token(tail)
@@ -78,9 +70,7 @@ def test_a_malformed_token_is_nobody(stranger: Stranger, tail: str) -> None:
 def test_an_exclusive_rc_obeys_one_of_two_forged_holders(stranger: Stranger) -> None:
     now = stranger.state()
     forged = [held(grant=[now["term"], seq], place=[now["term"], seq]) for seq in (901, 902)]
-    stranger.put(
-        "rcm/grants", json.dumps(grants(term=now["term"], seq=now["seq"], rcs={"robot/a": forged})).encode()
-    )
+    stranger.put("rcm/grants", json.dumps(grants(term=now["term"], seq=now["seq"], rcs={"robot/a": forged})).encode())
     assert len(stranger.ask("rc/robot/a/state", {}).get("holders", [])) <= 1
     stranger.await_("the RCM has set it right", lambda: "holders" not in stranger.ask("rc/robot/a/state", {}))
     stranger.serves()

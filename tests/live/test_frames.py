@@ -142,8 +142,7 @@ def test_who_looks_has_the_newest_frame_and_whoever_publishes_knows(tmp_path: Pa
             for payload, attachment in bad:
                 before = watch.malformed
                 await until_there(
-                    functools.partial(raw.put, payload, attachment),
-                    functools.partial(refused, watch, before),
+                    functools.partial(raw.put, payload, attachment), functools.partial(refused, watch, before)
                 )
             assert (await arrives(11, b"good")).head.number == 11
 

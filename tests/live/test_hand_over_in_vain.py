@@ -128,9 +128,7 @@ def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
     asyncio.run(story())
 
 
-def test_what_comes_and_nobody_wants_or_does_not_come(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_comes_and_nobody_wants_or_does_not_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(handover, "CLAIM_TIMEOUT", 0.2)
     monkeypatch.setattr(handover, "EXPECT_TIMEOUT", 0.2)
 

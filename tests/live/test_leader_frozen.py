@@ -128,9 +128,7 @@ async def _forgeries_are_ignored(lab: Lab, crew: Crew, stood: Stand, newest: Ter
             assert [holder.grant for holder in answers[-1].holders] == [real.grant]
         stranger.put(keys.notice(Sender(*notice.client.split("/"))), encode(notice))
         # A request of the same session is answered after what it published was read.
-        raw = await asyncio.to_thread(
-            _get, stranger, keys.schedule(Sender("test", "stranger")), _any_request()
-        )
+        raw = await asyncio.to_thread(_get, stranger, keys.schedule(Sender("test", "stranger")), _any_request())
         assert raw
     with pytest.raises(CommandRefused) as refused:
         await client.command(body.rc, thief, {"name": "echo", "value": 0})

@@ -259,10 +259,7 @@ async def _drains(tmp_path: Path) -> None:
         await placing.hosts(2)
         both = ["h0", "h1"]
         placed = await asyncio.gather(
-            *(
-                placing.place(name, "counter", {"rc": f"robot/{name}", "period": 0.01}, hosts=both)
-                for name in names
-            )
+            *(placing.place(name, "counter", {"rc": f"robot/{name}", "period": 0.01}, hosts=both) for name in names)
         )
         revoked: list[str] = []
 

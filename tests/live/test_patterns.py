@@ -184,9 +184,7 @@ def test_what_no_request_may_ask_is_refused_with_the_remedy(tmp_path: Path) -> N
                 assert refused.value.code == "bad_request"
                 with pytest.raises(RequestRefused, match=remedy):
                     await client.foresee("bad", needs, priority=0, min_runtime=Decimal(1))
-            foretold = await client.foresee(
-                "good", {"radio/*": {"rate": 1}}, priority=0, min_runtime=Decimal(1)
-            )
+            foretold = await client.foresee("good", {"radio/*": {"rate": 1}}, priority=0, min_runtime=Decimal(1))
             assert foretold is not None
             assert foretold.starts_in == 0
 

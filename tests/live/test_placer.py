@@ -158,9 +158,7 @@ async def _leader_dies(tmp_path: Path) -> None:
         placing = await three(lab)
         (leader,) = {
             token.host
-            for token in await placing.client.mesh.living(
-                placing.client.mesh.keys.alive_any(Role.RCM), timeout=1
-            )
+            for token in await placing.client.mesh.living(placing.client.mesh.keys.alive_any(Role.RCM), timeout=1)
         }
         others = sorted({"h0", "h1", "h2"} - {leader})
         lost = await placing.place("lost", "counter", hosts=[leader, others[0]])
@@ -190,8 +188,6 @@ async def _restarts(tmp_path: Path) -> None:
         assert view.pid is not None
         assert lives(view.pid)
         psutil.Process(view.pid).kill()
-        again = await placing.until(
-            "one", lambda one: one.state == "running" and one.incarnation > first.incarnation
-        )
+        again = await placing.until("one", lambda one: one.state == "running" and one.incarnation > first.incarnation)
         assert again.restarts == 1
         assert (await placing.get(UncordonHost("h1"), Placements)).cordoned == []

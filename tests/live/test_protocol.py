@@ -39,9 +39,7 @@ def test_the_document_names_every_message_and_field(name: str) -> None:
     assert section is not None, f"docs/protocol.md has no section on {name}"
     told = set(re.findall(r"^\| `(\w+)` \|", section.group(), re.MULTILINE))
     tag = STRUCTS[name].__struct_config__.tag_field
-    fields = {field.encode_name for field in msgspec.structs.fields(STRUCTS[name])} | (
-        {tag} if tag else set()
-    )
+    fields = {field.encode_name for field in msgspec.structs.fields(STRUCTS[name])} | ({tag} if tag else set())
     assert told == fields
 
 
@@ -67,13 +65,7 @@ def test_the_document_names_every_key_and_role() -> None:
         keys.vote("K/N"),
         keys.command("K/N", sender),
     ]
-    built += [
-        keys.rc_state("K/N"),
-        keys.frame("K/N"),
-        keys.load("H"),
-        keys.notice(sender),
-        keys.requests(sender),
-    ]
+    built += [keys.rc_state("K/N"), keys.frame("K/N"), keys.load("H"), keys.notice(sender), keys.requests(sender)]
     words = {"fleet": "<fleet>", "H": "<host>", "C": "<client>", "K": "<kind>", "N": "<name>"}
     for key in built:
         told = "/".join(words.get(chunk, chunk) for chunk in key.split("/"))
@@ -110,11 +102,7 @@ class PlainProcess:
         program = str(Path(__file__).with_name("plain_client.py"))
         arguments = [lab.fleet.name, "elsewhere", name, mesh.multicast_address, str(mesh.lease)]
         process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            program,
-            *arguments,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
+            sys.executable, program, *arguments, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
         )
         return cls(process)
 
@@ -156,9 +144,7 @@ class PlainProcess:
 def holds(request_id: str, grant: Any = None) -> Callable[[RcmState], bool]:
     """Whether the RCM's state shows a hold of this id, under this grant if one is given."""
     wanted = None if grant is None else json.dumps(grant)
-    return lambda state: any(
-        view.id == request_id and wanted in (None, json.dumps(view.grant)) for view in state.holds
-    )
+    return lambda state: any(view.id == request_id and wanted in (None, json.dumps(view.grant)) for view in state.holds)
 
 
 @pytest.mark.live

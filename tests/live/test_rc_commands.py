@@ -47,17 +47,12 @@ def test_every_refusal(tmp_path: Path) -> None:
                 assert (await echo(grant)).result == 1
                 assert await answer(echo(never)) == "not_holder"
                 assert await answer(other.command("robot/bench", grant, ECHO)) == "wrong_client"
-                assert (
-                    await answer(other.command("robot/bench", grant, {"name": "confirm"})) == "wrong_client"
-                )
+                assert await answer(other.command("robot/bench", grant, {"name": "confirm"})) == "wrong_client"
                 assert await answer(echo(Grant(grant.term, grant.seq + 1000))) == "not_yet"
                 for ttl in (0, -1, MAX_TTL + 1):
                     assert await answer(echo(grant, ttl=ttl)) == "bad_command"
                 for name in ("no such thing", 7, None):
-                    assert (
-                        await answer(client.command("robot/bench", grant, {"name": name}))
-                        == "unknown_command"
-                    )
+                    assert await answer(client.command("robot/bench", grant, {"name": name})) == "unknown_command"
                 assert await answer(client.command("robot/bench", grant, {"name": "crash"})) == "failed"
                 await _malformed(lab, client, grant)
 
@@ -65,9 +60,7 @@ def test_every_refusal(tmp_path: Path) -> None:
                 slow = asyncio.create_task(client.command("robot/bench", grant, WAIT, timeout=HANG))
                 await bench.waiting.wait()
                 stale = asyncio.create_task(echo(grant, ttl=0.05, timeout=HANG))
-                many = [
-                    asyncio.create_task(echo(grant, ttl=60, timeout=HANG)) for _ in range(COMMAND_QUEUE - 1)
-                ]
+                many = [asyncio.create_task(echo(grant, ttl=60, timeout=HANG)) for _ in range(COMMAND_QUEUE - 1)]
                 await until(lambda: rc.queue.commands == COMMAND_QUEUE)
                 assert await answer(echo(grant)) == "busy"
                 sent = clock.now()
@@ -135,10 +128,7 @@ def test_what_piles_up_while_a_node_stands_still_is_refused(tmp_path: Path) -> N
             arc, grant = await running(client, "one", "robot/x")
             lab.signal("c", signal.SIGSTOP)
             sent = clock.now()
-            old = [
-                asyncio.create_task(client.command("robot/x", grant, ECHO, ttl=0.3, timeout=HANG))
-                for _ in range(5)
-            ]
+            old = [asyncio.create_task(client.command("robot/x", grant, ECHO, ttl=0.3, timeout=HANG)) for _ in range(5)]
             await until(lambda: clock.now() - sent > 0.8 * SECOND)
             assert not any(task.done() for task in old)
             lab.signal("c", signal.SIGCONT)
@@ -236,9 +226,7 @@ def test_holds_end_at_rc_and_client_when_no_rcm_is_heard_for_the_hold_lease(tmp_
                 kept, kept_grant = await running(client, "kept", "robot/y", min_runtime=0.1, keep=True)
                 grants: list[Grant] = []
                 with pytest.raises(Revoked) as revoked:  # noqa: PT012
-                    async with hold(
-                        client, "gang", {"robot/x": {}, "robot/bench": {}}, min_runtime=600
-                    ) as held:
+                    async with hold(client, "gang", {"robot/x": {}, "robot/bench": {}}, min_runtime=600) as held:
                         grants.append(held.grant)
                         killed = lab.signal("a", signal.SIGKILL)
                         async with asyncio.timeout(HANG):

@@ -81,9 +81,7 @@ def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path, monkeypatch
     asyncio.run(story())
 
 
-def test_a_question_that_nobody_answered_is_asked_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_question_that_nobody_answered_is_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", 0.1)
 
     async def story() -> None:

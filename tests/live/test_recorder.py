@@ -22,12 +22,7 @@ import pytest
 
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.services.recorder.paper_run import (
-    colours,
-    events,
-    lanes,
-    rows,
-)
+from tests.services.recorder.paper_run import colours, events, lanes, rows
 from zscout.behaviors.client.arc import hold
 from zscout.config.fleet import MeshConfig
 from zscout.config.node import RecorderConfig
@@ -35,14 +30,7 @@ from zscout.config.strict import BadInput
 from zscout.keyexpr import Role, Token
 from zscout.messages import Notice, RcState
 from zscout.services.recorder.colours import OPERATOR
-from zscout.services.recorder.process import (
-    RecorderJob,
-    Recording,
-    beside,
-    encode_job,
-    new_recording,
-    prune,
-)
+from zscout.services.recorder.process import RecorderJob, Recording, beside, encode_job, new_recording, prune
 
 pytestmark = pytest.mark.live
 
@@ -142,9 +130,7 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
                 await lab.state(client, lambda state: {wait.arc for wait in state.queue} == {"survey"})
                 await asyncio.Event().wait()
             await lab.state(client, lambda state: "survey" in {held.arc for held in state.holds})
-            await recorded(
-                runs, lambda path: {entity for entity, _, _ in loads_in(path)} == {"/load/a", "/load/b"}
-            )
+            await recorded(runs, lambda path: {entity for entity, _, _ in loads_in(path)} == {"/load/a", "/load/b"})
             await client.end(survey)
             await client.end(listen)
             await lab.state(client, lambda state: not state.holds and not state.queue)
@@ -215,9 +201,7 @@ def test_a_recorder_starts_in_the_middle_and_outlives_the_leader(tmp_path: Path)
             await client.end(second)
             await lab.state(client, lambda state: not state.holds)
             ends = [["waiter"], [""]], [[""]]
-            await recorded(
-                runs, lambda path: (lane(path, "/rc/robot/b")[-2:], lane(path, "/rc/robot/c")[-1:]) == ends
-            )
+            await recorded(runs, lambda path: (lane(path, "/rc/robot/b")[-2:], lane(path, "/rc/robot/c")[-1:]) == ends)
             # The node is shot: its recorder finishes the file all the same, as its input closes.
             lab.nodes["c"].kill()
             await until(lambda: finished(the_file(tmp_path / "runs")))
@@ -325,9 +309,7 @@ def run_recorder(lab: Lab, job: bytes) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, None])
-def test_the_program_says_where_it_records_and_ends_in_order(
-    tmp_path: Path, number: signal.Signals | None
-) -> None:
+def test_the_program_says_where_it_records_and_ends_in_order(tmp_path: Path, number: signal.Signals | None) -> None:
     async def story() -> None:
         async with Lab(tmp_path) as lab:
             job = RecorderJob(RecorderConfig(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
@@ -361,9 +343,7 @@ def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
                         RecorderJob(RecorderConfig(tmp_path / "runs", "127.0.0.1", port), lab.fleet, "a")
                     ),
                     "recordings can't be written to": encode_job(
-                        RecorderJob(
-                            RecorderConfig(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet, "a"
-                        )
+                        RecorderJob(RecorderConfig(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet, "a")
                     ),
                     "no job for a recorder": b'{"recorder": 1}\n',
                 }

@@ -124,9 +124,7 @@ def test_a_voter_that_does_not_answer_stops_nobody_else(tmp_path: Path) -> None:
                 arc, _ = await running(client, f"other-{number}", "robot/b")
                 took.append((clock.now() - began) / SECOND)
                 await client.end(arc)
-            print(
-                f"told that a voter is silent after {told:.2f} s; grants beside it: {max(took):.3f} s at most"
-            )
+            print(f"told that a voter is silent after {told:.2f} s; grants beside it: {max(took):.3f} s at most")
             assert worker.grant == grant
             assert await answer(client.command("robot/a", grant, ECHO)) == "done"
             state = await lab.state(client, lambda state: len(state.queue) == 1)

@@ -174,9 +174,7 @@ def test_all_who_serve_a_key_reply(play: Play) -> None:
             mesh.serve(ASK, Ping, pong(mesh))
         await world.declared()
         replies = await a.ask(ASK, Ping(7), Pong, timeout=LONG)
-        assert {(reply.key, reply.message) for reply in replies} == {
-            (ASK, Pong(7, host)) for host in ("a", "b", "c")
-        }
+        assert {(reply.key, reply.message) for reply in replies} == {(ASK, Pong(7, host)) for host in ("a", "b", "c")}
         assert all(reply.problem is None for reply in replies)
 
     play(story)
@@ -266,11 +264,7 @@ def test_a_query_is_over_when_the_process_that_keeps_it_leaves(play: Play) -> No
 
 @pytest.mark.parametrize(
     ("error", "code"),
-    [
-        (Refused("not_yet", "wait"), "not_yet"),
-        (BadName("no name"), "bad_name"),
-        (ValueError("broken"), "internal"),
-    ],
+    [(Refused("not_yet", "wait"), "not_yet"), (BadName("no name"), "bad_name"), (ValueError("broken"), "internal")],
 )
 def test_what_a_handler_raises_is_replied_as_a_problem(play: Play, error: Exception, code: str) -> None:
     async def story(world: World) -> None:
@@ -329,9 +323,7 @@ def test_a_query_without_a_message_is_an_empty_one(play: Play) -> None:
     play(story)
 
 
-def test_a_reply_that_is_malformed_or_too_long_is_dropped(
-    play: Play, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_reply_that_is_malformed_or_too_long_is_dropped(play: Play, caplog: pytest.LogCaptureFixture) -> None:
     async def story(world: World) -> None:
         a, b = await world.open("a", "b")
         b.serve(ASK, Ping, lambda query: query.answer(Pong(1, "x" * 200)))
@@ -600,9 +592,7 @@ def test_the_newest_frame_is_taken_and_its_publisher_knows_of_subscribers(play: 
             await until(lambda: publisher.watched)
             sent = itertools.count()
 
-            def publish(
-                until: Callable[[], object],
-            ) -> bool:  # again: a frame that would have to wait is dropped
+            def publish(until: Callable[[], object]) -> bool:  # again: a frame that would have to wait is dropped
                 number = next(sent)
                 publisher.put(FrameHead(number=number, time=0, width=1, height=1), b"jpeg %d" % number)
                 return bool(until())

@@ -88,9 +88,7 @@ def test_a_task_that_raises_is_logged_once_fails_its_owner_once_and_ends_its_sib
     assert has_traceback(record, "in explode")
 
 
-def test_two_that_fail_together_fail_the_owner_once_and_are_both_logged(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_two_that_fail_together_fail_the_owner_once_and_are_both_logged(caplog: pytest.LogCaptureFixture) -> None:
     async def story() -> None:
         async with owned() as owner:
             owner.supervisor.spawn(explode("first"))
@@ -121,9 +119,7 @@ def test_an_error_that_is_awaited_in_a_sibling_is_logged_once(caplog: pytest.Log
     assert len(errors(caplog)) == 1
 
 
-def test_a_timer_that_raises_fails_the_owner(
-    runner: asyncio.Runner, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_timer_that_raises_fails_the_owner(runner: asyncio.Runner, caplog: pytest.LogCaptureFixture) -> None:
     async def story() -> None:
         async with owned() as owner:
             sibling = owner.supervisor.spawn(forever())
@@ -175,9 +171,7 @@ def test_a_handler_that_refuses_has_not_failed(answer: Exception) -> None:
     asyncio.run(story())
 
 
-def test_an_owner_that_fails_to_handle_a_failure_is_logged_and_its_tasks_end(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_an_owner_that_fails_to_handle_a_failure_is_logged_and_its_tasks_end(caplog: pytest.LogCaptureFixture) -> None:
     async def story() -> None:
         def on_failure(error: Exception) -> None:
             raise KeyError("twice")
@@ -190,10 +184,7 @@ def test_an_owner_that_fails_to_handle_a_failure_is_logged_and_its_tasks_end(
                 await sibling
 
     asyncio.run(story())
-    assert [record.getMessage() for record in errors(caplog)] == [
-        "owner failed",
-        "owner could not handle its failure",
-    ]
+    assert [record.getMessage() for record in errors(caplog)] == ["owner failed", "owner could not handle its failure"]
     assert has_traceback(errors(caplog)[1], "in on_failure")
 
 

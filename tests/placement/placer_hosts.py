@@ -147,13 +147,7 @@ class Hosts(ABC):
         proc.waiting.append(tell)
 
     def _ready(
-        self,
-        host: Host,
-        life: dict[tuple[ComponentId, Incarnation], Proc],
-        proc: Proc,
-        *,
-        standby: bool,
-        well: bool,
+        self, host: Host, life: dict[tuple[ComponentId, Incarnation], Proc], proc: Proc, *, standby: bool, well: bool
     ) -> None:
         if host.procs is not life or proc.phase != "starting":
             return
@@ -161,9 +155,7 @@ class Hosts(ABC):
             self.end(host, proc, "failed")
         elif standby:
             proc.phase = "standby"
-            self.later(
-                STANDS_BY, lambda: self.end(host, proc, "stopped") if proc.phase == "standby" else None
-            )
+            self.later(STANDS_BY, lambda: self.end(host, proc, "stopped") if proc.phase == "standby" else None)
         else:
             self.activate(host, proc)
         for tell in proc.waiting:

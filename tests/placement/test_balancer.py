@@ -13,12 +13,7 @@ from tests.thorough import times
 from zscout.messages import ComponentUse, LoadReport
 from zscout.placement import balancer as core
 from zscout.placement.balancer import SHOWN, Balancer
-from zscout.placement.model import (
-    DEFAULT_PROFILE,
-    STALE,
-    Profile,
-    RankQuery,
-)
+from zscout.placement.model import DEFAULT_PROFILE, STALE, Profile, RankQuery
 from zscout.types import METRICS, POLICIES, SECOND, Metric, Policy
 
 GIGABYTE = 1_000_000_000
@@ -98,9 +93,7 @@ def test_only_the_hosts_asked_for_are_ranked() -> None:
     assert ([one.host for one in ranking.hosts], ranking.left_out) == (["slow"], {})
 
 
-@pytest.mark.parametrize(
-    ("policy", "sees"), [("least_loaded", False), ("two_choices", True), ("pending", True)]
-)
+@pytest.mark.parametrize(("policy", "sees"), [("least_loaded", False), ("two_choices", True), ("pending", True)])
 def test_policies_count_what_no_report_shows(policy: Policy, sees: bool) -> None:
     balancer = fleet({})
     balancer.placed(0, "one", "job", "fast")
@@ -122,10 +115,7 @@ def test_pending_lets_go_as_the_load_average_shows_it() -> None:
         # What the reports show and what they do not show yet are always the one core that it wants.
         assert balancer.outlook(at * SECOND, "fast", pending=True).load == pytest.approx(1.0, abs=0.001)
         assert balancer.outlook(at * SECOND, "fast", pending=True).memory == 4 * GIGABYTE
-    assert (
-        balancer.outlook(SHOWN, "fast", pending=True).load
-        == balancer.outlook(SHOWN, "fast", pending=False).load
-    )
+    assert balancer.outlook(SHOWN, "fast", pending=True).load == balancer.outlook(SHOWN, "fast", pending=False).load
 
 
 @pytest.mark.parametrize("end", ["gone", "moved", "lost"])
@@ -316,6 +306,4 @@ def test_no_ranking_names_a_host_that_does_not_fit(
     asked = set(balancer.reports) if hosts is None else hosts
     assert sorted([*named, *ranking.left_out]) == sorted(asked)
     if policy != "two_choices":
-        assert [one.score for one in ranking.hosts] == sorted(
-            (one.score for one in ranking.hosts), reverse=True
-        )
+        assert [one.score for one in ranking.hosts] == sorted((one.score for one in ranking.hosts), reverse=True)

@@ -78,9 +78,7 @@ def changes(effects: list[PlacerEffect]) -> list[tuple[str, str]]:
 def test_what_has_ended_is_forgotten_after_a_while_and_its_incarnations_are_not_used_again() -> None:
     (placer, balancer), spec = fleet(), ComponentSpec("job")
     [(host, first)] = starts(placer.handle(0, PlaceComponent("a", spec)))
-    ended = ComponentsListed(
-        host, (ComponentView("a", first.incarnation, host, spec, "ended", ended="completed"),)
-    )
+    ended = ComponentsListed(host, (ComponentView("a", first.incarnation, host, spec, "ended", ended="completed"),))
     assert changes(placer.handle(SECOND, ended)) == [("a", "ended")]
     assert ("a", "forgotten") not in changes(placer.handle(RETENTION))
     assert placer.handle(SECOND + RETENTION) == [ComponentChanged("a", None), PlacerWakeAt(None)]

@@ -12,14 +12,7 @@ from msgspec.structs import replace
 
 from zscout.config.fleet import PlacementPolicy
 from zscout.lab.study.placement.simulation import Machine, SimulatedJob, _Host, _Running
-from zscout.messages import (
-    ComponentSpec,
-    ComponentView,
-    DrainHost,
-    MoveComponent,
-    StartComponent,
-    StopComponent,
-)
+from zscout.messages import ComponentSpec, ComponentView, DrainHost, MoveComponent, StartComponent, StopComponent
 from zscout.placement.balancer import LOAD_TIME, Balancer
 from zscout.placement.events import (
     ComponentsListed,

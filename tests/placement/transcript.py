@@ -118,9 +118,7 @@ class PlacerPlayer:
         """Wakes and reports up to then."""
         found: list[str] = []
         for _ in range(MOST_WAKES):
-            due = min(
-                until, self.now + REPORT_EVERY, until if self.wake is None else max(self.wake, self.now)
-            )
+            due = min(until, self.now + REPORT_EVERY, until if self.wake is None else max(self.wake, self.now))
             self.pass_to(due)
             if self.wake is not None and self.wake <= due:
                 found += [f"at {seconds(due)}: {line}" for line in self.handle()]

@@ -45,9 +45,7 @@ def fits(items: Sequence[PackingItem], vetoes: Iterable[frozenset[int]], chosen:
     return not any(items[one].mask & items[other].mask for one, other in combinations(chosen, 2))
 
 
-def may_end(
-    items: Sequence[PackingItem], vetoes: Iterable[frozenset[int]], chosen: frozenset[int], one: int
-) -> bool:
+def may_end(items: Sequence[PackingItem], vetoes: Iterable[frozenset[int]], chosen: frozenset[int], one: int) -> bool:
     """Whether a running item is in the set, or has no room beside the chosen that it must give way to."""
     if one in chosen:
         return True

@@ -13,24 +13,14 @@ from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Arc, ArcRequest, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.workload import WorkloadRc, excess
-from zscout.types import (
-    NO_TERM,
-    ArcId,
-    ClientId,
-    Grant,
-    Ns,
-    Params,
-    RcName,
-)
+from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Params, RcName
 
 
 class Ledger:
     """Follows grants and revocations and raises `AssertionError` at the first that breaks a promise."""
 
     def __init__(self, rcs: Iterable[WorkloadRc], requests: Iterable[ArcRequest] = ()) -> None:
-        self.capacity: dict[RcName, Mapping[str, Fraction]] = {
-            rc.name: rc.capacity for rc in rcs if rc.sharable
-        }
+        self.capacity: dict[RcName, Mapping[str, Fraction]] = {rc.name: rc.capacity for rc in rcs if rc.sharable}
         self.requests: dict[ArcId, ArcRequest] = {request.arc: request for request in requests}
         self.open: dict[ArcId, Granted] = {}
         self.newest = Grant(NO_TERM, 0)
@@ -61,9 +51,7 @@ class Ledger:
                     pass
         held = {arc: (hold.grant, hold.client) for arc, hold in self.open.items()}
         believed = {
-            arc.id: (arc.hold.grant, arc.request.client)
-            for arc in core._state.running.values()
-            if arc.hold is not None
+            arc.id: (arc.hold.grant, arc.request.client) for arc in core._state.running.values() if arc.hold is not None
         }
         assert not self.handed_over, "handed over to nobody"
         self._check_moves(core, effects)

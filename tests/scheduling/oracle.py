@@ -106,9 +106,7 @@ class Oracle:
         if not all(may_displace(one) for one in blockers):
             return None
         candidates = [
-            one
-            for one in running
-            if one not in blockers and sharable & set(one.request.needs) and may_displace(one)
+            one for one in running if one not in blockers and sharable & set(one.request.needs) and may_displace(one)
         ]
         stay = [one for one in running if one not in blockers and one not in candidates]
         if not self.accepted(sharable, [*stay, a]):

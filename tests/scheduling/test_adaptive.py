@@ -71,9 +71,7 @@ def instant(core: Core, now: Ns, workload: Workload, events: list[Event]) -> Non
     rcs = {rc.name: rc.capacity for rc in workload.rcs}
     for _ in range(MANY_PASSES):
         effects = core.handle(now, *events)
-        events = [
-            Vote(one.proposal, not excess(rcs[one.rc], one.holders.items())) for one in proposed(effects)
-        ]
+        events = [Vote(one.proposal, not excess(rcs[one.rc], one.holders.items())) for one in proposed(effects)]
         if not events:
             if not wants_more(now, effects):
                 return
@@ -165,10 +163,7 @@ def test_a_gain_is_told_in_words() -> None:
     core = Core(strategy)
     core.handle(0, *(RcJoined(rc, False) for rc in "abcd"))
     core.handle(
-        0,
-        Requested(arc("narrow", "bc", 3, 1)),
-        Requested(arc("left", "ab", 3)),
-        Requested(arc("right", "cd", 3)),
+        0, Requested(arc("narrow", "bc", 3, 1)), Requested(arc("left", "ab", 3)), Requested(arc("right", "cd", 3))
     )
     assert core._state.running.keys() == {"left", "right"}
     assert strategy.log_line().startswith("adaptive: RC assignments at priority 3: 2 -> 4, in ")
@@ -257,10 +252,7 @@ def test_a_veto_brings_the_next_best() -> None:
     core = Core(Adaptive())
     core.handle(0, *(RcJoined(rc, rc.isupper()) for rc in "Rabc"))
     effects = core.handle(
-        0,
-        Requested(arc("narrow", "ab", runtime=1)),
-        Requested(arc("left", "Ra")),
-        Requested(arc("right", "Rbc")),
+        0, Requested(arc("narrow", "ab", runtime=1)), Requested(arc("left", "Ra")), Requested(arc("right", "Rbc"))
     )
     for _ in range(MANY_PASSES):
         asked = proposed(effects)

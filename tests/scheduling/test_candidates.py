@@ -36,9 +36,7 @@ def everyone_looked_at(state: SchedulerState, votes: Votes, now: Ns) -> set[str]
             ]
             for rc in arc.rcs
         }
-        answers = [
-            votes.known(rc.name, frozenset((*stays[rc.name], arc.id))) for rc in arc.rcs if rc.sharable
-        ]
+        answers = [votes.known(rc.name, frozenset((*stays[rc.name], arc.id))) for rc in arc.rcs if rc.sharable]
         refused = any(answer is not None and not answer.accept for answer in answers)
         if refused or any(stays[rc.name] for rc in arc.rcs if not rc.sharable):
             continue
@@ -75,9 +73,7 @@ def mixed(seed: int) -> Workload:
         asked = one.request
         kept, rank = draw.random() < 0.2, draw.randint(1, 4)
         arrivals.append(
-            Arrival(
-                one.at, ArcRequest(asked.arc, asked.client, asked.needs, rank, asked.min_runtime, keep=kept)
-            )
+            Arrival(one.at, ArcRequest(asked.arc, asked.client, asked.needs, rank, asked.min_runtime, keep=kept))
         )
     return Workload(work.rcs, tuple(arrivals))
 

@@ -33,15 +33,7 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import WorkloadRc, excess
-from zscout.types import (
-    NO_TERM,
-    SECOND,
-    ArcId,
-    ClientId,
-    Ns,
-    RcName,
-    Term,
-)
+from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Ns, RcName, Term
 
 OPS = (
     # The first, asked most often, make the core busy; the others disturb it.
@@ -68,9 +60,7 @@ class Chaos:
         self.strategy = strategy
         self.fleet = draw.draw(rcs())
         names = [rc.name for rc in self.fleet]
-        self.to_ask = [
-            draw.draw(requests(f"a{number}", names)) for number in range(draw.draw(st.integers(1, 12)))
-        ]
+        self.to_ask = [draw.draw(requests(f"a{number}", names)) for number in range(draw.draw(st.integers(1, 12)))]
         self.capacities = draw.draw(st.lists(capacity, min_size=1, max_size=4))
         self.sharable = {rc.name: rc.sharable for rc in self.fleet}
         self.present: list[RcName] = []
@@ -185,10 +175,7 @@ class Chaos:
                 self.send(self.vote(self.waiting.pop()))
             elif not self.core._state.queued:
                 return
-            elif any(
-                arc.request.keep and arc.past_min_runtime(self.now)
-                for arc in self.core._state.running.values()
-            ):
+            elif any(arc.request.keep and arc.past_min_runtime(self.now) for arc in self.core._state.running.values()):
                 kept = [arc for arc in self.core._state.running.values() if arc.past_min_runtime(self.now)]
                 self.send(*[Released(arc.id) for arc in kept])
             elif all(self.unservable(arc) for arc in self.core._state.queued.values()):

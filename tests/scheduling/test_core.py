@@ -33,13 +33,7 @@ from zscout.scheduling.model import (
     VoteOverdue,
     WakeAt,
 )
-from zscout.types import (
-    SECOND,
-    Grant,
-    Params,
-    Place,
-    Term,
-)
+from zscout.types import SECOND, Grant, Params, Place, Term
 
 SomeEffect = TypeVar("SomeEffect", bound=Effect)
 OVERDUE = SECOND // 4
@@ -225,9 +219,7 @@ def test_a_kept_hold_yields_to_its_equal_at_the_instant_its_minimum_runtime_is_o
     core = core_with("robot/a")
     core.handle(0, Requested(request("operator", "robot/a", priority=5, keep=True)))
     core.handle(
-        0,
-        Requested(request("equal", "robot/a", priority=5)),
-        Requested(request("lower", "robot/a", priority=4)),
+        0, Requested(request("equal", "robot/a", priority=5)), Requested(request("lower", "robot/a", priority=4))
     )
     assert granted(core.handle(10 * SECOND - 1, Tick())) == []
     effects = core.handle(10 * SECOND, Tick())
@@ -261,9 +253,7 @@ def test_time_must_not_go_backwards() -> None:
 
 def test_the_wake_up_is_the_end_of_a_hold_or_the_quantum_while_anything_waits() -> None:
     core = core_with("robot/a")
-    assert [wake.at for wake in only(WakeAt, core.handle(0, Requested(request("a", "robot/a"))))] == [
-        10 * SECOND
-    ]
+    assert [wake.at for wake in only(WakeAt, core.handle(0, Requested(request("a", "robot/a"))))] == [10 * SECOND]
     assert [wake.at for wake in only(WakeAt, core.handle(0, Requested(request("b", "robot/a"))))] == [QUANTUM]
     late = 10 * SECOND - QUANTUM // 2
     assert [wake.at for wake in only(WakeAt, core.handle(late, Tick()))] == [10 * SECOND]
@@ -307,12 +297,7 @@ def test_a_gang_with_an_absent_rc_is_revoked_whole_and_queued_with_its_place() -
     joins = [RcJoined(rc, sharable=False) for rc in ("robot/a", "robot/b")]
     effects = core.handle(6, *joins, LeadTaken(NEW, (broken, sound)))
     (gone,) = only(HoldEnded, effects)
-    assert (gone.arc, gone.grant, gone.requeued, gone.outcome) == (
-        "broken",
-        Grant(OLD, 1),
-        True,
-        Outcome.LOST,
-    )
+    assert (gone.arc, gone.grant, gone.requeued, gone.outcome) == ("broken", Grant(OLD, 1), True, Outcome.LOST)
     assert core._state.queued["broken"].place == Place(OLD, 1)
     assert core._state.running["sound"].hold is not None
     assert core._state.running["sound"].hold.grant == Grant(OLD, 2)

@@ -21,13 +21,7 @@ from zscout.scheduling.model import (
     Tick,
     Vote,
 )
-from zscout.types import (
-    SECOND,
-    Grant,
-    Params,
-    Place,
-    Term,
-)
+from zscout.types import SECOND, Grant, Params, Place, Term
 
 
 def test_votes_go_with_an_arc_that_is_handed_over() -> None:

@@ -35,9 +35,7 @@ from zscout.types import SECOND, ArcId
 def arc(name: ArcId, needs: str, priority: int = 0, runtime: int = 5, rate: int = 1) -> ArcRequest:
     """`needs`: RCs by letter; capitals are sharable."""
     shares = {"rate": Fraction(rate)}
-    return ArcRequest(
-        name, "host/a", {rc: shares if rc.isupper() else {} for rc in needs}, priority, runtime * SECOND
-    )
+    return ArcRequest(name, "host/a", {rc: shares if rc.isupper() else {} for rc in needs}, priority, runtime * SECOND)
 
 
 def core_of(rcs: str, *requests: ArcRequest) -> tuple[Core, list[Effect]]:
@@ -54,8 +52,7 @@ def test_two_that_use_more_go_before_one_of_better_rank() -> None:
     core, _ = core_of("abcd", arc("narrow", "bc", runtime=1), arc("left", "ab"), arc("right", "cd"))
     assert core._state.running.keys() == {"left", "right"}
     assert (
-        str(core._state.queued["narrow"].reason)
-        == "needs b (held by left, priority 0), c (held by right, priority 0)"
+        str(core._state.queued["narrow"].reason) == "needs b (held by left, priority 0), c (held by right, priority 0)"
     )
 
 
@@ -78,9 +75,7 @@ def test_a_higher_priority_takes_the_place_that_costs_least() -> None:
     assert [set(one.holders) for one in asked] == [{"great", "operator"}]
     effects = core.handle(SECOND, Vote(asked[0].proposal, True))
     ended = [effect for effect in effects if isinstance(effect, HoldEnded)]
-    assert [(effect.arc, effect.outcome, effect.by) for effect in ended] == [
-        ("small", Outcome.PREEMPTED, "operator")
-    ]
+    assert [(effect.arc, effect.outcome, effect.by) for effect in ended] == [("small", Outcome.PREEMPTED, "operator")]
 
 
 def test_a_slow_voter_stops_nobody_who_has_nothing_to_do_with_it() -> None:
@@ -122,8 +117,7 @@ def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
     while batch:
         effects = core.handle(0, *batch)
         batch = [
-            Vote(one.proposal, not excess(there[one.rc].capacity, one.holders.items()))
-            for one in proposed(effects)
+            Vote(one.proposal, not excess(there[one.rc].capacity, one.holders.items())) for one in proposed(effects)
         ]
     assert core._state.running.keys() == {able[one].arc for one in expected(able, there)}
 

@@ -30,9 +30,7 @@ def case(seed: int, most: int = 9) -> Case:
         elif shared and draw.random() < 0.3:
             mask = 0
         past_min_runtime = running and draw.random() < 0.3
-        items.append(
-            PackingItem(mask, mask.bit_count() + shared, draw.randrange(3), running, past_min_runtime)
-        )
+        items.append(PackingItem(mask, mask.bit_count() + shared, draw.randrange(3), running, past_min_runtime))
     items.sort(key=lambda item: item.level)
     vetoes: list[frozenset[int]] = []
     for _ in range(draw.randint(1, 4) if draw.random() < 0.6 else 0):
@@ -86,9 +84,7 @@ def test_what_is_cut_short_is_lawful_no_better_than_the_best_and_no_worse_than_t
         for chosen in (pack(asked, 2).chosen, search.best, asked.complete(seed)):
             holders = frozenset(numbers(chosen))
             assert not any(veto <= holders for veto in vetoes)
-            assert not any(
-                items[one].mask & items[other].mask for one in holders for other in holders if one < other
-            )
+            assert not any(items[one].mask & items[other].mask for one in holders for other in holders if one < other)
             running = [one for one in range(len(items)) if items[one].running]
             assert all(may_end(items, vetoes, holders, one) for one in running)
             assert asked.key(chosen) <= asked.key(exact.chosen)

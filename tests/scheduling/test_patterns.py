@@ -36,23 +36,14 @@ from zscout.scheduling.model import (
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
-from zscout.types import (
-    SECOND,
-    Grant,
-    Ns,
-    Params,
-    Place,
-    Term,
-)
+from zscout.types import SECOND, Grant, Ns, Params, Place, Term
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")
 TERM, NEXT = Term(1, "rcm/a"), Term(2, "rcm/b")
 
 
 def request(arc: str, *needs: str, priority: int = 1, seconds: int = 10, rate: int = 0) -> ArcRequest:
-    wanted: dict[str, Params] = {
-        need: {"rate": Fraction(rate)} if need.startswith("radio") else {} for need in needs
-    }
+    wanted: dict[str, Params] = {need: {"rate": Fraction(rate)} if need.startswith("radio") else {} for need in needs}
     return ArcRequest(arc, "h/c", wanted, priority, seconds * SECOND)
 
 
@@ -87,9 +78,7 @@ def test_several_are_counted_by_naming(strategy: StrategyName) -> None:
     assert len(held(core)) == 1
     assert len(held(core)["two"]) == 2
     core.handle(0, Requested(request("four", *(f"fg/*#{n}" for n in range(1, 5)))))
-    assert str(core._state.queued["four"].reason) == (
-        "no RC on the mesh is left for fg/*#1, fg/*#2, fg/*#3 and 1 more"
-    )
+    assert str(core._state.queued["four"].reason) == ("no RC on the mesh is left for fg/*#1, fg/*#2, fg/*#3 and 1 more")
     core.handle(0, RcJoined("fg/d", sharable=False))
     assert sorted(held(core)) == ["also", "two"]
 
@@ -142,18 +131,13 @@ def test_a_silent_radio_keeps_nobody_who_could_do_with_another(strategy: Strateg
         out = [effect for effect in effects if isinstance(effect, Propose)]
         asked += [one.rc for one in out]
         # The first that is asked never answers.
-        events = [
-            VoteOverdue(one.proposal) if one.rc == asked[0] else Vote(one.proposal, accept=True)
-            for one in out
-        ]
+        events = [VoteOverdue(one.proposal) if one.rc == asked[0] else Vote(one.proposal, accept=True) for one in out]
     assert len(held(core)["any"]) == 1
     assert asked[0] not in held(core)["any"]
 
 
 @pytest.mark.parametrize("strategy", ALL)
-def test_a_hold_keeps_its_rc_over_a_change_of_rcm_and_may_have_another_after_a_loss(
-    strategy: StrategyName,
-) -> None:
+def test_a_hold_keeps_its_rc_over_a_change_of_rcm_and_may_have_another_after_a_loss(strategy: StrategyName) -> None:
     core = Core(STRATEGIES[strategy]())
     wanted = request("any", "fg/*")
     stands = RecoveredHold(wanted, Place(TERM, 1), Grant(TERM, 1), 0, 10 * SECOND, {"fg/*": "fg/b"})
@@ -191,9 +175,7 @@ def test_the_owed_are_kept_one_that_matches() -> None:
     core.handle(0, Requested(request("holds", "robot/x", seconds=20)))
     core.handle(0, Requested(request("owed", "fg/*", "robot/x")))
     core.handle(
-        15 * SECOND,
-        Requested(request("one", "fg/*", seconds=30)),
-        Requested(request("two", "fg/*", seconds=30)),
+        15 * SECOND, Requested(request("one", "fg/*", seconds=30)), Requested(request("two", "fg/*", seconds=30))
     )
     assert sorted(core._state.running) == ["holds", "one"]
     core.handle(20 * SECOND, Tick())
@@ -207,22 +189,14 @@ def workload(seed: int) -> Workload:
     draw = random.Random(seed)  # noqa: S311
     grabbers = [f"fg/{letter}{number}" for letter in "ab" for number in range(draw.randint(1, 2))]
     robots = [f"robot/r{number}" for number in range(draw.randint(1, 3))]
-    radios = [
-        WorkloadRc(f"radio/rf{number}", sharable=True, capacity={"rate": Fraction(10)}) for number in range(2)
-    ]
+    radios = [WorkloadRc(f"radio/rf{number}", sharable=True, capacity={"rate": Fraction(10)}) for number in range(2)]
     arrivals, at = [], 0
     for number in range(draw.randint(5, 16)):
         needs = draw.sample(grabbers, draw.randint(0, 1)) + draw.sample(robots, draw.randint(0, 1))
-        needs += draw.sample(
-            ["fg/*", "fg/*#2", "fg/a$*", "robot/*", "radio/*", "radio/rf0"], draw.randint(0, 3)
-        )
+        needs += draw.sample(["fg/*", "fg/*#2", "fg/a$*", "robot/*", "radio/*", "radio/rf0"], draw.randint(0, 3))
         needs = [need for need in needs if need != "fg/*#2" or "fg/*" in needs] or ["robot/*"]
         wanted = request(
-            f"a{number}",
-            *needs,
-            priority=draw.randint(1, 3),
-            seconds=draw.randint(1, 9),
-            rate=draw.randint(1, 6),
+            f"a{number}", *needs, priority=draw.randint(1, 3), seconds=draw.randint(1, 9), rate=draw.randint(1, 6)
         )
         arrivals.append(Arrival(at, wanted))
         at += draw.randint(0, 3) * SECOND
@@ -231,9 +205,7 @@ def workload(seed: int) -> Workload:
 
 def bindings(arc: Arc, rcs: list[str]) -> Iterator[set[str]]:
     """All ways to meet an ARC's needs, by trying."""
-    choices = [
-        [rc for rc in rcs if matcher(need)(rc)] if is_pattern(need) else [need] for need in arc.request.needs
-    ]
+    choices = [[rc for rc in rcs if matcher(need)(rc)] if is_pattern(need) else [need] for need in arc.request.needs]
     for chosen in itertools.product(*choices):
         if len(set(chosen)) == len(chosen):
             yield set(chosen)
@@ -248,9 +220,7 @@ def could_start(core: Core, arc: Arc, work: Workload) -> bool:
             holders = core._state.rc(name).holders.values()
             if name in capacity:
                 used = sum((holder.needs[name]["rate"] for holder in holders), Fraction(0))
-                rate = next(
-                    params["rate"] for need, params in arc.request.needs.items() if need.startswith("radio")
-                )
+                rate = next(params["rate"] for need, params in arc.request.needs.items() if need.startswith("radio"))
                 free &= used + rate <= capacity[name]
             else:
                 free &= not holders
@@ -273,9 +243,7 @@ def test_nobody_waits_while_some_choice_is_free(strategy: StrategyName, seed: in
 
     played = replay(work, watch, strategy=STRATEGIES[strategy](), policy=SchedulingPolicy(patience=None))
     assert set(played.unserved) == {
-        one.request.arc
-        for one in work.arrivals
-        if not any(bindings(_arc(one.request), [rc.name for rc in work.rcs]))
+        one.request.arc for one in work.arrivals if not any(bindings(_arc(one.request), [rc.name for rc in work.rcs]))
     }
 
 
@@ -291,8 +259,7 @@ def _answered(core: Core, now: Ns, capacity: dict[str, int], *events: Event) -> 
         batch = [
             Vote(
                 effect.proposal,
-                accept=sum(params["rate"] for params in effect.holders.values())
-                <= capacity.get(effect.rc, 1000),
+                accept=sum(params["rate"] for params in effect.holders.values()) <= capacity.get(effect.rc, 1000),
             )
             for effect in effects
             if isinstance(effect, Propose)

@@ -29,13 +29,7 @@ from zscout.scheduling.model import (
 from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
-from zscout.types import (
-    SECOND,
-    Grant,
-    Ns,
-    Place,
-    Term,
-)
+from zscout.types import SECOND, Grant, Ns, Place, Term
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")
 PATIENCE = 6 * SECOND
@@ -74,9 +68,7 @@ def test_a_protected_hold_that_is_kept_yields_after_its_time(strategy: StrategyN
     core = core_of(strategy, SchedulingPolicy(preempt="after_min_runtime"), "robot/a")
     core.handle(0, Requested(ArcRequest("kept", "h/c", {"robot/a": {}}, 1, 10 * SECOND, keep=True)))
     core.handle(
-        SECOND,
-        Requested(request("high", "robot/a", priority=5)),
-        Requested(request("low", "robot/a", priority=0)),
+        SECOND, Requested(request("high", "robot/a", priority=5)), Requested(request("low", "robot/a", priority=0))
     )
     assert running(core) == {"kept"}
     core.handle(10 * SECOND, Tick())
@@ -138,9 +130,7 @@ def test_a_low_priority_starves_unless_the_fleet_promises_all() -> None:
 
     def start(policy: SchedulingPolicy) -> Ns:
         played = replay(work, strategy=STRATEGIES["adaptive"](), policy=policy)
-        return next(
-            hold.start for hold in played.holds if hold.arc == "low" and hold.outcome is Outcome.COMPLETED
-        )
+        return next(hold.start for hold in played.holds if hold.arc == "low" and hold.outcome is Outcome.COMPLETED)
 
     assert start(SchedulingPolicy(patience=PATIENCE)) >= 80 * SECOND
     # Due at 7 s: from 4 s on nobody starts who would still run by then, and nobody takes it back.
@@ -156,9 +146,7 @@ def test_promise_all_keeps_the_other_promises(seed: int) -> None:
     def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
         ledger.take(now, core, effects)
 
-    policy = SchedulingPolicy(
-        patience=PATIENCE, promise="all", max_running_per_host=draw.choice([None, 1, 2])
-    )
+    policy = SchedulingPolicy(patience=PATIENCE, promise="all", max_running_per_host=draw.choice([None, 1, 2]))
     assert not replay(work, watch, strategy=STRATEGIES["adaptive"](), policy=policy).unserved
 
 

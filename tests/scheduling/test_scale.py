@@ -88,9 +88,7 @@ class Twins:
         }
         client = f"host/{rng.randrange(self.size.clients)}"
         runtime = rng.randint(1, 6) * SECOND // 2
-        return Requested(
-            ArcRequest(f"a{self.number}", client, needs, rng.randrange(4), runtime, rng.random() < 0.2)
-        )
+        return Requested(ArcRequest(f"a{self.number}", client, needs, rng.randrange(4), runtime, rng.random() < 0.2))
 
     def send(self, *events: Event) -> bool:
         """False if nothing was decided."""
@@ -233,9 +231,7 @@ def test_what_a_release_looks_at_does_not_grow_with_the_queue(monkeypatch: pytes
 def test_the_words_for_who_asks_are_those_of_now() -> None:
     core = Core()
     core.handle(0, RcJoined("robot/a", sharable=False))
-    core.handle(
-        0, *[Requested(ArcRequest(f"a{number}", "h/c", {"robot/a": {}}, 0, SECOND)) for number in range(20)]
-    )
+    core.handle(0, *[Requested(ArcRequest(f"a{number}", "h/c", {"robot/a": {}}, 0, SECOND)) for number in range(20)])
     assert reason_of(core) == str(last_of(core).reported) == "needs robot/a (held by a0, priority 0)"
     core.handle(1, Released("a0"))
     assert reason_of(core) == "needs robot/a (held by a1, priority 0)"

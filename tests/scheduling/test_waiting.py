@@ -16,15 +16,7 @@ from zscout.scheduling.model import ArcRequest, Effect, LeadTaken, RcJoined, Rec
 from zscout.scheduling.replay import Replay, replay
 from zscout.scheduling.reservations import MAX_STARVING
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
-from zscout.types import (
-    NO_TERM,
-    SECOND,
-    Ns,
-    Params,
-    Place,
-    RcName,
-    Term,
-)
+from zscout.types import NO_TERM, SECOND, Ns, Params, Place, RcName, Term
 
 RUNS = times(1_000)
 PARTS = 10
@@ -71,8 +63,7 @@ def check_bound(workload: Workload, played: Replay, patience: Ns) -> int:
         while found := [
             one
             for one in before.values()
-            if one.arc not in linked
-            and any(one.needs.keys() & other.needs.keys() for other in linked.values())
+            if one.arc not in linked and any(one.needs.keys() & other.needs.keys() for other in linked.values())
         ]:
             linked |= {one.arc: one for one in found}
         ahead = sum(one.min_runtime for one in linked.values() if one is not arc)

@@ -15,15 +15,7 @@ from tests.thorough import times
 from zscout.config.strict import BadInput
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.replay import replay
-from zscout.scheduling.workload import (
-    MAX_ARCS,
-    MAX_NEEDS,
-    MAX_RCS,
-    Arrival,
-    Workload,
-    WorkloadRc,
-    parse_workload,
-)
+from zscout.scheduling.workload import MAX_ARCS, MAX_NEEDS, MAX_RCS, Arrival, Workload, WorkloadRc, parse_workload
 
 RC = '[[rc]]\nname = "robot/a"\n'
 RADIO = '[[rc]]\nname = "radio/r"\nsharable = true\n'
@@ -32,19 +24,12 @@ TWICE = "rename or remove one of the two"
 
 def arc(arc_name: str = "arc0", /, **keys: str) -> str:
     """An ARC in TOML; a key given replaces the good value, an empty one leaves the key out."""
-    good = {
-        "name": f'"{arc_name}"',
-        "at": "0.0",
-        "priority": "1",
-        "min_runtime": "5.0",
-        "needs": '{"robot/a" = {}}',
-    }
+    good = {"name": f'"{arc_name}"', "at": "0.0", "priority": "1", "min_runtime": "5.0", "needs": '{"robot/a" = {}}'}
     return "[[arc]]\n" + "".join(f"{key} = {value}\n" for key, value in (good | keys).items() if value)
 
 
 BAD = {
-    "[[arc]": "line 1, column 6: Expected ']]' at the end of an array declaration; "
-    "mend the TOML there or just before",
+    "[[arc]": "line 1, column 6: Expected ']]' at the end of an array declaration; mend the TOML there or just before",
     # Keys
     "[[arcs]]": "arcs: unknown key; did you mean arc or rc?",
     "[rc]": "rc: is a table; write tables, each under [[rc]]",
@@ -52,9 +37,7 @@ BAD = {
     RC + "shareable = true": "rc[0].shareable (robot/a): unknown key; did you mean sharable?",
     RC + "capcity = {}": "rc[0].capcity (robot/a): unknown key; did you mean capacity?",
     arc() + "min_run_time = 1": "arc[0].min_run_time (arc0): unknown key; did you mean min_runtime?",
-    arc() + "keep = true": (
-        "arc[0].keep (arc0): unknown key; known here: at, min_runtime, name, needs, priority"
-    ),
+    arc() + "keep = true": ("arc[0].keep (arc0): unknown key; known here: at, min_runtime, name, needs, priority"),
     "[[rc]]": "rc[0].name: is missing; add it",
     arc(name=""): "arc[0].name: is missing; add it",
     arc(at=""): "arc[0].at (arc0): is missing; add it",
@@ -81,9 +64,7 @@ BAD = {
     arc(at='"0"'): 'arc[0].at (arc0): is the text "0"; write a number',
     arc(at="true"): "arc[0].at (arc0): is true; write a number",
     arc(min_runtime="0"): "arc[0].min_runtime (arc0): is 0 s; write 0.000000001 to 1000000000 seconds",
-    arc(
-        min_runtime="1e-10"
-    ): "arc[0].min_runtime (arc0): is 1E-10 s; write 0.000000001 to 1000000000 seconds",
+    arc(min_runtime="1e-10"): "arc[0].min_runtime (arc0): is 1E-10 s; write 0.000000001 to 1000000000 seconds",
     arc(min_runtime="-2.5"): "arc[0].min_runtime (arc0): is -2.5 s; write 0.000000001 to 1000000000 seconds",
     arc(priority="1.5"): "arc[0].priority (arc0): is 1.5; write a whole number from 0 to 1000000000",
     arc(priority="-1"): "arc[0].priority (arc0): is -1; write a whole number from 0 to 1000000000",
@@ -101,17 +82,12 @@ BAD = {
     ),
     RC + "sharable = 1": "rc[0].sharable (robot/a): is 1; write true or false",
     RC + "capacity = {rate = 1}": (
-        "rc[0].capacity (robot/a): an exclusive RC has one holder and no capacity; "
-        "add sharable = true, or remove it"
+        "rc[0].capacity (robot/a): an exclusive RC has one holder and no capacity; add sharable = true, or remove it"
     ),
     RADIO + "capacity = 1": "rc[0].capacity (radio/r): is 1; write a table",
     RADIO + "capacity = {rate = -0.1}": "rc[0].capacity.rate (radio/r): is -0.1; write 0 or more",
-    RADIO + "capacity = {rate = inf}": (
-        "rc[0].capacity.rate (radio/r): is not a finite number; write a number"
-    ),
-    RADIO + "capacity = {rate = 1e-101}": (
-        "rc[0].capacity.rate (radio/r): has more than 100 decimal places; round it"
-    ),
+    RADIO + "capacity = {rate = inf}": ("rc[0].capacity.rate (radio/r): is not a finite number; write a number"),
+    RADIO + "capacity = {rate = 1e-101}": ("rc[0].capacity.rate (radio/r): has more than 100 decimal places; round it"),
     # Counts
     arc(needs="{" + ",".join(f"r{i}={{}}" for i in range(MAX_NEEDS + 1)) + "}"): (
         "arc[0].needs (arc0): has 1,001 entries; at most 1,000 are allowed"
@@ -225,9 +201,7 @@ def workloads(draw: st.DrawFn) -> Workload:
     return Workload(
         tuple(WorkloadRc(name, sharable, capacity if sharable else {}) for name, sharable, capacity in rcs),
         tuple(
-            Arrival(
-                draw(TIMES), ArcRequest(name, name, draw(needs), draw(st.integers(0, 10**9)), draw(TIMES))
-            )
+            Arrival(draw(TIMES), ArcRequest(name, name, draw(needs), draw(st.integers(0, 10**9)), draw(TIMES)))
             for name in names
         ),
     )
@@ -267,28 +241,11 @@ def test_whatever_is_written_is_read_back_the_same(workload: Workload) -> None:
     assert parse_workload(toml(workload), "w") == workload
 
 
-ODD = [
-    "",
-    "0",
-    "-1",
-    "nan",
-    "1e999",
-    "true",
-    '""',
-    '"x"',
-    "[]",
-    "[{}]",
-    "{}",
-    "{a = {}}",
-    "{a = {b = -1}}",
-    "07:32:00",
-]
+ODD = ["", "0", "-1", "nan", "1e999", "true", '""', '"x"', "[]", "[{}]", "{}", "{a = {}}", "{a = {b = -1}}", "07:32:00"]
 
 
 @given(
-    st.lists(
-        st.sampled_from(["[[rc]]", "[[arc]]", "[arc]", "[arc.needs]", "rc", "a.b", "x = '"]), max_size=2
-    ),
+    st.lists(st.sampled_from(["[[rc]]", "[[arc]]", "[arc]", "[arc.needs]", "rc", "a.b", "x = '"]), max_size=2),
     st.dictionaries(
         st.sampled_from(["name", "at", "priority", "min_runtime", "needs", "sharable", "capacity", "x"]),
         st.sampled_from(ODD) | st.text(max_size=5),

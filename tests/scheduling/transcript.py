@@ -46,13 +46,7 @@ from zscout.scheduling.model import (
     VoteOverdue,
     WakeAt,
 )
-from zscout.types import (
-    Grant,
-    Ns,
-    Params,
-    Place,
-    Term,
-)
+from zscout.types import Grant, Ns, Params, Place, Term
 
 _NEED = re.compile(r"([\w.-]+/[\w.-]+)(?:\{([^}]*)\})?")
 

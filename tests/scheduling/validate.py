@@ -72,10 +72,7 @@ def _check_index(state: SchedulerState, index: QueueIndex) -> None:
     starving = sorted((-band(arc.priority), arc.since, arc.id) for arc in queued if arc.starving)
     assert index.starving == starving, "the starving are not those of the queue"
     for arc in queued:
-        places = {
-            ArcState.PARKED: arc.id in index.parked,
-            ArcState.WATCHING: arc.watched is not None,
-        }
+        places = {ArcState.PARKED: arc.id in index.parked, ArcState.WATCHING: arc.watched is not None}
         assert (arc.id in index.ready) == (not any(places.values())), f"{arc.id} is indexed twice, or nowhere"
         for kind, there in places.items():
             assert there == (arc.state is kind), f"{arc.id} is {arc.state} and not indexed so"

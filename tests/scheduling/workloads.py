@@ -20,12 +20,10 @@ _capacities = st.sampled_from([Fraction(2, 10), Fraction(3, 10), Fraction(6, 10)
 
 # Mostly `rate` on both sides, so that RCs are short of it and reprieves matter.
 params: st.SearchStrategy[Params] = st.one_of(
-    st.fixed_dictionaries({"rate": _shares}),
-    st.dictionaries(st.sampled_from(PARAMETERS), _shares, max_size=2),
+    st.fixed_dictionaries({"rate": _shares}), st.dictionaries(st.sampled_from(PARAMETERS), _shares, max_size=2)
 )
 capacity: st.SearchStrategy[Params] = st.one_of(
-    st.fixed_dictionaries({"rate": _capacities}),
-    st.dictionaries(st.sampled_from(PARAMETERS), _capacities, max_size=2),
+    st.fixed_dictionaries({"rate": _capacities}), st.dictionaries(st.sampled_from(PARAMETERS), _capacities, max_size=2)
 )
 
 
@@ -64,9 +62,7 @@ def workloads(draw: st.DrawFn, *, keep: bool = True) -> Workload:
     fleet = draw(rcs())
     names = [rc.name for rc in fleet]
     arrivals = [
-        Arrival(
-            draw(st.sampled_from([0, 1, 2, 3, 5])) * SECOND, draw(requests(f"a{number}", names, keep=keep))
-        )
+        Arrival(draw(st.sampled_from([0, 1, 2, 3, 5])) * SECOND, draw(requests(f"a{number}", names, keep=keep)))
         for number in range(draw(st.sampled_from([1, 2, 4, 6, 8, 10, 12])))
     ]
     return Workload(fleet, tuple(arrivals))

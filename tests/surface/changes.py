@@ -8,9 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 _STARTS_IN: Final = "a notice carries its estimate, so that who waits need not ask for the fleet's state"
-_CONTEXT: Final = (
-    "the field's word for what a component is given; Stage is the same class. It is given by position"
-)
+_CONTEXT: Final = "the field's word for what a component is given; Stage is the same class. It is given by position"
 _WHY: Final = "what `reason` says in words, as data: no program need read English"
 
 ADDED: Final[dict[str, str]] = {
@@ -33,14 +31,12 @@ ADDED: Final[dict[str, str]] = {
     "python > zscout.Held > methods > now": "the clock by which the hold ends, for bodies that keep a pace",
 }
 
-REMOVED: Final[dict[str, str]] = {
-    "python > zscout.Component > methods > run > takes > stage": _CONTEXT,
-}
+REMOVED: Final[dict[str, str]] = {"python > zscout.Component > methods > run > takes > stage": _CONTEXT}
 
 CHANGED: Final[dict[str, tuple[object, str]]] = {
     "python > zscout.Client > methods > connect > gives": (
         "Connecting[Self]",
         "it can be awaited, as before, and entered",
-    ),
+    )
 }
 """The value now, and the reason."""

@@ -88,9 +88,7 @@ def _param(param: click.Parameter, context: click.Context) -> dict[str, Any]:
         **{key: kind.get(key) for key in ("choices", "min", "max", "min_open", "max_open", "exists")},
         "only": None if path or "exists" not in kind else "files" if kind["file_okay"] else "folders",
     }
-    return {
-        key: value for key, value in shown.items() if value is not None and value is not False and value != ""
-    }
+    return {key: value for key, value in shown.items() if value is not None and value is not False and value != ""}
 
 
 # What is printed

@@ -53,9 +53,7 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
             "[]", ('["tls/anvil:7447"]',), ('["tcp/a:0"]', '["tcp/a:70000"]', '["tcp/1.2.3:7"]', '"tcp/a:1"')
         ),
         "multicast": Key("true", ("false",), TRUTH),
-        "multicast_address": Key(
-            '"224.0.0.224:7446"', ('"239.1.2.3:99"',), ('"10.0.0.1:7446"', '"224.0.0.224"', "1")
-        ),
+        "multicast_address": Key('"224.0.0.224:7446"', ('"239.1.2.3:99"',), ('"10.0.0.1:7446"', '"224.0.0.224"', "1")),
         "interface": Key('"auto"', ('"eth0,lo"',), ('""', '"eth 0"', "0")),
         "lease": _number("1.0", "0.2", "2.5", "0.1", "31"),
     },
@@ -117,9 +115,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
     "capacity": (
         'name = "radio/a"\ncapacity = { rate = 10 }',
         {
-            "capacity": Key(
-                None, ("{ rate = 0.1, width = 2 }",), ("{}", "{ rate = -1 }", '{ "a b" = 1 }', "10")
-            ),
+            "capacity": Key(None, ("{ rate = 0.1, width = 2 }",), ("{}", "{ rate = -1 }", '{ "a b" = 1 }', "10")),
             "activation": _number("0.0", "0.5", "3600", "-1", "3601"),
         },
     ),
@@ -137,9 +133,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "id": Key(None, ("0", "255"), ("-1", "256", '"a"')),
             "radio": Key(None, ('"radio/b"',), ('"robot/b"', '"b"')),
             "channels": Key(
-                "{}",
-                (CHANNELS,),
-                ('{ "robot/b" = 1 }', '{ "video/ch1" = 0 }', '{ "video/a" = 1, "video/b" = 1 }'),
+                "{}", (CHANNELS,), ('{ "robot/b" = 1 }', '{ "video/ch1" = 0 }', '{ "video/a" = 1, "video/b" = 1 }')
             ),
             "warm_up": _number("2.0", "0", "60", "-1", "61"),
             "dead_man": _number("0.5", "0.05", "5", "0.04", "5.1"),
@@ -168,8 +162,7 @@ def files() -> dict[str, Any]:
         fleet, node = _Loader(find("load_fleet"), path), _Loader(find("load_node"), path)
         return {
             "fleet file": dict(_tables(fleet, FLEET)),
-            "node file": dict(_tables(node, NODE))
-            | {f'rc, driver = "{name}"': _rc(node, name) for name in RC},
+            "node file": dict(_tables(node, NODE)) | {f'rc, driver = "{name}"': _rc(node, name) for name in RC},
         }
 
 
@@ -211,15 +204,11 @@ def _tables(loader: _Loader, tables: Mapping[str, Mapping[str, Key]]) -> Iterato
 def _rc(loader: _Loader, driver: str) -> dict[str, Any]:
     table, keys = RC[driver]
     head = f'[[rc]]\ndriver = "{driver}"\n{table}'
-    others = {
-        key: about for name in RC for key, about in RC[name][1].items() if key not in keys and about.good
-    }
+    others = {key: about for name in RC for key, about in RC[name][1].items() if key not in keys and about.good}
     return {
         **{key: _tried(loader, _without(head, key), key, about) for key, about in keys.items()},
         "unnamed": loader.says(re.sub(r"name = .*\n?", "", head)),
-        "of others": {
-            key: loader.says(f"{head}\n{key} = {about.good[0]}") for key, about in sorted(others.items())
-        },
+        "of others": {key: loader.says(f"{head}\n{key} = {about.good[0]}") for key, about in sorted(others.items())},
     }
 
 

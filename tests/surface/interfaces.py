@@ -31,10 +31,7 @@ MADE: Final = ("zscout.Component", "zscout.Lab")
 def python() -> dict[str, Any]:
     """Every name in `zscout.__all__`, and the attributes of what some of them give."""
     named = {f"zscout.{name}": getattr(zscout, name) for name in sorted(zscout.__all__)}
-    given = {
-        "what Client.request gives": _given(zscout.Client.request),
-        "what hold gives": _given(zscout.hold),
-    }
+    given = {"what Client.request gives": _given(zscout.Client.request), "what hold gives": _given(zscout.hold)}
     module = "zscout.components.component"
     # The address that docs/components.md names.
     authors = {name: getattr(import_module(module), name) for name in ("Component", "Stage")}
@@ -74,9 +71,7 @@ def _fields(kind: type) -> set[str]:
     tree = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
     assert isinstance(tree, ast.ClassDef)
     declared = {
-        node.target.id
-        for node in tree.body
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+        node.target.id for node in tree.body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
     }
     init = next((node for node in tree.body if getattr(node, "name", "") == "__init__"), None)
     for node in ast.walk(init) if init is not None else ():
@@ -92,11 +87,7 @@ def _signature(called: Any) -> dict[str, Any]:
     for name, param in signature.parameters.items():
         if name == "self":
             continue
-        words: dict[Any, str] = {
-            param.KEYWORD_ONLY: "by name: ",
-            param.VAR_POSITIONAL: "*",
-            param.VAR_KEYWORD: "**",
-        }
+        words: dict[Any, str] = {param.KEYWORD_ONLY: "by name: ", param.VAR_POSITIONAL: "*", param.VAR_KEYWORD: "**"}
         text = words.get(param.kind, "") + str(param.annotation)
         shown[name] = text if param.default is param.empty else f"{text} = {param.default!r}"
     awaited = "awaited: " if inspect.iscoroutinefunction(called) else ""
@@ -126,9 +117,7 @@ def wire() -> dict[str, Any]:
     return {
         messages.schema(kinds[name]): {
             "required": sorted(shapes[name].get("required", [])),
-            "fields": {
-                field: _shape(told, shapes, kinds) for field, told in _sorted(shapes[name]["properties"])
-            },
+            "fields": {field: _shape(told, shapes, kinds) for field, told in _sorted(shapes[name]["properties"])},
         }
         for name in sorted(kinds)
     }
@@ -150,9 +139,7 @@ def _shape(told: Any, shapes: dict[str, Any], kinds: dict[str, type]) -> Any:
     if name in kinds:
         return {**told, "$ref": f"zscout.{name}.v1"}
     if name:
-        return _shape(
-            {**shapes[name], **{key: value for key, value in told.items() if key != "$ref"}}, shapes, kinds
-        )
+        return _shape({**shapes[name], **{key: value for key, value in told.items() if key != "$ref"}}, shapes, kinds)
     unseen = ("title", "description")
     return {key: _shape(value, shapes, kinds) for key, value in told.items() if key not in unseen}
 
@@ -174,18 +161,13 @@ def keys() -> list[str]:
         "host": "HOST",
         "role": "*",
     }
-    tokens = [
-        keyexpr.Token("HOST", role, "KIND/NAME" if role == "rc" else "NAME", "INSTANCE") for role in roles
-    ]
+    tokens = [keyexpr.Token("HOST", role, "KIND/NAME" if role == "rc" else "NAME", "INSTANCE") for role in roles]
     found = {made.alive(token) for token in tokens} | {made.alive_any(role) for role in roles}
     for name, value in vars(keyexpr.Keys).items():
         if hasattr(value, "__get__") and not callable(value) and name != "fleet":
             found.add(getattr(made, name))
         elif (
-            callable(value)
-            and not name.startswith("_")
-            and name not in ("alive", "fleet")
-            and not name.endswith("_of")
+            callable(value) and not name.startswith("_") and name not in ("alive", "fleet") and not name.endswith("_of")
         ):
             params = list(inspect.signature(value).parameters.values())[1:]
             given = [samples.get(str(param.annotation), samples.get(param.name)) for param in params]

@@ -145,9 +145,7 @@ class Story:
         """Runs a command here until what it prints is so; returns its exit code and that."""
         end = time.monotonic() + HANG
         while True:
-            told = printed(
-                "zscout", scripts()["zscout"], ["--fleet", str(self.folder / "fleet.toml"), *words]
-            )
+            told = printed("zscout", scripts()["zscout"], ["--fleet", str(self.folder / "fleet.toml"), *words])
             # What went wrong, where nothing was printed.
             code, out = int(told["exit"]), "\n".join(told.get("out", told.get("err", [])))
             if until(out):
@@ -160,9 +158,7 @@ class Story:
         assert out.startswith("{"), f"{words} with exit code {code}: {out}"
         found = json.loads(out)
         # Which host is drained may differ.
-        self.note(
-            words[0] if words[0] in ("drain", "uncordon", "migrate") else " ".join(words), [found], code
-        )
+        self.note(words[0] if words[0] in ("drain", "uncordon", "migrate") else " ".join(words), [found], code)
         return found
 
     def look(self, *words: str, until: Callable[[str], bool] = _anything) -> None:

@@ -42,9 +42,7 @@ def text(value: Any, indent: int = 0, before: int = 0) -> str:
         parts = [pad + text(one, indent + 1) for one in value]
         return "[\n" + ",\n".join(parts) + "\n" + " " * indent + "]"
     names = [json.dumps(name, ensure_ascii=False) + ": " for name in value]
-    parts = [
-        pad + name + text(one, indent + 1, len(name)) for name, one in zip(names, value.values(), strict=True)
-    ]
+    parts = [pad + name + text(one, indent + 1, len(name)) for name, one in zip(names, value.values(), strict=True)]
     return "{\n" + ",\n".join(parts) + "\n" + " " * indent + "}"
 
 

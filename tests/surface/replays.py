@@ -86,12 +86,8 @@ def kept(text: str, seed: int, strategy: StrategyName) -> str:
         )
         for arrival in asked.arrivals
     )
-    played = replay(
-        dataclasses.replace(asked, arrivals=arrivals), strategy=STRATEGIES[strategy](), policy=policy
-    )
-    holds = [
-        (hold.arc, hold.start, hold.end, str(hold.outcome.value), sorted(hold.rcs)) for hold in played.holds
-    ]
+    played = replay(dataclasses.replace(asked, arrivals=arrivals), strategy=STRATEGIES[strategy](), policy=policy)
+    holds = [(hold.arc, hold.start, hold.end, str(hold.outcome.value), sorted(hold.rcs)) for hold in played.holds]
     return json.dumps([holds, sorted(played.unserved)])
 
 

@@ -25,9 +25,7 @@ def workload(seed: int) -> str:
     """The text of the workload file of a seed: the same on every machine."""
     # Strings seed by their text, not by their hash, which changes from process to process.
     random = Random(f"surface/{seed}")  # noqa: S311 - workloads, not secrets
-    exclusive = [
-        f"{random.choice(KINDS)}/{number}" for number in range(random.choice((1, 2, 3, 4, 6, 8, 12)))
-    ]
+    exclusive = [f"{random.choice(KINDS)}/{number}" for number in range(random.choice((1, 2, 3, 4, 6, 8, 12)))]
     radios = [f"radio/rf{number}" for number in range(random.choice((0, 0, 1, 1, 2, 3)))]
     lines = [f'[[rc]]\nname = "{name}"\n' for name in exclusive]
     for name in radios:

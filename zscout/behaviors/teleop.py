@@ -230,12 +230,7 @@ class Teleop:
 
     async def _drive(self) -> None:
         async with hold(
-            self.client,
-            self._name,
-            self.needs.needs(),
-            priority=self.priority,
-            min_runtime=1.0,
-            keep=True,
+            self.client, self._name, self.needs.needs(), priority=self.priority, min_runtime=1.0, keep=True
         ) as held:
             robot = self.robot = HeldRobot(held, self.needs)
             self.held, self._arc = held, held.arc

@@ -36,9 +36,7 @@ def completion(ctx: click.Context, shell: str | None) -> None:
     name = shell or Path(os.environ.get("SHELL", "")).name
     found = get_completion_class(name) if name in SHELLS else None
     if found is None:
-        raise click.UsageError(
-            f"$SHELL names no shell that is known here; write one of {', '.join(SHELLS)}", ctx
-        )
+        raise click.UsageError(f"$SHELL names no shell that is known here; write one of {', '.join(SHELLS)}", ctx)
     click.echo(found(ctx.find_root().command, {}, "zscout", "_ZSCOUT_COMPLETE").source())
 
 

@@ -52,8 +52,7 @@ class RadioRc(RcTable, frozen=True, tag="radio"):
     """A serial line to a transmitter."""
 
     port: Annotated[
-        str,
-        key("For pyserial's `serial_for_url`.", example="/dev/ttyUSB0", remedy=f"add it, as in {A_PORT}"),
+        str, key("For pyserial's `serial_for_url`.", example="/dev/ttyUSB0", remedy=f"add it, as in {A_PORT}")
     ]
     baud: Annotated[int, key("Of the line.", 300, 1_000_000, unit="bit/s")] = 9_600
     bound: Annotated[Ns, seconds("0.01", "10", "The longest that a packet may wait.")] = SECOND // 4
@@ -63,18 +62,15 @@ class RobotRc(RcTable, frozen=True, tag="robot"):
     """A robot that is driven over a radio."""
 
     id: Annotated[int, key("That its packets carry.", 0, MAX_ROBOT, example=33, remedy=f"add the id {AN_ID}")]
-    radio: Annotated[
-        str,
-        key("The RC that carries its halt.", example="radio/rf0", remedy=f"add the radio {A_RADIO}"),
-    ]
+    radio: Annotated[str, key("The RC that carries its halt.", example="radio/rf0", remedy=f"add the radio {A_RADIO}")]
     channels: Annotated[
         Mapping[str, Annotated[int, Meta(ge=1, le=MAX_CHANNEL)]],
         key("Of its camera's transmitter, by video RC.", most=MAX_CHANNELS, example={"video/ch1": 1}),
     ] = {}
     warm_up: Annotated[Ns, seconds("0", "60", "Of its camera, once it is switched on.")] = 2 * SECOND
-    dead_man: Annotated[
-        Ns, seconds("0.05", "5", "Its wheels are stopped this long after the last drive command.")
-    ] = SECOND // 2
+    dead_man: Annotated[Ns, seconds("0.05", "5", "Its wheels are stopped this long after the last drive command.")] = (
+        SECOND // 2
+    )
 
 
 class VideoRc(RcTable, frozen=True, tag="video"):
@@ -115,9 +111,7 @@ def check_rc(rc: RcConfig, at: Where) -> None:
     match rc:
         case CapacityRc():
             if not rc.capacity:
-                raise (at / "capacity").bad(
-                    "is missing or empty", "add one, as in capacity = { command_rate = 10 }"
-                )
+                raise (at / "capacity").bad("is missing or empty", "add one, as in capacity = { command_rate = 10 }")
             for parameter in rc.capacity:
                 check_name(parameter, at / "capacity")
             amounts(rc.capacity, at / "capacity")

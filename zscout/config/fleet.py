@@ -18,17 +18,7 @@ from zscout.config.scheduling_policy import (
     SchedulingPolicy,
     StrategyName,
 )
-from zscout.config.strict import (
-    BadInput,
-    Where,
-    check_name,
-    check_names,
-    check_unique,
-    key,
-    quoted,
-    read_toml,
-    seconds,
-)
+from zscout.config.strict import BadInput, Where, check_name, check_names, check_unique, key, quoted, read_toml, seconds
 from zscout.types import SECOND, Ns
 
 FLEET_VARIABLE: Final = "ZSCOUT_FLEET"
@@ -50,14 +40,8 @@ Endpoints = Annotated[tuple[str, ...], Meta(max_length=MAX_ENDPOINTS)]
 class MeshConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [mesh]: how a host joins the mesh."""
 
-    listen: Annotated[
-        Endpoints,
-        key("Endpoints of this host; none: a free port.", example=["tcp/0.0.0.0:7447"]),
-    ] = ()
-    connect: Annotated[
-        Endpoints,
-        key("Endpoints of hosts to be connected to always.", example=["tcp/anvil:7447"]),
-    ] = ()
+    listen: Annotated[Endpoints, key("Endpoints of this host; none: a free port.", example=["tcp/0.0.0.0:7447"])] = ()
+    connect: Annotated[Endpoints, key("Endpoints of hosts to be connected to always.", example=["tcp/anvil:7447"])] = ()
     multicast: Annotated[bool, key("Whether hosts find each other by UDP multicast.")] = True
     multicast_address: Annotated[str, key("`ip:port`.")] = "224.0.0.224:7446"
     interface: Annotated[str, key("Network interfaces for multicast.", example="eth0")] = "auto"
@@ -80,9 +64,9 @@ class Timing(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [timing]: the clockwork of the RCM and of RCs, in ns. `hold_lease` is longer than the mesh
     lease plus `rebuild`."""
 
-    heartbeat: Annotated[
-        Ns, seconds("0.05", "10", "From one publication of the RCM to the next at the latest.")
-    ] = SECOND // 2
+    heartbeat: Annotated[Ns, seconds("0.05", "10", "From one publication of the RCM to the next at the latest.")] = (
+        SECOND // 2
+    )
     hold_lease: Annotated[
         Ns, seconds("0.5", "300", "A hold ends at RC and client when no RCM was heard for this long.")
     ] = 3 * SECOND
@@ -94,25 +78,25 @@ class PlacementPolicy(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [placement]: how hard a fleet tries to place, and whether it moves what pays. Durations in
     ns."""
 
-    start_timeout: Annotated[
-        Ns, seconds("0.05", "600", "A start without an answer for this long has failed.")
-    ] = 15 * SECOND
+    start_timeout: Annotated[Ns, seconds("0.05", "600", "A start without an answer for this long has failed.")] = (
+        15 * SECOND
+    )
     restarts: Annotated[int, key("Starts in a row that fail soon until it is given up.", 0, 1_000)] = 5
-    back_off: Annotated[
-        Ns, seconds("0.05", "3600", "Before the first restart after a failure; doubled each time.")
-    ] = SECOND // 2
+    back_off: Annotated[Ns, seconds("0.05", "3600", "Before the first restart after a failure; doubled each time.")] = (
+        SECOND // 2
+    )
     longest_back_off: Annotated[Ns, seconds("0.05", "86400", "Up to this.")] = 30 * SECOND
-    settled: Annotated[
-        Ns, seconds("0.05", "86400", "After running this long its failures are counted anew.")
-    ] = 30 * SECOND
+    settled: Annotated[Ns, seconds("0.05", "86400", "After running this long its failures are counted anew.")] = (
+        30 * SECOND
+    )
     rebalance: Annotated[bool, key("Whether running components are moved when that pays.")] = False
-    gain: Annotated[
-        float, key("How much better it must run elsewhere, as a share of now, to be moved.", 0.05, 100)
-    ] = 0.3
+    gain: Annotated[float, key("How much better it must run elsewhere, as a share of now, to be moved.", 0.05, 100)] = (
+        0.3
+    )
     steady: Annotated[Ns, seconds("0.05", "3600", "For how long that must be so.")] = 10 * SECOND
-    rest: Annotated[
-        Ns, seconds("0.05", "86400", "A component that was placed or moved stays for this long.")
-    ] = 60 * SECOND
+    rest: Annotated[Ns, seconds("0.05", "86400", "A component that was placed or moved stays for this long.")] = (
+        60 * SECOND
+    )
 
 
 DEFAULT_PLACEMENT: Final = PlacementPolicy()
@@ -152,9 +136,7 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     operator_priority: Annotated[
         int, key("ARCs of this priority and above are an operator's: nothing keeps them.", 0, 1_000_000_000)
     ] = OPERATOR_PRIORITY
-    preempt: Annotated[Preempt, key("When one ARC may take the hold of another of lower priority.")] = (
-        "always"
-    )
+    preempt: Annotated[Preempt, key("When one ARC may take the hold of another of lower priority.")] = "always"
     patience: Annotated[
         Ns, seconds("0", "31622400", "`adaptive`: after this long an ARC that waits is due; 0: never.")
     ] = PATIENCE
@@ -252,9 +234,7 @@ def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: st
             _check_endpoint(endpoint, (at / name).item(number), lowest_port=lowest_port)
         check_unique(endpoints, at / name)
     if not _INTERFACE.fullmatch(interface):
-        raise (at / "interface").bad(
-            f"{quoted(interface)} names no interface", 'write "auto", or as in "eth0"'
-        )
+        raise (at / "interface").bad(f"{quoted(interface)} names no interface", 'write "auto", or as in "eth0"')
 
 
 def _check_endpoint(endpoint: str, where: Where, *, lowest_port: int) -> None:
@@ -270,15 +250,8 @@ def check_multicast(address: str, where: Where) -> None:
     """Refuses what is not a multicast `ip:port`. Raises BadInput."""
     host, _, port = address.rpartition(":")
     ip = ip_of(host.removeprefix("[").removesuffix("]"))
-    if (
-        ip is None
-        or not ip.is_multicast
-        or not re.fullmatch("[0-9]{1,5}", port)
-        or not 0 < int(port) < 65_536
-    ):
-        raise where.bad(
-            f"{quoted(address)} is not a multicast address", 'write ip:port, as in "224.0.0.224:7446"'
-        )
+    if ip is None or not ip.is_multicast or not re.fullmatch("[0-9]{1,5}", port) or not 0 < int(port) < 65_536:
+        raise where.bad(f"{quoted(address)} is not a multicast address", 'write ip:port, as in "224.0.0.224:7446"')
 
 
 def _is_host(host: str) -> bool:

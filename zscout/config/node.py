@@ -10,16 +10,7 @@ from msgspec import Meta, Struct, structs
 
 from zscout.config.devices import RcConfig, check_rc
 from zscout.config.fleet import Endpoints, Fleet, check_links, default_fleet, ip_of, load_fleet
-from zscout.config.strict import (
-    BadInput,
-    Where,
-    check_name,
-    check_names,
-    check_unique,
-    key,
-    quoted,
-    read_toml,
-)
+from zscout.config.strict import BadInput, Where, check_name, check_names, check_unique, key, quoted, read_toml
 from zscout.keyexpr import valid_name
 from zscout.messages import MAX_LABELS
 
@@ -85,9 +76,7 @@ class NodeTable(Struct, frozen=True, forbid_unknown_fields=True):
     load: Annotated[
         LoadKind, key('Whether it reports its load; "tree": only that of this node and what it started.')
     ] = True
-    labels: Annotated[
-        tuple[str, ...], key("For components that need them.", most=MAX_LABELS, example=["gpu"])
-    ] = ()
+    labels: Annotated[tuple[str, ...], key("For components that need them.", most=MAX_LABELS, example=["gpu"])] = ()
 
 
 class RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):

@@ -200,9 +200,7 @@ def check_unique(values: Iterable[str], where: Where, key: str = "") -> None:
         first[value] = number
 
 
-def seconds_to_ns(
-    value: Decimal, where: Where, *, low: Decimal = Decimal(0), high: Decimal = MAX_SECONDS
-) -> int:
+def seconds_to_ns(value: Decimal, where: Where, *, low: Decimal = Decimal(0), high: Decimal = MAX_SECONDS) -> int:
     """Seconds as whole nanoseconds, halves to even; refused outside `low`..`high` s. Raises BadInput."""
     if not (value.is_finite() and low <= value <= high):
         raise where.bad(f"is {value} s", f"write {low:f} to {high:f} seconds")
@@ -306,9 +304,7 @@ def _tagged(structs: Iterable[inspect.Type], table: Mapping[str, object], where:
     tag = table[tag_field]
     _check_choice(sorted(known), tag, where / tag_field)
     for key in table:
-        others = [
-            name for name, one in known.items() if any(key == field.encode_name for field in one.fields)
-        ]
+        others = [name for name, one in known.items() if any(key == field.encode_name for field in one.fields)]
         if others and tag not in others:
             raise (where / key).bad(
                 f"the {tag_field} {quoted(str(tag))} has none",
@@ -324,9 +320,7 @@ def _checked_struct(kind: inspect.StructType, table: Mapping[str, object], where
         if key not in fields and key not in found:
             near = difflib.get_close_matches(key[:MAX_NAME], fields, n=3)
             known = ", ".join(sorted((*fields, *found)))
-            raise (where / key).bad(
-                "unknown key", f"did you mean {_either(near)}?" if near else f"known here: {known}"
-            )
+            raise (where / key).bad("unknown key", f"did you mean {_either(near)}?" if near else f"known here: {known}")
     for name, field in fields.items():
         if name in table:
             found[name] = _checked(field.type, table[name], where / name)

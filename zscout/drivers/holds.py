@@ -209,8 +209,7 @@ class HoldTable:
     def holders(self, now: Ns) -> list[Holder]:
         """The holders, with the time that each has left now."""
         return [
-            msgspec.structs.replace(held.holder, remaining=(held.end - now) / SECOND)
-            for held in self.held.values()
+            msgspec.structs.replace(held.holder, remaining=(held.end - now) / SECOND) for held in self.held.values()
         ]
 
     # Changes

@@ -65,9 +65,7 @@ class RadioDriver(Driver):
         self._rc = rc
         # Of its own: halts still go out after the RC has closed that of its other work.
         self._supervisor = Supervisor(f"the line of {rc.name}", rc.supervisor.fail)
-        self._line = SerialLine(
-            self._port, self._baud, up=self._line_up, down=self._line_down, wrote=self._line_wrote
-        )
+        self._line = SerialLine(self._port, self._baud, up=self._line_up, down=self._line_down, wrote=self._line_wrote)
         try:
             await asyncio.wait_for(self._known.wait(), OPENING)
         except TimeoutError:
@@ -96,10 +94,7 @@ class RadioDriver(Driver):
     def capacity(self) -> Amounts:
         """`command_rate`: packets of the full size a second, all holders together."""
         room = self._rate * (1 - RESERVE)
-        return {
-            "command_rate": Decimal(repr(float(room / MAX_PACKET))),
-            "bytes_per_second": Decimal(repr(float(room))),
-        }
+        return {"command_rate": Decimal(repr(float(room / MAX_PACKET))), "bytes_per_second": Decimal(repr(float(room)))}
 
     async def begin(self, holder: Holder) -> None:
         try:

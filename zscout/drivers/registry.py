@@ -2,15 +2,7 @@
 
 from __future__ import annotations
 
-from zscout.config.devices import (
-    CapacityRc,
-    ExclusiveRc,
-    FramegrabberRc,
-    RadioRc,
-    RcConfig,
-    RobotRc,
-    VideoRc,
-)
+from zscout.config.devices import CapacityRc, ExclusiveRc, FramegrabberRc, RadioRc, RcConfig, RobotRc, VideoRc
 from zscout.drivers.driver import Driver
 from zscout.drivers.generic import CapacityDriver, ExclusiveDriver, VideoDriver
 from zscout.messages import exact_amounts
@@ -28,11 +20,7 @@ def driver_for(rc: RcConfig) -> Driver:
             from zscout.drivers.robot import RobotDriver
 
             return RobotDriver(
-                rc.id,
-                radio=rc.radio,
-                channels=rc.channels,
-                warm_up=rc.warm_up / SECOND,
-                dead_man=rc.dead_man / SECOND,
+                rc.id, radio=rc.radio, channels=rc.channels, warm_up=rc.warm_up / SECOND, dead_man=rc.dead_man / SECOND
             )
         case VideoRc():
             return VideoDriver()

@@ -64,9 +64,7 @@ class _Waiting:
 class RobotDriver(Driver):
     """The RC of a robot, whose halt is carried by the RC `radio`."""
 
-    def __init__(
-        self, robot: int, *, radio: str, channels: Mapping[str, int], warm_up: float, dead_man: float
-    ) -> None:
+    def __init__(self, robot: int, *, radio: str, channels: Mapping[str, int], warm_up: float, dead_man: float) -> None:
         """`robot`: its id on the air. `channels`: of its camera, by video RC. `warm_up`: seconds until the
         camera works. `dead_man`: seconds after which it is stopped where no drive command follows, however
         long the last one may last."""
@@ -90,10 +88,7 @@ class RobotDriver(Driver):
         rc.fail(f"{self._radio} has not taken its halt yet")
         self._directory = RcDirectory(rc.mesh, self._on_directory_change)
         state = rc.mesh.keys.rc_state(self._radio)
-        self._declared = [
-            self._directory.watch(),
-            rc.mesh.subscribe(state, RcState, self._on_radio_state),
-        ]
+        self._declared = [self._directory.watch(), rc.mesh.subscribe(state, RcState, self._on_radio_state)]
         rc.supervisor.spawn(self._halt_until_sure())
         rc.supervisor.spawn(self._send_all())
 
@@ -181,9 +176,7 @@ class RobotDriver(Driver):
             code, why = "radio_refused", f"{waiting.radio}: {reply.problem.message} ({reply.problem.code})"
         waiting.resolve(Refused(code, why))
 
-    async def _ask_radio(
-        self, radio: str, order: Any, grant: Grant | None, timeout: float
-    ) -> Reply[Done] | None:
+    async def _ask_radio(self, radio: str, order: Any, grant: Grant | None, timeout: float) -> Reply[Done] | None:
         key = self._mesh.keys.command(radio, self._mesh.me)
         message = Command(do=msgspec.to_builtins(order), grant=grant, ttl=timeout)
         return await self._mesh.ask_one(key, message, Done, timeout=timeout)

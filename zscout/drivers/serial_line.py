@@ -26,8 +26,7 @@ READ_AT_ONCE: Final = 4_096
 _WORDS: Final = {
     **dict.fromkeys((errno.ENOENT, errno.ENODEV, errno.ENXIO), "is not there; is it plugged in?"),
     **dict.fromkeys(
-        (errno.EACCES, errno.EPERM),
-        "may not be opened by this user; add it to the group of the port, often dialout",
+        (errno.EACCES, errno.EPERM), "may not be opened by this user; add it to the group of the port, often dialout"
     ),
     **dict.fromkeys((errno.EBUSY, errno.EAGAIN), "is used by another program"),
     errno.ENOTTY: "is no serial port",
@@ -47,13 +46,7 @@ class SerialLine:
     """
 
     def __init__(
-        self,
-        port: str,
-        baud: int,
-        *,
-        up: Callable[[], None],
-        down: Callable[[str], None],
-        wrote: Callable[[], None],
+        self, port: str, baud: int, *, up: Callable[[], None], down: Callable[[str], None], wrote: Callable[[], None]
     ) -> None:
         self.port, self.baud = port, baud
         self.received = 0
@@ -99,9 +92,7 @@ class SerialLine:
 
         # Only real ports can be locked; of two programs on one line neither would be understood.
         exclusive = True if "://" not in self.port else None
-        return serial.serial_for_url(
-            self.port, self.baud, timeout=TIMEOUT, write_timeout=TIMEOUT, exclusive=exclusive
-        )
+        return serial.serial_for_url(self.port, self.baud, timeout=TIMEOUT, write_timeout=TIMEOUT, exclusive=exclusive)
 
     def _serve(self, port: Any) -> None:
         """Writes until the line fails or nobody wants it any more."""

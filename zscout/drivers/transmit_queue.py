@@ -119,11 +119,7 @@ class _Robot:
 def _remainder(repeat: _Repeat, newer: Packet) -> _Repeat | None:
     """What of `repeat` still applies once `newer` was sent."""
     match repeat.packet, newer:
-        case (
-            (_, HaltPacket())
-            | (StopPacket(), DrivePacket() | StopPacket())
-            | (CameraPacket(), CameraPacket())
-        ):
+        case (_, HaltPacket()) | (StopPacket(), DrivePacket() | StopPacket()) | (CameraPacket(), CameraPacket()):
             return None
         case HaltPacket() as halt, DrivePacket() | StopPacket():
             return _Repeat(CameraPacket(halt.robot, halt.number, 0), repeat.left, repeat.due)
@@ -242,8 +238,7 @@ class TransmitQueue:
         halt camera packets too. Returns in about how many ns it is through."""
         self.replaced += self._remove(
             lambda waiting: (
-                waiting.command.robot == robot
-                and (kind is HaltPacket or isinstance(waiting.command, RadioDrive))
+                waiting.command.robot == robot and (kind is HaltPacket or isinstance(waiting.command, RadioDrive))
             )
         )
         first, since = self._urgent.get(robot, (kind, now))
@@ -275,11 +270,7 @@ class TransmitQueue:
             kind, since = self._urgent.pop(number)
             robot = self._robot(number)
             return self._transmit(kind(number, robot.number()), Fraction(since), now)
-        due = [
-            (repeat.due, robot, repeat)
-            for robot, repeat in self._repeats()
-            if self._may_repeat(repeat) <= now
-        ]
+        due = [(repeat.due, robot, repeat) for robot, repeat in self._repeats() if self._may_repeat(repeat) <= now]
         if due:
             at, robot, repeat = min(due, key=lambda item: item[0])
             return self._transmit(robot.repeat(repeat, now), Fraction(at), now, repeat=True)
@@ -334,9 +325,7 @@ class TransmitQueue:
         """When a repeat may go out: where it is due, and the reserve has room for it."""
         return max(Fraction(repeat.due), self._reserve.ready(len(encode(repeat.packet))))
 
-    def _transmit(
-        self, packet: Packet, entered: Fraction, now: Ns, *, repeat: bool = False
-    ) -> OutgoingPacket:
+    def _transmit(self, packet: Packet, entered: Fraction, now: Ns, *, repeat: bool = False) -> OutgoingPacket:
         size = len(encode(packet))
         if repeat or isinstance(packet, StopPacket | HaltPacket):
             self._reserve.take(size, now)

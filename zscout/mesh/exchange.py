@@ -108,11 +108,7 @@ class PolledSubscription(Declaration, Generic[S]):
     """The latest publications on a key, kept outside the event loop until they are taken."""
 
     def __init__(
-        self,
-        take: Callable[[], tuple[str, bytes] | None],
-        undeclare: Undeclare,
-        kind: type[S],
-        depth: int,
+        self, take: Callable[[], tuple[str, bytes] | None], undeclare: Undeclare, kind: type[S], depth: int
     ) -> None:
         super().__init__(undeclare)
         self._take, self._kind, self._depth = take, kind, depth

@@ -72,9 +72,7 @@ class FramePublisher:
 class FrameWatch:
     """The newest frame on a key (or of each publication on a key expression, whichever came last)."""
 
-    def __init__(
-        self, transport: Transport, key: str, deliver: Callable[..., None], now: Callable[[], Ns]
-    ) -> None:
+    def __init__(self, transport: Transport, key: str, deliver: Callable[..., None], now: Callable[[], Ns]) -> None:
         self._deliver, self._now = deliver, now
         self._lock = threading.Lock()
         self._newest: tuple[str, bytes, bytes | None, Ns] | None = None

@@ -282,9 +282,7 @@ class Mesh:
             except Malformed as error:
                 _refuse(query, "malformed", str(error))
                 return
-            incoming: IncomingQuery[Any] = IncomingQuery(
-                query, asked, asked if wild else key, message, arrived
-            )
+            incoming: IncomingQuery[Any] = IncomingQuery(query, asked, asked if wild else key, message, arrived)
             try:
                 handler(incoming)
             except Refused as refused:

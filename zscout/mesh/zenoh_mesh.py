@@ -20,15 +20,7 @@ from zscout.keyexpr import Keys, Sender
 from zscout.mesh.exchange import MeshError
 from zscout.mesh.session import Mesh
 from zscout.mesh.supervision import clock
-from zscout.mesh.transport import (
-    Collector,
-    OnSample,
-    Quality,
-    Transport,
-    TransportPublisher,
-    TransportQuery,
-    Undeclare,
-)
+from zscout.mesh.transport import Collector, OnSample, Quality, Transport, TransportPublisher, TransportQuery, Undeclare
 
 log = logging.getLogger(__name__)
 
@@ -90,9 +82,7 @@ class ZenohMesh(Mesh):
             opening.add_done_callback(_close_abandoned)
             raise
         except zenoh.ZError as error:
-            raise MeshError(
-                f"the mesh can't be joined: {error}; check listen and connect under [mesh]"
-            ) from None
+            raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
         return cls(ZenohTransport(session), keys, me, clock.now)
 
 
@@ -172,9 +162,7 @@ class ZenohTransport(Transport):
         def on_zenoh_sample(sample: zenoh.Sample) -> None:
             attachment = sample.attachment
             on_sample(
-                str(sample.key_expr),
-                sample.payload.to_bytes(),
-                None if attachment is None else attachment.to_bytes(),
+                str(sample.key_expr), sample.payload.to_bytes(), None if attachment is None else attachment.to_bytes()
             )
 
         return _undeclare(self._session.declare_subscriber(key, _direct(on_zenoh_sample)))

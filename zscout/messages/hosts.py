@@ -38,9 +38,7 @@ class LoadReport(Message, frozen=True):
 
     host: str
     number: int
-    cores: (
-        Annotated[int, msgspec.Meta(gt=0, le=1_000_000)] | Annotated[float, msgspec.Meta(gt=0, le=1_000_000)]
-    )
+    cores: Annotated[int, msgspec.Meta(gt=0, le=1_000_000)] | Annotated[float, msgspec.Meta(gt=0, le=1_000_000)]
     load_average: tuple[float, float, float]
     cpu: float
     memory_available: int

@@ -8,14 +8,7 @@ from typing import Final
 from zscout.messages import ComponentSpec, ComponentState, RankedHost
 from zscout.placement.events import StartAnswered
 from zscout.placement.repeating import Probes, SurplusIncarnations
-from zscout.placement.state import (
-    OVER,
-    PROBE_TIMEOUT,
-    ComponentRecord,
-    PlacementState,
-    Termination,
-    host_gone,
-)
+from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, PlacementState, Termination, host_gone
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
 GRACE: Final[Ns] = 2 * SECOND
@@ -98,9 +91,7 @@ class Lifecycle:
         names = [name for name in state.to_place if name in state.components]
         state.to_place = {}
         waiting = [
-            (name, state.components[name].spec.kind)
-            for name in names
-            if state.components[name].state == "waiting"
+            (name, state.components[name].spec.kind) for name in names if state.components[name].state == "waiting"
         ]
         for number, component in enumerate(state.balancer.heaviest_first(waiting)):
             record = state.components[component]

@@ -12,14 +12,7 @@ from zscout.messages import Phase
 from zscout.placement.balancer import MAX_HOSTS
 from zscout.placement.events import MoveAnswered, StartAnswered
 from zscout.placement.lifecycle import Lifecycle
-from zscout.placement.state import (
-    PROBE_TIMEOUT,
-    ComponentRecord,
-    Migration,
-    PlacementState,
-    Termination,
-    TimerKind,
-)
+from zscout.placement.state import PROBE_TIMEOUT, ComponentRecord, Migration, PlacementState, Termination, TimerKind
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
 MAX_STARTS: Final = 3

@@ -222,9 +222,7 @@ class MetricLearner:
         found = self.agreement()
         best = max(CHOICES, key=lambda metric: found[metric] + AHEAD * (metric == DEFAULT))
         others = ", ".join(f"{metric} {found[metric]:.2f}" for metric in CHOICES if metric != best)
-        return best, (
-            f"{best} agrees best with how {len(self.seen)} components ran: {found[best]:.2f} ({others})"
-        )
+        return best, (f"{best} agrees best with how {len(self.seen)} components ran: {found[best]:.2f} ({others})")
 
 
 def spearman(one: Sequence[float], other: Sequence[float]) -> float:

@@ -20,14 +20,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from zscout.config.fleet import DEFAULT_PLACEMENT, PlacementPolicy
-from zscout.messages import (
-    DrainHost,
-    EndComponent,
-    MigrateComponent,
-    PlaceComponent,
-    Placement,
-    UncordonHost,
-)
+from zscout.messages import DrainHost, EndComponent, MigrateComponent, PlaceComponent, Placement, UncordonHost
 from zscout.placement.balancer import Balancer
 from zscout.placement.events import (
     ComponentsListed,

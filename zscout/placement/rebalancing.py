@@ -48,11 +48,7 @@ class Rebalancer:
         found = self._changes()
         before = self._paying
         self._paying = {move: before.get(move, state.now) for move in found}
-        ripe = [
-            (gain, move)
-            for move, gain in found.items()
-            if state.now - self._paying[move] >= state.rules.steady
-        ]
+        ripe = [(gain, move) for move, gain in found.items() if state.now - self._paying[move] >= state.rules.steady]
         if ripe:
             gain, (component, to) = max(ripe)
             self._paying.clear()

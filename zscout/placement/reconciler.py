@@ -10,14 +10,7 @@ from zscout.messages import ComponentState, ComponentView, Incarnation, Placemen
 from zscout.placement.events import ComponentsListed, TokenAppeared, TokenVanished
 from zscout.placement.lifecycle import GRACE, Lifecycle
 from zscout.placement.migration import Migrations
-from zscout.placement.state import (
-    OVER,
-    PROBE_TIMEOUT,
-    ComponentRecord,
-    PlacementState,
-    Termination,
-    host_gone,
-)
+from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, PlacementState, Termination, host_gone
 from zscout.types import ComponentId, HostName
 
 RUNNING: Final = ("running", "stopping")
@@ -89,9 +82,7 @@ class Reconciler:
             record.host_reason = f"found running on {host}"
         return record.host == host
 
-    def _other_runs(
-        self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool
-    ) -> None:
+    def _other_runs(self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool) -> None:
         """An incarnation runs that is not the record's."""
         state = self.state
         if self.surplus.has(record.component, incarnation):
@@ -103,9 +94,7 @@ class Reconciler:
         if host not in state.alive:
             return
         if record.host is not None:
-            self.surplus.add(
-                record.component, record.incarnation, record.host, record.start_until, token=record.token
-            )
+            self.surplus.add(record.component, record.incarnation, record.host, record.start_until, token=record.token)
         self.migrations.cancel(record)
         state.component_left(record)
         record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
@@ -213,10 +202,7 @@ class Reconciler:
             self.lifecycle.ended(record, end)
 
     def _not_listed(
-        self,
-        record: ComponentRecord,
-        listing: ComponentsListed,
-        present: set[tuple[ComponentId, Incarnation]],
+        self, record: ComponentRecord, listing: ComponentsListed, present: set[tuple[ComponentId, Incarnation]]
     ) -> None:
         """An incarnation that a list lacks is not there, unless it started after the list was made: a token,
         or a start that is not answered, prove more."""

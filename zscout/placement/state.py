@@ -25,12 +25,7 @@ from zscout.messages import (
     StopComponent,
 )
 from zscout.placement.balancer import LOAD_TIME, Balancer, RankingCache
-from zscout.placement.events import (
-    ComponentChanged,
-    HostCommand,
-    PlacementRefused,
-    PlacerEffect,
-)
+from zscout.placement.events import ComponentChanged, HostCommand, PlacementRefused, PlacerEffect
 from zscout.placement.model import NO_REPORT, RankQuery
 from zscout.types import SECOND, ComponentId, HostName, Kind, Ns
 
@@ -152,9 +147,7 @@ class ComponentRecord:
     """There exactly while it is `moving`."""
     not_before: Ns = 0
     """Until then it is neither moved off a drained host nor, if inherited, placed."""
-    ended_incarnations: deque[Incarnation] = field(
-        default_factory=lambda: deque(maxlen=MAX_ENDED_INCARNATIONS)
-    )
+    ended_incarnations: deque[Incarnation] = field(default_factory=lambda: deque(maxlen=MAX_ENDED_INCARNATIONS))
 
     def enter(self, state: ComponentState) -> None:
         """Raises ValueError for a transition that the table does not have."""
@@ -286,9 +279,7 @@ class PlacementState:
                 self.published[component] = status
                 effects.append(ComponentChanged(component, status))
         # A host may have been lost in this very instant, after a command to it.
-        return effects + [
-            one for one in self._commands if isinstance(one, PlacementRefused) or one.host in self.alive
-        ]
+        return effects + [one for one in self._commands if isinstance(one, PlacementRefused) or one.host in self.alive]
 
     # Components
 

@@ -88,9 +88,7 @@ class _Search:
 
     def fits(self, group: ConflictGroup) -> bool:
         return (
-            self.items == group.items
-            and self.arcs == [arc.id for arc in group.arcs]
-            and self.nogoods == group.nogoods
+            self.items == group.items and self.arcs == [arc.id for arc in group.arcs] and self.nogoods == group.nogoods
         )
 
     @property
@@ -158,9 +156,7 @@ class Adaptive(Strategy):
 
     def _continue(self) -> bool:
         """Goes on with what is unfinished. False: something has come to its end."""
-        return not any(
-            self._bounded(search).exhausted or self._advance(search) for search in self._unfinished
-        )
+        return not any(self._bounded(search).exhausted or self._advance(search) for search in self._unfinished)
 
     def _decide(self, group: ConflictGroup, before: dict[ArcId, _Search], actions: Actions) -> bool:
         """Takes the better set of a group, or leaves it to `priority`. False: it is off limits for now."""

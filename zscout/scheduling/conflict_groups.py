@@ -145,9 +145,7 @@ def conflict_groups(
         ConflictGroup(state, members, reserved)
         for members in split(undecided_arcs(state, reserved, limit) or ())
         if len(members) > 1
-        and (
-            sum(arc.hold is None for arc in members) > 1 or any(arc.mask & state.sharable for arc in members)
-        )
+        and (sum(arc.hold is None for arc in members) > 1 or any(arc.mask & state.sharable for arc in members))
     ]
 
 
@@ -185,11 +183,8 @@ def _level_key(arc: Arc, first: set[ArcId], now: Ns) -> tuple[int, int]:
     equals, but not before running ones: equals are not preempted."""
     if (below := arc.protected_below(now)) is not None:
         return min(-arc.priority, 1 - below), 0
-    if arc.hold is not None:
-        later = bool(first) and arc.past_min_runtime(now)
-    else:
-        later = bool(first) and arc.id not in first
-    return -arc.priority, 2 if later else 1
+    later = arc.past_min_runtime(now) if arc.hold is not None else arc.id not in first
+    return -arc.priority, 2 if first and later else 1
 
 
 def _one_group(arcs: Sequence[Arc]) -> bool:
@@ -278,9 +273,7 @@ class ConflictGroup:
     def _vetoes(self, rc: Rc) -> Iterator[int]:
         """The vetoes of `rc` that bear on these ARCs. Its other holders stay."""
         for holders in self.votes.vetoed(rc.name):
-            if all(arc in self._number or arc in rc.holders for arc in holders) and (
-                nogood := self._bits(holders)
-            ):
+            if all(arc in self._number or arc in rc.holders for arc in holders) and (nogood := self._bits(holders)):
                 yield nogood
 
     def _probe(self, rc: Rc, holders: HolderSet) -> HolderSet:

@@ -96,8 +96,7 @@ class Core:
             queued=tuple(self._arc_status(state.queued[rank[-1]]) for rank in ranks),
             waiting=self.waiting,
             rcs=tuple(
-                RcStatus(name, rc.present, rc.sharable, tuple(rc.holders))
-                for name, rc in sorted(state.rcs.items())
+                RcStatus(name, rc.present, rc.sharable, tuple(rc.holders)) for name, rc in sorted(state.rcs.items())
             ),
         )
 
@@ -135,17 +134,13 @@ class Core:
     def as_events(self, term: Term) -> tuple[list[on.Event], on.LeadTaken]:
         """The events that bring another core to the state of this one, in a term of its own."""
         state = self._state
-        joined: list[on.Event] = [
-            on.RcJoined(rc.name, rc.sharable) for rc in state.rcs.values() if rc.present
-        ]
+        joined: list[on.Event] = [on.RcJoined(rc.name, rc.sharable) for rc in state.rcs.values() if rc.present]
         recovered_holds = tuple(
             on.RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
             for arc in state.running.values()
             if arc.hold is not None
         )
-        waiting = tuple(
-            on.RecoveredRequest(arc.request, arc.place, arc.since) for arc in state.queued.values()
-        )
+        waiting = tuple(on.RecoveredRequest(arc.request, arc.place, arc.since) for arc in state.queued.values())
         return joined, on.LeadTaken(term, recovered_holds, waiting)
 
     def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
@@ -193,9 +188,7 @@ class Core:
             case on.RcReported(rc, ended, rules_changed):
                 for arc in ended:
                     if arc in self._state.rc(rc).holders:
-                        self._end_hold(
-                            self._state.running[arc], Outcome.LOST, Reason(ReasonCode.RC_ENDED, (rc,))
-                        )
+                        self._end_hold(self._state.running[arc], Outcome.LOST, Reason(ReasonCode.RC_ENDED, (rc,)))
                 if rules_changed:
                     self._votes.forget_rc(rc)
             case on.RcLost(rc, reason):
@@ -280,10 +273,7 @@ class Core:
             self._effects.append(Queued(arc.id, to, arc.reason))
 
     def _take_lead(
-        self,
-        term: Term,
-        recovered_holds: tuple[on.RecoveredHold, ...],
-        waiting: tuple[on.RecoveredRequest, ...],
+        self, term: Term, recovered_holds: tuple[on.RecoveredHold, ...], waiting: tuple[on.RecoveredRequest, ...]
     ) -> None:
         if term <= self.term:
             raise ValueError(f"the new term {term} is not above {self.term}")
@@ -323,12 +313,7 @@ class Core:
 
     def start(self, arc: Arc) -> None:
         grant = self._next_grant()
-        hold = Hold(
-            grant,
-            self._state.now,
-            self._state.now + arc.request.min_runtime,
-            self._state.protected_below(arc),
-        )
+        hold = Hold(grant, self._state.now, self._state.now + arc.request.min_runtime, self._state.protected_below(arc))
         self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold))
 
@@ -388,9 +373,7 @@ class Core:
         rcs = tuple(sorted(arc.needs))
         return Granted(arc.id, arc.request.client, hold.grant, rcs, hold.start, end)
 
-    def _revocation(
-        self, arc: Arc, hold: Hold, outcome: Outcome, reason: Reason, *, requeued: bool
-    ) -> HoldEnded:
+    def _revocation(self, arc: Arc, hold: Hold, outcome: Outcome, reason: Reason, *, requeued: bool) -> HoldEnded:
         self.number()
         rcs = tuple(sorted(arc.needs))
         by = reason.by[0].arc if reason.by else None

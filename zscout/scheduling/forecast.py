@@ -11,17 +11,7 @@ import itertools
 from dataclasses import dataclass, field
 
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    ArcRequest,
-    Event,
-    Granted,
-    HoldEnded,
-    Outcome,
-    Propose,
-    Requested,
-    Tick,
-    Vote,
-)
+from zscout.scheduling.model import ArcRequest, Event, Granted, HoldEnded, Outcome, Propose, Requested, Tick, Vote
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.replay import play_instant
 from zscout.scheduling.strategies import STRATEGIES

@@ -37,9 +37,7 @@ class LocalSearch:
             for number, item in enumerate(items[:MAX_ITEMS])
             if item.level < MAX_LEVELS and item.mask and problem.allowed(number, 0)
         ]
-        self._needs: dict[int, tuple[int, ...]] = {
-            number: tuple(numbers(items[number].mask)) for number in looked_at
-        }
+        self._needs: dict[int, tuple[int, ...]] = {number: tuple(numbers(items[number].mask)) for number in looked_at}
         width = max((rcs[-1] + 1 for rcs in self._needs.values()), default=0)
         self._cover: list[list[int]] = [[] for _ in range(width)]
         for number in looked_at:
@@ -59,11 +57,7 @@ class LocalSearch:
     @property
     def done(self) -> bool:
         """Whether nothing better is there, or nothing better was found for long."""
-        return (
-            self.best_key[0] >= self.upper_bound
-            or not self._pool
-            or self.steps - self._improved_at > self._idle
-        )
+        return self.best_key[0] >= self.upper_bound or not self._pool or self.steps - self._improved_at > self._idle
 
     def _adopt(self, chosen: int) -> None:
         """Starts from this set."""

@@ -58,16 +58,13 @@ class PackingProblem:
         """What one RC in use is worth at an item's level: more than all lower levels together."""
         self.masks = [item.mask for item in items]
         self.worth = [
-            0 if item.past_min_runtime else item.width * unit
-            for item, unit in zip(items, self.unit, strict=True)
+            0 if item.past_min_runtime else item.width * unit for item, unit in zip(items, self.unit, strict=True)
         ]
         self.extra = [
             0 if item.past_min_runtime else (item.width - item.mask.bit_count()) * unit
             for item, unit in zip(items, self.unit, strict=True)
         ]
-        self.plain = (
-            self.levels == 1 and not any(self.extra) and not any(item.past_min_runtime for item in items)
-        )
+        self.plain = self.levels == 1 and not any(self.extra) and not any(item.past_min_runtime for item in items)
         """Whether an RC in use counts one, whoever uses it."""
         self.nogoods: list[list[int]] = [[] for _ in items]
         for nogood in nogoods:
@@ -108,9 +105,7 @@ class PackingProblem:
 
     def preemptions(self, chosen: int) -> int:
         """How many would be preempted."""
-        return sum(
-            1 for number in self.running if self.items[number].in_min_runtime and not chosen >> number & 1
-        )
+        return sum(1 for number in self.running if self.items[number].in_min_runtime and not chosen >> number & 1)
 
     def key(self, chosen: int) -> tuple[int, int]:
         """Compares sets by value, then by preemptions; greater is better."""
@@ -151,9 +146,7 @@ class PackingProblem:
     def outranks(self, other: int, running: int) -> bool:
         """Whether `running` may have to end because `other` was chosen."""
         them, item = self.items[other], self.items[running]
-        return them.level < item.level or (
-            them.level == item.level and (them.running or item.past_min_runtime)
-        )
+        return them.level < item.level or (them.level == item.level and (them.running or item.past_min_runtime))
 
 
 def pack(problem: PackingProblem, nodes: int = NO_LIMIT) -> Packing:
@@ -174,8 +167,7 @@ class _BranchAndBound:
         self.in_min_runtime = [item.in_min_runtime for item in items]
         self.ends = any(self.in_min_runtime)
         self.checked = any(
-            item.running and not always_kept
-            for item, always_kept in zip(items, self.always_kept, strict=True)
+            item.running and not always_kept for item, always_kept in zip(items, self.always_kept, strict=True)
         )
         self.best = -1
         self.best_preemptions = 0
@@ -196,12 +188,7 @@ class _BranchAndBound:
         return Packing(self.chosen, not cut, self.nodes)
 
     def _descend(
-        self,
-        todo: list[tuple[list[int], int, int, int]],
-        open_: list[int],
-        chosen: int,
-        value: int,
-        preemptions: int,
+        self, todo: list[tuple[list[int], int, int, int]], open_: list[int], chosen: int, value: int, preemptions: int
     ) -> bool:
         """Takes whatever comes first, down to a complete set; what else might be done is put on `todo`.
 

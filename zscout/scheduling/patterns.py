@@ -61,10 +61,7 @@ class Binder:
             if not options[need]:
                 return None
         for worst in Fitness:
-            allowed = {
-                need: [rc for (fitness, _), rc in found if fitness <= worst]
-                for need, found in options.items()
-            }
+            allowed = {need: [rc for (fitness, _), rc in found if fitness <= worst] for need, found in options.items()}
             if all(allowed.values()) and (chosen := _distinct(allowed)) is not None:
                 return chosen
         return None
@@ -74,9 +71,7 @@ class Binder:
         demand = float(rc.demand)
         non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
-            answer = self._votes.known(
-                rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id))
-            )
+            answer = self._votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
             if answer is None and rc.name in self._votes.unresponsive:
                 return Fitness.RESERVED, demand
             if answer is not None and not answer.accept:

@@ -181,9 +181,7 @@ class AdmissionCheck:
 
     def _with_non_preemptible(self, rc: Rc) -> HolderSet:
         """The ARC and the holders of `rc` that are not preempted for it."""
-        return frozenset(
-            (*(holder.id for holder in rc.non_preemptible_holders(self.arc, self.now)), self.arc.id)
-        )
+        return frozenset((*(holder.id for holder in rc.non_preemptible_holders(self.arc, self.now)), self.arc.id))
 
     def _preemptible_sharers(self) -> list[Arc]:
         """In rank order, the holders of its sharable RCs that may be preempted for it."""

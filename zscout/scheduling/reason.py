@@ -95,9 +95,7 @@ def _listed(reason: Reason, shown: Iterable[str] | None = None) -> str:
 
 
 def _held(reason: Reason) -> str:
-    return "needs " + _listed(
-        reason, [f"{rc} (held by {by})" for rc, by in zip(reason.rcs, reason.by, strict=True)]
-    )
+    return "needs " + _listed(reason, [f"{rc} (held by {by})" for rc, by in zip(reason.rcs, reason.by, strict=True)])
 
 
 _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {

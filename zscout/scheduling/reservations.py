@@ -114,9 +114,7 @@ class Reservations:
         non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
             sharing = (reservation.arc.id for reservation in self.by_rc.get(rc.bit, ()))
-            if self._votes.accepts(
-                rc.name, frozenset((*(holder.id for holder in non_preemptible), *sharing, arc.id))
-            ):
+            if self._votes.accepts(rc.name, frozenset((*(holder.id for holder in non_preemptible), *sharing, arc.id))):
                 return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
             if rc.name in self._votes.unresponsive or (alone is not None and not alone.accept):

@@ -27,22 +27,10 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
-from zscout.config.strict import (
-    Where,
-    amounts,
-    check_unique,
-    parse_toml,
-    quoted,
-    seconds_to_ns,
-)
+from zscout.config.strict import Where, amounts, check_unique, parse_toml, quoted, seconds_to_ns
 from zscout.keyexpr import is_pattern
 from zscout.scheduling.model import ArcRequest
-from zscout.types import (
-    ArcId,
-    Ns,
-    Params,
-    RcName,
-)
+from zscout.types import ArcId, Ns, Params, RcName
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,9 +124,7 @@ def parse_workload(text: str, source: str) -> Workload:
 def _rc(rc: _Rc, where: Where) -> WorkloadRc:
     _check_text(rc.name, where / "name")
     if is_pattern(rc.name):
-        raise (where / "name").bad(
-            f"{quoted(rc.name)} is a pattern", "leave out the *; only needs may have it"
-        )
+        raise (where / "name").bad(f"{quoted(rc.name)} is a pattern", "leave out the *; only needs may have it")
     if rc.capacity is None:
         return WorkloadRc(rc.name, rc.sharable)
     if not rc.sharable:

@@ -40,11 +40,7 @@ class SmallFleet:
         stall = StallWatch()
         self.rcs = [
             ResourceController(
-                self.devices,
-                name,
-                ExclusiveDriver(),
-                hold_lease=FLEET.timing.hold_lease / SECOND,
-                stall=stall,
+                self.devices, name, ExclusiveDriver(), hold_lease=FLEET.timing.hold_lease / SECOND, stall=stall
             )
             for name in (RC, OTHER)
         ]

@@ -19,12 +19,7 @@ from zscout.config.fleet import default_fleet
 from zscout.keyexpr import BadName, Keys, Sender
 from zscout.mesh import Mesh
 from zscout.messages import Amounts, Notice, OpenRequest, Problem
-from zscout.types import (
-    SECOND,
-    Grant,
-    Place,
-    Term,
-)
+from zscout.types import SECOND, Grant, Place, Term
 
 OLD, TERM = Term(1, "zz"), Term(2, "aa")
 FIRST, SECOND_GRANT = Grant(TERM, 1), Grant(TERM, 9)
@@ -210,9 +205,7 @@ def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_lat
         assert (store.open, store.moved, known.last) == ([], {"id": known}, (TERM, 10))
         # What is expected is told of without a place: the RCs decide whose it is.
         store.expected["other"] = OpenArc.expected(msgspec.structs.replace(EXPECTED, id="other"), NOW)
-        assert [(told.id, told.place, told.grant) for told in store.open_requests()] == [
-            ("other", None, None)
-        ]
+        assert [(told.id, told.place, told.grant) for told in store.open_requests()] == [("other", None, None)]
         store.resumed.set()
         store.reclaim(known)
         assert (list(store.arcs), store.moved, known.state) == ([known.id], {}, "asking")
@@ -233,19 +226,14 @@ def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_lat
 
 @pytest.mark.parametrize(
     ("answers", "result"),
-    [
-        (["not_yet", "stale", "not_yet", None], FIRST),
-        (["not_yet", "ended"], "ended"),
-        (["not_holder"], "not_holder"),
-    ],
+    [(["not_yet", "stale", "not_yet", None], FIRST), (["not_yet", "ended"], "ended"), (["not_holder"], "not_holder")],
 )
 def test_a_grant_is_confirmed_again_where_its_rc_has_not_heard_of_it_yet(
     answers: list[str | None], result: Grant | str
 ) -> None:
     async def story() -> None:
         client = Client(
-            cast("Mesh", SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)),
-            default_fleet(),
+            cast("Mesh", SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)), default_fleet()
         )
         known = arc()
         known.take(runs({}), NOW)

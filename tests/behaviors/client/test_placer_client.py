@@ -13,14 +13,7 @@ from zscout.behaviors.client.request import RequestRefused
 from zscout.keyexpr import Sender
 from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import IncomingQuery, Refused
-from zscout.messages import (
-    ComponentSpec,
-    ListPlacements,
-    PlaceComponent,
-    Placement,
-    Placements,
-    PlacerOperation,
-)
+from zscout.messages import ComponentSpec, ListPlacements, PlaceComponent, Placement, Placements, PlacerOperation
 from zscout.types import Term
 
 JOB = ComponentSpec("job")

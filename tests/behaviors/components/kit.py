@@ -105,9 +105,7 @@ class Hosts:
         cpu_limit: float = 0.0,
     ) -> ComponentView:
         # The placer beside the leading RCM adopts what it sees; it is to leave alone what ends here.
-        spec = ComponentSpec(
-            kind, params or {}, restart="never", memory_limit=memory_limit, cpu_limit=cpu_limit
-        )
+        spec = ComponentSpec(kind, params or {}, restart="never", memory_limit=memory_limit, cpu_limit=cpu_limit)
         return await self.get(host, StartComponent(component, incarnation, spec, standby), ComponentView)
 
     async def stop(self, host: str, component: str, grace: float = 5.0) -> ComponentView:

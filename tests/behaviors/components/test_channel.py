@@ -13,23 +13,9 @@ import msgspec
 import pytest
 
 from zscout.behaviors.components import channel
-from zscout.behaviors.components.channel import (
-    BadFrame,
-    ComponentJob,
-    ComponentReport,
-    EndReport,
-    Order,
-    PhaseReport,
-)
+from zscout.behaviors.components.channel import BadFrame, ComponentJob, ComponentReport, EndReport, Order, PhaseReport
 from zscout.config.fleet import default_fleet
-from zscout.messages import (
-    MAX_CHECKPOINT,
-    ComponentSpec,
-    OpenRequest,
-    RestoreComponent,
-    StartComponent,
-    StopComponent,
-)
+from zscout.messages import MAX_CHECKPOINT, ComponentSpec, OpenRequest, RestoreComponent, StartComponent, StopComponent
 
 STOP = Order(0, StopComponent("c"))
 

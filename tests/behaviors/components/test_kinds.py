@@ -25,9 +25,7 @@ def test_kinds_of_other_packages_are_seen_at_once(tmp_path: Path, monkeypatch: p
     assert set(ODD) < set(installed_kinds())
 
 
-def test_a_name_that_means_two_things_or_none_is_no_kind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_that_means_two_things_or_none_is_no_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info = tmp_path / "other-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1\n")
@@ -40,8 +38,7 @@ def test_a_name_that_means_two_things_or_none_is_no_kind(
 
 
 @pytest.mark.parametrize(
-    "where",
-    ["zscout.behaviors.components.shipped:PAGE", "zscout.behaviors.components.shipped:No.such", "json"],
+    "where", ["zscout.behaviors.components.shipped:PAGE", "zscout.behaviors.components.shipped:No.such", "json"]
 )
 def test_what_is_no_component_is_refused_in_one_line(where: str) -> None:
     with pytest.raises(BadKind, match=r"kind x: .* no subclass of .*; mend the entry point") as caught:

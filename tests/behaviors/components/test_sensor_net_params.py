@@ -17,10 +17,7 @@ ONE: dict[str, Any] = {"robot": "robot/scout33"}
 TWO: dict[str, Any] = {"robots": ["robot/scout33", "robot/scout35"]}
 
 SHARED: list[tuple[dict[str, Any], str]] = [
-    (
-        {"radio": "robot/scout33"},
-        'radio: "robot/scout33" is no radio; name one, or a pattern, as in "radio/*"',
-    ),
+    ({"radio": "robot/scout33"}, 'radio: "robot/scout33" is no radio; name one, or a pattern, as in "radio/*"'),
     ({"radio": "rf0"}, 'radio: "rf0" is no radio; name one, or a pattern, as in "radio/*"'),
     ({"video": None}, "video: is null; write a text in quotes"),
     ({"video": "video/**"}, 'video: "video/**" is no video; name one, or a pattern, as in "video/*"'),
@@ -44,10 +41,7 @@ SHARED: list[tuple[dict[str, Any], str]] = [
     ({"hide_priority": 1.5}, "hide_priority: is 1.5; write a whole number from -1000 to 1000"),
     ({"watch_priority": 1001}, "watch_priority: is 1001; write a whole number from -1000 to 1000"),
     ({"watch_priority": False}, "watch_priority: is false; write a whole number from -1000 to 1000"),
-    (
-        {"watch_priorty": 1},
-        "watch_priorty: unknown key; did you mean watch_priority, watch_slot or hide_priority?",
-    ),
+    ({"watch_priorty": 1}, "watch_priorty: unknown key; did you mean watch_priority, watch_slot or hide_priority?"),
 ]
 """Wrong for both, with the words."""
 
@@ -69,15 +63,9 @@ OF_NET: list[tuple[dict[str, Any], str]] = [
     ({"robots": []}, 'robots: is empty; name one, as in ["robot/scout33"]'),
     ({"robots": "robot/scout33"}, 'robots: is the text "robot/scout33"; write a list'),
     ({"robots": {"robot/scout33": 1}}, "robots: is a table; write a list"),
-    (
-        {"robots": [f"robot/scout{number}" for number in range(65)]},
-        "robots: has 65 entries; at most 64 are allowed",
-    ),
+    ({"robots": [f"robot/scout{number}" for number in range(65)]}, "robots: has 65 entries; at most 64 are allowed"),
     ({"robots": ["robot/scout33", 35]}, "robots[1]: is 35; write a text in quotes"),
-    (
-        {"robots": ["framegrabber/fgrab1"]},
-        'robots[0]: "framegrabber/fgrab1" is no robot; name one, as in "robot/..."',
-    ),
+    ({"robots": ["framegrabber/fgrab1"]}, 'robots[0]: "framegrabber/fgrab1" is no robot; name one, as in "robot/..."'),
     ({"robots": ["robot/*"]}, f'robots[0]: "robot/*" is not the name of an RC; {RC_RULE}'),
     (
         {"robots": ["robot/scout33", "robot/scout35", "robot/scout33"]},

@@ -23,16 +23,12 @@ def room(*furniture: Furniture, rugs: tuple[Rug, ...] = ()) -> Plan:
 
 def sofa(x: float) -> Furniture:
     """Its front, 2 m wide with a gap of 0.12 m, at `x`, towards the robot."""
-    return Furniture(
-        name="sofa", kind="sofa", x=x + 0.425, y=2.0, width=2.0, depth=0.85, height=0.8, turn=-1.5708
-    )
+    return Furniture(name="sofa", kind="sofa", x=x + 0.425, y=2.0, width=2.0, depth=0.85, height=0.8, turn=-1.5708)
 
 
 def carton(x: float) -> Furniture:
     """A black box of 0.45 m on the floor, its face at `x`."""
-    return Furniture(
-        name="carton", kind="solid", x=x + 0.25, y=2.0, width=0.5, depth=0.6, height=0.45, shade=0.02
-    )
+    return Furniture(name="carton", kind="solid", x=x + 0.25, y=2.0, width=0.5, depth=0.6, height=0.45, shade=0.02)
 
 
 def seen_from(plan: Plan, x: float, y: float, heading: float, *, seed: int = 1) -> Picture:

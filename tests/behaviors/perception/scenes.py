@@ -27,9 +27,7 @@ class Scene:
         grain = cv2.GaussianBlur(self.rng.normal(0, 12, (HEIGHT, WIDTH)).astype(np.float32), (5, 5), 0)
         self.wall = cv2.GaussianBlur(wall, (3, 3), 0) + grain
 
-    def picture(
-        self, walker: float | None = None, *, gain: float = 1.0, shade: float = 35.0
-    ) -> NDArray[np.uint8]:
+    def picture(self, walker: float | None = None, *, gain: float = 1.0, shade: float = 35.0) -> NDArray[np.uint8]:
         """One picture; `gain` is the light's."""
         plane = self.wall
         if walker is not None:

@@ -8,15 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.behaviors.perception.recordings import (
-    EMPTY_LAWN,
-    GARDEN,
-    HAND,
-    PASSERS_BY,
-    PEOPLE,
-    covered,
-    pictures,
-)
+from tests.behaviors.perception.recordings import EMPTY_LAWN, GARDEN, HAND, PASSERS_BY, PEOPLE, covered, pictures
 from tests.behaviors.perception.scenes import Scene, box_of, overlap
 from zscout.behaviors.perception.motion import MAX_SIDE, MotionDetector
 from zscout.lab.building.plan_file import load_plan, shipped_plans
@@ -42,9 +34,7 @@ def settled(scene: Scene, rate: float = 10.0, seconds: float = 4.0) -> MotionDet
     ("noise", "rate", "seconds"),
     [(1.0, 5.0, 16.0), (1.0, 30.0, 3.0), (5.0, 2.0, 30.0), (12.0, 5.0, 16.0), (12.0, 2.0, 30.0)],
 )
-def test_nobody_is_no_alarm_and_a_walker_is_one_within_a_second(
-    noise: float, rate: float, seconds: float
-) -> None:
+def test_nobody_is_no_alarm_and_a_walker_is_one_within_a_second(noise: float, rate: float, seconds: float) -> None:
     scene, detector = Scene(1, noise=noise), MotionDetector()
     assert not any(detector.see(time, scene.picture()).moving for time in times(rate, seconds))
     first, best = None, 0.0
@@ -82,10 +72,7 @@ def test_light_that_flickers_drifts_and_is_switched_moves_nothing() -> None:
 def test_a_walker_is_seen_while_the_exposure_follows_him() -> None:
     scene = Scene(4)
     detector = settled(scene)
-    told = [
-        detector.see(4 + n / 10, scene.picture(30 + 4 * n, gain=1 + 0.03 * n, shade=20)).moving
-        for n in range(10)
-    ]
+    told = [detector.see(4 + n / 10, scene.picture(30 + 4 * n, gain=1 + 0.03 * n, shade=20)).moving for n in range(10)]
     assert sum(told) >= 8
 
 
@@ -113,9 +100,7 @@ def test_a_moved_camera_is_learned_anew() -> None:
 def test_who_stops_is_motion_no_longer_and_leaves_no_ghost() -> None:
     scene = Scene(7)
     detector = settled(scene, rate=5)
-    came = [
-        detector.see(time, scene.picture(min(80, 30 + 50 * (time - 4)))).moving for time in times(5, 2, 4)
-    ]
+    came = [detector.see(time, scene.picture(min(80, 30 + 50 * (time - 4)))).moving for time in times(5, 2, 4)]
     assert sum(came) >= 6
     stands = [detector.see(time, scene.picture(80)).moving for time in times(5, 20, 6)]
     assert not any(stands[50:])

@@ -21,9 +21,7 @@ def test_sizes(text: str, size: int) -> None:
     assert parse_size(text, "--memory") == size
 
 
-@pytest.mark.parametrize(
-    "text", ["", "0", "M", "-1", "1e3", "5P", "1 M", "0.0001", "9" * 30, "2000000T", "٣"]
-)
+@pytest.mark.parametrize("text", ["", "0", "M", "-1", "1e3", "5P", "1 M", "0.0001", "9" * 30, "2000000T", "٣"])
 def test_what_is_no_size_is_refused(text: str) -> None:
     with pytest.raises(BadInput, match=r"--memory: .* is no size; write bytes, or with a unit"):
         parse_size(text, "--memory")

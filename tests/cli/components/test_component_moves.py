@@ -87,9 +87,7 @@ def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFlee
 
     went = fleet.zscout("migrate", "wanderer", "--to", there)
     assert (went.returncode, went.stderr) == (0, "")
-    assert re.fullmatch(
-        rf"wanderer went from {here} to {there}, out of work for \d+ ms", went.stdout.splitlines()[-1]
-    )
+    assert re.fullmatch(rf"wanderer went from {here} to {there}, out of work for \d+ ms", went.stdout.splitlines()[-1])
     lines = read_until(follower, f"-- wanderer goes on on {there}")
     back = told(fleet.zscout("migrate", "wanderer", "--json"))
     assert (back["from"], back["host"], back["moves"]) == (there, here, 2)

@@ -46,12 +46,7 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
     fleet.state(lambda state: [hold.arc for hold in state.holds] == ["counter"])
 
     (one,) = listed(fleet)
-    assert (one["component"], one["state"], one["host"], one["movable"]) == (
-        "counter",
-        "running",
-        "anvil",
-        True,
-    )
+    assert (one["component"], one["state"], one["host"], one["movable"]) == ("counter", "running", "anvil", True)
     assert one["spec"]["kind"] == "counter"
     assert one["spec"]["params"] == {"period": 0.1, "rc": "robot/a"}
     assert 0 < one["uptime"] < HANG
@@ -69,9 +64,7 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
 
     other = fleet.zscout("start", "counter", "--set", "period=0.2")
     assert (other.returncode, other.stdout) == (1, "")
-    assert other.stderr.startswith(
-        "zscout: counter exists already, as another kind or with other settings; give"
-    )
+    assert other.stderr.startswith("zscout: counter exists already, as another kind or with other settings; give")
     assert other.stderr.endswith("zscout stop counter\n")
 
     stopped = fleet.zscout("stop", "counter")
@@ -192,13 +185,9 @@ def test_status_names_components_and_cordoned_hosts(fleet: CliFleet) -> None:
     assert "zscout: anvil is not empty: seen stays (it can't be moved; anvil is drained); " in drained.stderr
     assert fleet.zscout("drain", "anvli").returncode == 1
     shown = fleet.zscout("status")
-    assert re.search(r"^anvil +leads, cordoned .* node, 1 RC, seen$", shown.stdout, re.MULTILINE), (
-        shown.stdout
-    )
+    assert re.search(r"^anvil +leads, cordoned .* node, 1 RC, seen$", shown.stdout, re.MULTILINE), shown.stdout
     (anvil,) = (
-        host
-        for host in json.loads(fleet.zscout("status", "--json").stdout)["hosts"]
-        if host["host"] == "anvil"
+        host for host in json.loads(fleet.zscout("status", "--json").stdout)["hosts"] if host["host"] == "anvil"
     )
     assert (anvil["components"], anvil["cordoned"]) == (["seen"], True)
     assert fleet.zscout("uncordon", "anvil").stdout == "anvil is used again\n"

@@ -85,11 +85,7 @@ def test_health_and_figures_of_devices(tmp_path: Path) -> None:
                 assert "  robot/a: no other ARC holds it" in story.stdout.splitlines()
                 rcs = {rc["rc"]: rc for rc in json.loads(machine.stdout)["rcs"]}
                 assert rcs["framegrabber/ill"]["health"] == "the lens is dirty"
-                assert rcs["framegrabber/ill"]["figures"] == {
-                    "frames_per_second": 9.8,
-                    "dropped": 0,
-                    "opened": 3,
-                }
+                assert rcs["framegrabber/ill"]["figures"] == {"frames_per_second": 9.8, "dropped": 0, "opened": 3}
                 assert rcs["framegrabber/ill"]["present"] is False
                 assert (rcs["robot/a"]["health"], rcs["robot/a"]["figures"]) == ("ok", {})
 

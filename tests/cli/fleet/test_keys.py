@@ -54,9 +54,7 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
             assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=HANG) is not None
             assert queries[2:] == [f"{base}/balancer/rank", f"{base}/placer/component"]
             assert await client.mesh.ask_one(queries[2], RankAsk(), HostRanking, timeout=HANG) is not None
-            assert (
-                await client.mesh.ask_one(queries[3], ListPlacements(), Placements, timeout=HANG) is not None
-            )
+            assert await client.mesh.ask_one(queries[3], ListPlacements(), Placements, timeout=HANG) is not None
             (host,) = [key["key"] for key in alive["anvil", "node", "node"]["keys"]]
             assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=HANG) is not None
             for rc in ("robot/a", "radio/rf0"):

@@ -56,11 +56,7 @@ def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
             ]
             assert running[0][3].endswith(", keeps")
             waiting = section(plain.stdout, "Waiting")
-            assert [row[:3] for row in waiting] == [
-                ["1", "first", "2"],
-                ["2", "second", "1"],
-                ["3", "ghost", "0"],
-            ]
+            assert [row[:3] for row in waiting] == [["1", "first", "2"], ["2", "second", "1"], ["3", "ghost", "0"]]
             assert "held by take, priority 10" in waiting[0][-1]
             assert waiting[2][-1] == "robot/nowhere not on the mesh"
             hosts = {row[0]: row for row in section(plain.stdout, "Hosts")}
@@ -79,9 +75,7 @@ def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
                 ("robot/b", True, False, "bellows"),
                 ("robot/nowhere", False, False, None),
             ]
-            assert shown["rcs"][0]["holders"] == [
-                {"arc": "survey", "id": survey.id, "client": "test/program"}
-            ]
+            assert shown["rcs"][0]["holders"] == [{"arc": "survey", "id": survey.id, "client": "test/program"}]
             kept = next(hold for hold in shown["holds"] if hold["id"] == take.id)
             assert (kept["keep"], kept["priority"], kept["needs"]) == (True, 10, {"robot/b": {}})
             assert 590 < kept["remaining"] < 600

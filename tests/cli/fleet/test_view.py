@@ -24,14 +24,7 @@ import pytest
 from tests.cli.tools import COMMAND, zscout_here
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.services.recorder.paper_run import (
-    RCS,
-    RERUN,
-    TABLE2,
-    lanes,
-    play_table1,
-    second_by_second,
-)
+from tests.services.recorder.paper_run import RCS, RERUN, TABLE2, lanes, play_table1, second_by_second
 from zscout.services.recorder.timeline import Timeline
 
 OPEN = re.compile(rb"^Open (http://\S+)", re.MULTILINE)
@@ -46,9 +39,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def viewing(
-    folder: Path, *args: object, env: dict[str, str] | None = None
-) -> Iterator[subprocess.Popen[bytes]]:
+def viewing(folder: Path, *args: object, env: dict[str, str] | None = None) -> Iterator[subprocess.Popen[bytes]]:
     """`zscout view` with its output in `view.log` of the folder."""
     with (folder / "view.log").open("wb") as log:
         command = [*COMMAND, "view", *map(str, args)]
@@ -71,9 +62,7 @@ def until(true: Callable[[], bool], what: str) -> None:
 def page(folder: Path, process: subprocess.Popen[bytes]) -> tuple[str, str]:
     """The address that it said to open, and that of the stream in it."""
     log = folder / "view.log"
-    until(
-        lambda: OPEN.search(log.read_bytes()) is not None or process.poll() is not None, "no address was said"
-    )
+    until(lambda: OPEN.search(log.read_bytes()) is not None or process.poll() is not None, "no address was said")
     found = OPEN.search(log.read_bytes())
     assert found is not None, log.read_text()
     url = found[1].decode()
@@ -116,10 +105,7 @@ def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Pa
 
 
 def shows_table_2(path: Path) -> bool:
-    with (
-        suppress(ValueError, RuntimeError, OSError, KeyError, IndexError),
-        warnings.catch_warnings(),
-    ):
+    with suppress(ValueError, RuntimeError, OSError, KeyError, IndexError), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the file is still being written
         shown = lanes(path, "/rc/**")
         return {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS} == TABLE2

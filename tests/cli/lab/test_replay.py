@@ -9,14 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.tools import Terminal, zscout, zscout_here
-from tests.services.recorder.paper_run import (
-    RCS,
-    TABLE1,
-    TABLE2,
-    events,
-    lanes,
-    second_by_second,
-)
+from tests.services.recorder.paper_run import RCS, TABLE1, TABLE2, events, lanes, second_by_second
 
 JSON = (
     '{"strategy": "priority", "holds": ['
@@ -149,27 +142,15 @@ def test_sharable_rcs_have_a_row_for_each_holder_and_times_that_are_not_whole_a_
     ]
 
 
-def test_a_long_schedule_has_a_column_for_each_interval(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arc = (
-        '[[arc]]\nname = "{name}"\nat = {at}\npriority = 1\nmin_runtime = 3600\n'
-        'needs = {{"robot/a" = {{}}}}\n'
-    )
+def test_a_long_schedule_has_a_column_for_each_interval(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arc = '[[arc]]\nname = "{name}"\nat = {at}\npriority = 1\nmin_runtime = 3600\nneeds = {{"robot/a" = {{}}}}\n'
     file = tmp_path / "long.toml"
-    file.write_text(
-        '[[rc]]\nname = "robot/a"\n' + arc.format(name="x1", at=0) + arc.format(name="y2", at=7200)
-    )
+    file.write_text('[[rc]]\nname = "robot/a"\n' + arc.format(name="x1", at=0) + arc.format(name="y2", at=7200))
     assert zscout_here("replay", file) == 0
-    assert cells(capsys.readouterr().out) == [
-        ["seconds", "0", "3600", "7200"],
-        ["robot/a", "x1", "-", "y2"],
-    ]
+    assert cells(capsys.readouterr().out) == [["seconds", "0", "3600", "7200"], ["robot/a", "x1", "-", "y2"]]
 
 
-def test_a_schedule_without_end_is_cut_in_the_table_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_schedule_without_end_is_cut_in_the_table_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arc = '[[arc]]\nname = "a{n}"\nat = {n}\npriority = 1\nmin_runtime = 0.5\n[arc.needs]\n"robot/a" = {{}}\n'
     file = tmp_path / "many.toml"
     file.write_text('[[rc]]\nname = "robot/a"\n' + "".join(arc.format(n=n) for n in range(600)))
@@ -201,10 +182,7 @@ def test_the_other_strategies_serve_table_1_as_the_paper_does(
 
 @pytest.mark.parametrize(
     ("args", "words"),
-    [
-        (["--rrd", "picture.png"], "end it in .rrd"),
-        (["--rrd", "no/such/folder/x.rrd"], "can't write the recording"),
-    ],
+    [(["--rrd", "picture.png"], "end it in .rrd"), (["--rrd", "no/such/folder/x.rrd"], "can't write the recording")],
 )
 def test_what_can_t_be_done_is_one_line_and_code_2(
     table1: Path, args: list[str], words: str, capsys: pytest.CaptureFixture[str]
@@ -220,10 +198,7 @@ def test_what_can_t_be_done_is_one_line_and_code_2(
     [
         ("[[rc", "line 1"),
         ('[[arc]]\nname = "a"\nat = -1\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}', "arc[0].at"),
-        (
-            '[[arc]]\nname = "a"\nat = nan\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}',
-            "arc[0].at",
-        ),
+        ('[[arc]]\nname = "a"\nat = nan\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}', "arc[0].at"),
         ('[[arc]]\nname = "a"\nat = 0\npriority = 1\nmin_runtime = 1\n[arc.needs]', "at least one RC"),
     ],
 )

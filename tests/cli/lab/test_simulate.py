@@ -53,9 +53,7 @@ def closet(tmp_path: Path) -> Path:
 
 
 @contextmanager
-def simulating(
-    *args: object, env: dict[str, str] | None = None
-) -> Iterator[tuple[subprocess.Popen[str], Any]]:
+def simulating(*args: object, env: dict[str, str] | None = None) -> Iterator[tuple[subprocess.Popen[str], Any]]:
     """A building in the background, and what it told of itself."""
     process = subprocess.Popen(
         [*COMMAND, *(["simulate", *map(str, args), "--json"])], stdout=subprocess.PIPE, text=True, env=env
@@ -71,20 +69,7 @@ def simulating(
 
 def test_it_serves_what_it_tells_and_leaves_nothing_behind(closet: Path, tmp_path: Path) -> None:
     link, file = tmp_path / "radio0", tmp_path / "lab.toml"
-    how = (
-        "--radio",
-        link,
-        "--node",
-        file,
-        "--speed",
-        2,
-        "--baud",
-        1200,
-        "--channels",
-        2,
-        "--framegrabbers",
-        3,
-    )
+    how = ("--radio", link, "--node", file, "--speed", 2, "--baud", 1200, "--channels", 2, "--framegrabbers", 3)
     with simulating(closet, *how) as (process, told):
         assert told["radio"] == {"port": str(link), "baud": 2400}
         assert [robot["id"] for robot in told["robots"]] == [33, 35]

@@ -50,9 +50,7 @@ def test_the_same_seeds_give_the_same_bytes_on_any_number_of_processors() -> Non
     for family in told["families"]:
         assert [one["strategy"] for one in family["strategies"]] == list(STRATEGIES)
         assert 0 < family["degenerate"]["behind"] < family["degenerate"]["situations"]
-        assert all(
-            one["decision_us"]["p99"] >= one["decision_us"]["median"] > 0 for one in family["strategies"]
-        )
+        assert all(one["decision_us"]["p99"] >= one["decision_us"]["median"] > 0 for one in family["strategies"])
 
 
 def test_in_a_pipe_it_prints_plain_tables(capsys: pytest.CaptureFixture[str]) -> None:
@@ -108,11 +106,7 @@ def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 def study(*options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [*COMMAND, *LONG, *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
+        [*COMMAND, *LONG, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
 
 
@@ -173,17 +167,12 @@ def test_a_process_that_dies_is_one_line() -> None:
         max(children, key=lambda child: child.cpu_times().user).kill()
         out, err = process.communicate(timeout=HANG)
         assert (process.returncode, out) == (Failed.exit_code, "")
-        assert (
-            err
-            == "zscout: a process of the study died, perhaps for want of memory; use fewer with --jobs 1\n"
-        )
+        assert err == "zscout: a process of the study died, perhaps for want of memory; use fewer with --jobs 1\n"
 
 
 def test_processes_that_can_not_start_are_one_line() -> None:
     few = ("sh", "-c", 'ulimit -n 40; exec "$@"', "sh")
-    done = subprocess.run(
-        [*few, *COMMAND, *LONG, "--jobs", "200"], capture_output=True, text=True, timeout=HANG
-    )
+    done = subprocess.run([*few, *COMMAND, *LONG, "--jobs", "200"], capture_output=True, text=True, timeout=HANG)
     assert (done.returncode, done.stdout) == (Failed.exit_code, "")
     line = "zscout: a process can't be started (Too many open files); use fewer with --jobs 1\n"
     assert done.stderr == line
@@ -250,9 +239,7 @@ def changes(path: Path) -> Iterator[tuple[str, float]]:
         (["replacement"], "No such command 'replacement'"),
     ],
 )
-def test_bad_input_is_one_line_and_code_2(
-    args: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_line_and_code_2(args: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here("study", *args) == 2
     out, line = capsys.readouterr()
     assert out == ""

@@ -72,9 +72,7 @@ def test_the_help_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
         (["--rrd", "no/such/folder/x.rrd"], "it can't be written"),
     ],
 )
-def test_bad_input_is_one_line_and_code_2(
-    args: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_line_and_code_2(args: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here("study", "placement", *args) == 2
     out, line = capsys.readouterr()
     assert out == ""

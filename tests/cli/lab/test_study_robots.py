@@ -95,9 +95,7 @@ def test_the_help_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
         (["--svg", "no/such/folder"], "does not exist"),
     ],
 )
-def test_bad_input_is_one_line_and_code_2(
-    args: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_line_and_code_2(args: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here("study", "robots", *args) == 2
     out, line = capsys.readouterr()
     assert out == ""

@@ -19,16 +19,7 @@ from tests.hang import HANG
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.teleop import Pilot, Teleop
-from zscout.cli.operator.drive import (
-    AXIS,
-    BUTTON,
-    FULL,
-    INITIAL,
-    PAD_EVENT,
-    Hands,
-    _Console,
-    game_pad,
-)
+from zscout.cli.operator.drive import AXIS, BUTTON, FULL, INITIAL, PAD_EVENT, Hands, _Console, game_pad
 from zscout.config.strict import BadInput
 from zscout.mesh import clock
 from zscout.terminal import MAX_TYPED, keys_in, typed_keys

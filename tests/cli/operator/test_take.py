@@ -64,9 +64,7 @@ def test_without_a_terminal_it_needs_yes(fleet: CliFleet) -> None:
     assert survey.wait(HANG) == 1
 
 
-def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(
-    fleet: CliFleet, tmp_path: Path
-) -> None:
+def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(fleet: CliFleet, tmp_path: Path) -> None:
     survey = fleet.holder("survey", "robot/a")
     out = tmp_path / "events.json"
     # A shell at the terminal, as people have it: the JSON goes into a file.
@@ -93,9 +91,7 @@ def test_what_is_free_is_taken_without_a_question(fleet: CliFleet) -> None:
 def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
     sharer = fleet.holder("sharer", "radio/rf0:rate=4")
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
-    done = fleet.zscout(
-        "take", "radio/rf0:rate=4", "robot/b", "robot/x", "--yes", "--timeout", "0.2", "--json"
-    )
+    done = fleet.zscout("take", "radio/rf0:rate=4", "robot/b", "robot/x", "--yes", "--timeout", "0.2", "--json")
     preview = events(done.stdout)[0]
     assert preview["preempts"] == []
     assert [hold["arc"] for hold in preview["may_preempt"]] == ["sharer"]

@@ -61,9 +61,7 @@ def test_a_file_is_told_event_by_event(video: Path, capsys: pytest.CaptureFixtur
     assert told.err.startswith("9.9 s watched, 100 pictures; 1 event, motion for ")
 
 
-def test_in_a_pipe_it_is_plain_lines_and_the_limit_ends_it(
-    video: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_in_a_pipe_it_is_plain_lines_and_the_limit_ends_it(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here("watch", "--source", video, "--limit", 6) == 0
     event, summary = capsys.readouterr().out.splitlines()
     assert "motion and goes on, one thing at the peak, the largest " in event
@@ -94,11 +92,7 @@ def test_a_recording_has_pictures_boxes_and_events(video: Path, tmp_path: Path) 
     ],
 )
 def test_a_source_that_gives_nothing_is_one_line_and_exit_code_2(
-    source: str,
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    source: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("notes.txt").write_text("no video\n" * 50)
@@ -139,14 +133,9 @@ def camera() -> Iterator[MjpegServer]:
         yield server
 
 
-def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary(
-    camera: MjpegServer,
-) -> None:
+def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary(camera: MjpegServer) -> None:
     process = subprocess.Popen(
-        [*COMMAND, "watch", "--source", camera.url, "--json"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+        [*COMMAND, "watch", "--source", camera.url, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
     assert process.stderr is not None

@@ -21,9 +21,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
 
 
 def test_release_ends_a_hold_and_its_command(fleet: CliFleet) -> None:
-    running = fleet.start(
-        "request", "robot/a", "--name", "survey", "--", "sh", "-c", "echo on; exec sleep 1000"
-    )
+    running = fleet.start("request", "robot/a", "--name", "survey", "--", "sh", "-c", "echo on; exec sleep 1000")
     read_until(running, "on")
     done = fleet.zscout("release", "survey")
     assert done.returncode == 0, done.stderr

@@ -69,9 +69,7 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     assert {rc["rc"]: rc["holders"][0]["arc"] for rc in queued["rcs"] if rc["holders"]} == held
     shown = fleet.zscout("status").stdout
     assert re.search(rf"^{F2} +exclusive +held +anvil +second$", shown, re.MULTILINE)
-    assert re.search(
-        r"^1 +next +0 .* no framegrabber/\* is to be had: needs framegrabber/", shown, re.MULTILINE
-    )
+    assert re.search(r"^1 +next +0 .* no framegrabber/\* is to be had: needs framegrabber/", shown, re.MULTILINE)
 
     end(second)
     granted, ended = events(out_of(waiting).read())
@@ -115,9 +113,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     for process, name in zip(waiting, ("next", "quiet"), strict=True):
         read_until(process, f"{name} waits")
     text = fleet.zscout("why", "next").stdout
-    assert re.search(
-        rf"^  framegrabber/\*: {F1} held by first of .*, priority 0, for .* left$", text, re.MULTILINE
-    )
+    assert re.search(rf"^  framegrabber/\*: {F1} held by first of .*, priority 0, for .* left$", text, re.MULTILINE)
     assert re.search(rf"^  framegrabber/\*: {F2} held by second of ", text, re.MULTILINE)
     assert "\n  robot/a: no other ARC holds it\n" in text
     assert "\n  video/*: not on the mesh\n" in text
@@ -132,9 +128,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     assert [holder["rc"] for holder in told["needs"][0]["holders"]] == [F1, F2]
 
     shared = fleet.zscout("why", "quiet").stdout
-    assert re.search(
-        r"^  radio/\* \(rate=5\): radio/rf0 shared with loud \(rate=8\) of ", shared, re.MULTILINE
-    )
+    assert re.search(r"^  radio/\* \(rate=5\): radio/rf0 shared with loud \(rate=8\) of ", shared, re.MULTILINE)
     assert "\n  robot/*: no ARC holds robot/a\n" in shared
     holds = fleet.zscout("why", "second").stdout
     assert f"\nHolds\n  {F2} for {ANY}: no other ARC holds it\n" in holds
@@ -175,10 +169,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
 @pytest.mark.parametrize(
     ("args", "line"),
     [
-        (
-            ("request", "framegrabber/**"),
-            "need \"framegrabber/**\": need 'framegrabber/**' is not valid: write",
-        ),
+        (("request", "framegrabber/**"), "need \"framegrabber/**\": need 'framegrabber/**' is not valid: write"),
         (("request", "framegrabber/f*"), "write kind/name with * for a whole name or $* for a part of one"),
         (("take", "framegrabber/*#0"), "#2, #3 and so on behind it for a second and third"),
         (("request", "radio/*:rate=1", "radio/*:rate=2"), "have different parameters; give all the same"),
@@ -205,9 +196,7 @@ def test_the_help_says_how_to_quote(capsys: pytest.CaptureFixture[str]) -> None:
 # What is made of the RCM's state
 
 
-def state(
-    rcs: dict[str, str], *, absent: tuple[str, ...] = (), priority: dict[str, int] | None = None
-) -> RcmState:
+def state(rcs: dict[str, str], *, absent: tuple[str, ...] = (), priority: dict[str, int] | None = None) -> RcmState:
     """A state with these RCs and the ARC that holds each (empty: nobody)."""
     views = [RcView(rc, rc not in absent, rc.startswith("radio")) for rc in sorted(rcs)]
     holds = [

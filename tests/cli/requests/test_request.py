@@ -33,12 +33,8 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
 
 
 def test_a_command_gets_its_grant_and_gives_its_exit_code(fleet: CliFleet) -> None:
-    script = (
-        'echo "$ZSCOUT_ARC|$ZSCOUT_RCS|$ZSCOUT_GRANT|$ZSCOUT_CLIENT|$ZSCOUT_REMAINING|$ZSCOUT_FLEET"; exit 7'
-    )
-    done = fleet.zscout(
-        "request", "robot/a", "radio/rf0:rate=2.5", "--name", "survey", "--", "sh", "-c", script
-    )
+    script = 'echo "$ZSCOUT_ARC|$ZSCOUT_RCS|$ZSCOUT_GRANT|$ZSCOUT_CLIENT|$ZSCOUT_REMAINING|$ZSCOUT_FLEET"; exit 7'
+    done = fleet.zscout("request", "robot/a", "radio/rf0:rate=2.5", "--name", "survey", "--", "sh", "-c", script)
     assert done.returncode == 7, done.stderr
     arc, rcs, grant, client, remaining, file = done.stdout.strip().split("|")
     assert (arc, rcs, file) == ("survey", "radio/rf0 robot/a", str(fleet.lab.fleet_file))

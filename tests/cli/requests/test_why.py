@@ -21,9 +21,7 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             lab.node("anvil", "robot/a", "robot/b", "radio/rf0:rate=10")
             client, other = await lab.client("program"), await lab.client("other")
             await lab.ready(client, "robot/a", "robot/b", "radio/rf0")
-            survey = await client.request(
-                "survey", {"robot/a": {}, "radio/rf0": {"rate": 4}}, min_runtime=600
-            )
+            survey = await client.request("survey", {"robot/a": {}, "radio/rf0": {"rate": 4}}, min_runtime=600)
             await other.request("mapping", {"radio/rf0": {"rate": 5}}, min_runtime=600, keep=True)
             await other.request("take", {"robot/a": {}}, priority=10, min_runtime=600)
             await other.request("late", {"robot/b": {}, "robot/nowhere": {}}, min_runtime=30)
@@ -32,24 +30,17 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             plain = await zscout_soon("why", "survey", env=lab.env)
             assert (plain.returncode, plain.stderr) == (0, "")
             lines = plain.stdout.splitlines()
-            assert lines[0].startswith(
-                f"survey (id {survey.id}, of test/program, priority 0) has waited for "
-            )
+            assert lines[0].startswith(f"survey (id {survey.id}, of test/program, priority 0) has waited for ")
             assert "held by take, priority 10" in lines[1]
             assert lines[2].endswith("in the queue of 2; it wants 10 min")
             assert re.fullmatch(r"  it may start in (10 min|9 min 5\d s), if nothing else comes", lines[3])
             assert lines[4:6] == ["  it was preempted once", "Needs"]
-            assert lines[6].startswith(
-                "  radio/rf0 (rate=4): shared with mapping (rate=5) of test/other, priority 0,"
-            )
+            assert lines[6].startswith("  radio/rf0 (rate=4): shared with mapping (rate=5) of test/other, priority 0,")
             assert lines[6].endswith(" left at least")
             assert lines[7].startswith("  robot/a: held by take of test/other, priority 10, for ")
             assert lines[8] == "Story"
             told = [line.split(" ago  ", 1)[1] for line in lines[9:]]
-            assert told[:2] == [
-                "asked for radio/rf0, robot/a at priority 0",
-                "granted radio/rf0, robot/a",
-            ]
+            assert told[:2] == ["asked for radio/rf0, robot/a at priority 0", "granted radio/rf0, robot/a"]
             assert told[2].startswith("preempted: preempted by take")
             assert told[3].startswith("waits: ")
 

@@ -17,9 +17,7 @@ LAMP: Final = Light(name="lamp", x=2.0, y=1.5)
 QUIET: Final = Noise(sensor=0, analog=0, flicker=0, daylight=0)
 SOFA: Final = Furniture(name="sofa", kind="sofa", x=2.0, y=2.55, width=1.6, depth=0.85, height=0.8)
 TABLE: Final = Furniture(name="table", kind="table", x=0.8, y=1.2, width=1.0, depth=0.8, height=0.74)
-CARTON: Final = Furniture(
-    name="carton", kind="solid", x=3.2, y=0.8, width=0.5, depth=0.4, height=0.4, shade=0.03
-)
+CARTON: Final = Furniture(name="carton", kind="solid", x=3.2, y=0.8, width=0.5, depth=0.4, height=0.4, shade=0.03)
 
 
 def room(

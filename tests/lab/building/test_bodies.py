@@ -7,21 +7,8 @@ import pytest
 from msgspec.structs import replace
 
 from tests.lab.building.rooms import room
-from zscout.drivers.packets import (
-    CameraPacket,
-    DrivePacket,
-    HaltPacket,
-    Packet,
-    StopPacket,
-)
-from zscout.lab.building.bodies import (
-    LAG,
-    TOP_SPEED,
-    WARM_UP,
-    WHEEL_BASE,
-    Body,
-    Pose,
-)
+from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet, StopPacket
+from zscout.lab.building.bodies import LAG, TOP_SPEED, WARM_UP, WHEEL_BASE, Body, Pose
 from zscout.lab.building.plan import Robot
 from zscout.lab.building.world import World
 

@@ -7,15 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.lab.building.rooms import (
-    CARTON,
-    LAMP,
-    SOFA,
-    TABLE,
-    column_at,
-    room,
-    shipped,
-)
+from tests.lab.building.rooms import CARTON, LAMP, SOFA, TABLE, column_at, room, shipped
 from zscout.lab.building.casting import (
     EYE,
     FIRST_BOX,
@@ -28,19 +20,8 @@ from zscout.lab.building.casting import (
     Cylinder,
     columns_of,
 )
-from zscout.lab.building.plan import (
-    Furniture,
-    Light,
-    Noise,
-    Plan,
-)
-from zscout.lab.building.sensor import (
-    GAMMA,
-    MOST_GAIN,
-    SETTLES,
-    TARGET,
-    Sensor,
-)
+from zscout.lab.building.plan import Furniture, Light, Noise, Plan
+from zscout.lab.building.sensor import GAMMA, MOST_GAIN, SETTLES, TARGET, Sensor
 from zscout.lab.building.solids import Floats, cuboids_of
 from zscout.lab.building.world import World
 
@@ -130,15 +111,7 @@ def test_under_a_sofa_there_is_a_dark_gap() -> None:
 
 def test_what_is_above_shows_its_dark_underside() -> None:
     canopy = Furniture(
-        name="canopy",
-        kind="raised",
-        x=3.0,
-        y=1.5,
-        width=2.0,
-        depth=1.6,
-        height=1.2,
-        turn=-1.5708,
-        clearance=0.3,
+        name="canopy", kind="raised", x=3.0, y=1.5, width=2.0, depth=1.6, height=1.2, turn=-1.5708, clearance=0.3
     )
     world = World(room(canopy, lights=(Light(name="lamp", x=0.8, y=1.5),)))
     camera = world._camera

@@ -11,15 +11,7 @@ from tests.lab.building.rooms import room, shipped
 from zscout.config.strict import Where
 from zscout.lab.building import drawn
 from zscout.lab.building.bodies import RADIUS
-from zscout.lab.building.drawn import (
-    DOOR,
-    HIDE_AREA,
-    HIDES,
-    STRIDE,
-    drawn_plan,
-    hiding_places,
-    with_robots,
-)
+from zscout.lab.building.drawn import DOOR, HIDE_AREA, HIDES, STRIDE, drawn_plan, hiding_places, with_robots
 from zscout.lab.building.plan import Plan
 from zscout.lab.building.plan_file import check_plan, check_starts
 from zscout.lab.building.solids import Cuboids, cuboids_of, parts

@@ -8,22 +8,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from tests.lab.building.rooms import (
-    CARTON,
-    SOFA,
-    TABLE,
-    room,
-    shipped,
-)
+from tests.lab.building.rooms import CARTON, SOFA, TABLE, room, shipped
 from zscout.lab.building.bodies import RADIUS
 from zscout.lab.building.light import hidden, light_of
-from zscout.lab.building.plan import (
-    Furniture,
-    Light,
-    Noise,
-    Rug,
-    Wall,
-)
+from zscout.lab.building.plan import Furniture, Light, Noise, Rug, Wall
 from zscout.lab.building.solids import Cuboid, as_arrays
 from zscout.lab.building.world import World
 

@@ -11,9 +11,7 @@ from msgspec.structs import replace
 from zscout.lab.building.people import FOOT, STRIDE, Walker
 from zscout.lab.building.plan import Person
 
-ADA = Person(
-    name="ada", path=((0.0, 1.0), (2.0, 1.0), (2.0, 3.0)), speed=2.0, first=10.0, every=5.0, jitter=0.0
-)
+ADA = Person(name="ada", path=((0.0, 1.0), (2.0, 1.0), (2.0, 3.0)), speed=2.0, first=10.0, every=5.0, jitter=0.0)
 
 
 def walker(person: Person, seed: int = 0) -> Walker:

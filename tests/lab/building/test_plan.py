@@ -89,27 +89,19 @@ BAD = {
         'furniture[0].kind (couch): is the text "couch"; '
         'write "bed", "chair", "desk", "raised", "shelf", "sofa", "solid" or "table"'
     ),
-    ("y = 2.4", "y = 3.4"): (
-        "furniture[0] (couch): (1.2, 3.4) is outside; write x from 0 to 4, y from 0 to 3"
-    ),
-    ("height = 0.75", "height = 2.6"): (
-        "furniture[0].height (couch): is 2.6 m; write at most 2.5, the room's"
-    ),
+    ("y = 2.4", "y = 3.4"): ("furniture[0] (couch): (1.2, 3.4) is outside; write x from 0 to 4, y from 0 to 3"),
+    ("height = 0.75", "height = 2.6"): ("furniture[0].height (couch): is 2.6 m; write at most 2.5, the room's"),
     ("height = 0.75", "height = 0.13"): (
         "furniture[0].clearance (couch): is 0.12 m; write at most 0.11, below the height"
     ),
     ("height = 0.74", "height = 0.74\nleg = 0.301"): (
         "furniture[1].leg (desk): is 0.301; write a number from 0.02 to 0.3"
     ),
-    ("width = 1.0\n", "width = 0.05\n"): (
-        "furniture[1].leg (desk): is 0.05 m; write at most 0.025, half of the piece"
-    ),
+    ("width = 1.0\n", "width = 0.05\n"): ("furniture[1].leg (desk): is 0.05 m; write at most 0.025, half of the piece"),
     ('name = "desk"', 'name = "couch"'): (
         'furniture[1].name: "couch" stands at furniture[0] already; rename or remove one of the two'
     ),
-    ("x = 0.0\n", "x = 0.5\n"): (
-        "light[1] (window): is a window in no outer wall; put its x or y on an outer wall"
-    ),
+    ("x = 0.0\n", "x = 0.5\n"): ("light[1] (window): is a window in no outer wall; put its x or y on an outer wall"),
     ("z = 1.5", "z = 0.4"): (
         "light[1].z (window): is 0.4 m, so the window leaves its wall; "
         "give the height of its middle, half its depth or more from floor and ceiling"
@@ -123,28 +115,20 @@ BAD = {
     ("[3.0, 1.0]]", "[5.5, 1.0]]"): (
         "person[0].path[1] (ada): (5.5, 1) is outside; write x from -1 to 5, y from -1 to 4"
     ),
-    ("[3.0, 1.0]]", "[-0.45, 1.0]]"): (
-        "person[0].path (ada): leads nowhere; move one of its points by 0.1 m or more"
-    ),
+    ("[3.0, 1.0]]", "[-0.45, 1.0]]"): ("person[0].path (ada): leads nowhere; move one of its points by 0.1 m or more"),
     ("[3.0, 1.0]]", "[1, 2, 3]]"): ("person[0].path[1] (ada): has 3 entries; at most 2 are allowed"),
     ("id = 33", "id = 255"): ("robot[0].id (scout33): is 255; write a whole number from 0 to 254"),
-    ("id = 33", "id = 35"): (
-        'robot[1].id (35): "35" stands at robot[0] already; rename or remove one of the two'
-    ),
+    ("id = 33", "id = 35"): ('robot[1].id (35): "35" stands at robot[0] already; rename or remove one of the two'),
     ("id = 33", "id = true"): ("robot[0].id (scout33): is true; write a whole number from 0 to 254"),
-    ('name = "ada"', 'name = "ada"\nspeed = 0'): (
-        "person[0].speed (ada): is 0; write a number from 0.1 to 3"
-    ),
+    ('name = "ada"', 'name = "ada"\nspeed = 0'): ("person[0].speed (ada): is 0; write a number from 0.1 to 3"),
     ("x = 1.0\ny = 1.0", "x = 2.6\ny = 1.62"): (
-        "robot[0] (scout33): (2.6, 1.62) is in a wall or furniture, or touches it; "
-        "leave 0.06 m around its middle"
+        "robot[0] (scout33): (2.6, 1.62) is in a wall or furniture, or touches it; leave 0.06 m around its middle"
     ),
     ("x = 1.0\ny = 1.0", "x = 2.1\ny = 1.0"): (
         "robot[1] (scout35): stands in scout33; leave 0.12 m between their middles"
     ),
     ("x = 1.0\ny = 1.0", "x = 0.05\ny = 1.0"): (
-        "robot[0] (scout33): (0.05, 1) is in a wall or furniture, or touches it; "
-        "leave 0.06 m around its middle"
+        "robot[0] (scout33): (0.05, 1) is in a wall or furniture, or touches it; leave 0.06 m around its middle"
     ),
     ("[[person]]", "[[noise]]\nsensor = 1\n\n[[person]]"): ("noise: is a list; write a table, under [noise]"),
 }
@@ -162,9 +146,7 @@ def read(folder: Path, text: str) -> str:
 
 
 @pytest.mark.parametrize(("change", "line"), BAD.items(), ids=[short(one[1]) for one in BAD])
-def test_a_bad_building_is_one_line_with_place_and_remedy(
-    change: tuple[str, str], line: str, tmp_path: Path
-) -> None:
+def test_a_bad_building_is_one_line_with_place_and_remedy(change: tuple[str, str], line: str, tmp_path: Path) -> None:
     old, new = change
     assert GOOD.count(old) == 1
     assert read(tmp_path, GOOD.replace(old, new)) == line

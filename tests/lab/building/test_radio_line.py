@@ -12,18 +12,8 @@ import serial
 
 from tests.hang import HANG
 from zscout.config.strict import BadInput
-from zscout.drivers.packets import (
-    DrivePacket,
-    Packet,
-    StopPacket,
-    encode,
-)
-from zscout.lab.building.radio_line import (
-    HOLDS,
-    SLACK,
-    Pace,
-    RadioLine,
-)
+from zscout.drivers.packets import DrivePacket, Packet, StopPacket, encode
+from zscout.lab.building.radio_line import HOLDS, SLACK, Pace, RadioLine
 
 DRIVE = DrivePacket(33, 0, 0.5, -0.5, 1.0)
 

@@ -17,23 +17,10 @@ import serial
 from tests.hang import HANG
 from tests.lab.building.test_radio_line import until
 from zscout.config.strict import BadInput
-from zscout.drivers.packets import (
-    CameraPacket,
-    DrivePacket,
-    HaltPacket,
-    Packet,
-    encode,
-)
+from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet, encode
 from zscout.lab.building.bodies import TOP_SPEED
 from zscout.lab.building.camera import Picture
-from zscout.lab.building.plan import (
-    Furniture,
-    Light,
-    Noise,
-    Person,
-    Plan,
-    Robot,
-)
+from zscout.lab.building.plan import Furniture, Light, Noise, Person, Plan, Robot
 from zscout.lab.building.serve import Served
 from zscout.lab.building.view import building_plan
 
@@ -205,13 +192,7 @@ def test_who_is_where_and_what_the_building_looks_like() -> None:
     cave = Furniture("bed", "bed", 0.6, 1.0, 1.2, 1.6, 0.5, clearance=0.1)
     robots = (PLAN.robots[0], Robot("scout35", 35, 2.0, 0.5))
     plan = Plan(
-        name="bedroom",
-        width=2.4,
-        depth=2.0,
-        furniture=(cave,),
-        lights=PLAN.lights,
-        people=(walker,),
-        robots=robots,
+        name="bedroom", width=2.4, depth=2.0, furniture=(cave,), lights=PLAN.lights, people=(walker,), robots=robots
     )
 
     async def script(served: Served) -> None:

@@ -8,25 +8,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from tests.lab.building.rooms import (
-    QUIET,
-    SOFA,
-    room,
-    shipped,
-)
+from tests.lab.building.rooms import QUIET, SOFA, room, shipped
 from tests.thorough import times
 from zscout.drivers.packets import DrivePacket
 from zscout.lab.building.bodies import RADIUS, TOP_SPEED, Pose
 from zscout.lab.building.collisions import SLACK
 from zscout.lab.building.drawn import drawn_plan
 from zscout.lab.building.people import FOOT
-from zscout.lab.building.plan import (
-    ROBOT_HEIGHT,
-    Furniture,
-    Person,
-    Plan,
-    Wall,
-)
+from zscout.lab.building.plan import ROBOT_HEIGHT, Furniture, Person, Plan, Wall
 from zscout.lab.building.world import MAX_STEP, World
 
 

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zscout.lab.building.world_clock import (
-    MAX_BEHIND,
-    STEP,
-    FramePace,
-    WorldClock,
-)
+from zscout.lab.building.world_clock import MAX_BEHIND, STEP, FramePace, WorldClock
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 7.0])

@@ -210,9 +210,7 @@ def test_the_same_seed_makes_the_same_run() -> None:
             meshes = [network.open("test", Sender(f"h{number}", "test")) for number in range(6)]
 
             def listen(mesh: MemoryMesh) -> None:
-                mesh.subscribe(
-                    NEWS, Ping, lambda _, ping: events.append((mesh.now(), mesh.me.host, ping.number))
-                )
+                mesh.subscribe(NEWS, Ping, lambda _, ping: events.append((mesh.now(), mesh.me.host, ping.number)))
 
             for mesh in meshes:
                 listen(mesh)

@@ -9,26 +9,9 @@ import pytest
 from tests.thorough import times
 from zscout.lab.study.placement.scenarios import NET_SIZE, NETS, STAGGER
 from zscout.lab.study.placement.simulation import Machine, SimulatedJob, simulate
-from zscout.lab.study.placement.study import (
-    BASELINE,
-    BATCHES,
-    batch,
-    figure,
-    learn,
-)
-from zscout.placement.model import (
-    CHOICES,
-    ENOUGH,
-    MetricLearner,
-    Observation,
-    spearman,
-)
-from zscout.types import (
-    POLICIES,
-    SECOND,
-    Metric,
-    Policy,
-)
+from zscout.lab.study.placement.study import BASELINE, BATCHES, batch, figure, learn
+from zscout.placement.model import CHOICES, ENOUGH, MetricLearner, Observation, spearman
+from zscout.types import POLICIES, SECOND, Metric, Policy
 
 SEEDS = range(100)
 PLACED_BY = 2 * SECOND
@@ -64,9 +47,7 @@ def test_staggered_every_policy_uses_all_hosts(policy: Policy) -> None:
 
 
 def test_pending_brings_the_load_curves_together() -> None:
-    apart = {
-        policy: sum(figure("simultaneous", policy, seed).apart() for seed in range(4)) for policy in POLICIES
-    }
+    apart = {policy: sum(figure("simultaneous", policy, seed).apart() for seed in range(4)) for policy in POLICIES}
     assert apart["pending"] < apart["two_choices"] < apart["randomized"] < apart["least_loaded"]
 
 
@@ -105,10 +86,7 @@ def test_auto_finds_the_metric_that_foretells(decides: str, right: set[Metric]) 
 def test_auto_says_which_metric_it_believes_and_why() -> None:
     learner = MetricLearner()
     for number in range(ENOUGH):
-        assert learner.judge() == (
-            "composite",
-            f"the default: {number} placements seen, {ENOUGH} tell enough",
-        )
+        assert learner.judge() == ("composite", f"the default: {number} placements seen, {ENOUGH} tell enough")
         scores = {metric: float(number if metric == "available_memory" else -number) for metric in CHOICES}
         learner.add(Observation(scores, number / 10))
     metric, why = learner.judge()

@@ -61,9 +61,7 @@ def test_bad_input_stays_bad_input() -> None:
         collected(refused, ["a.toml"], 1)
 
 
-@pytest.mark.parametrize(
-    ("work", "job"), [(os._exit, 3), (killed_in_the_middle_of_its_answer, 1_000_000_000)]
-)
+@pytest.mark.parametrize(("work", "job"), [(os._exit, 3), (killed_in_the_middle_of_its_answer, 1_000_000_000)])
 def test_a_process_that_dies_ends_it(work: Callable[[int], Any], job: int) -> None:
     with pytest.raises(LabError, match="died"):
         collected(work, [job, job])

@@ -96,9 +96,7 @@ def test_runs_are_summed_up_by_what_they_had_to_work_with() -> None:
 
 def test_starts_are_summed_up_by_building() -> None:
     def start(building: str, at: float | None, *, dark: bool, facing: bool) -> RobotsTrial:
-        return RobotsTrial(
-            RobotsJob(building, 0, None), hide.HideOutcome(building, 0, at, dark, facing, 1.0, 2.0, 0.1)
-        )
+        return RobotsTrial(RobotsJob(building, 0, None), hide.HideOutcome(building, 0, at, dark, facing, 1.0, 2.0, 0.1))
 
     trials = [
         start("office", 30.0, dark=True, facing=True),

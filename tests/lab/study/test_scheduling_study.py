@@ -10,33 +10,12 @@ from random import Random
 import numpy as np
 import pytest
 
-from zscout.lab.study.scheduling.families import (
-    FAMILIES,
-    Mix,
-    at_once,
-    stream,
-)
-from zscout.lab.study.scheduling.foretell import (
-    FEWEST,
-    Condition,
-    correlations,
-    fit,
-)
-from zscout.lab.study.scheduling.measures import (
-    Curve,
-    curve,
-    measure,
-    percentile,
-)
+from zscout.lab.study.scheduling.families import FAMILIES, Mix, at_once, stream
+from zscout.lab.study.scheduling.foretell import FEWEST, Condition, correlations, fit
+from zscout.lab.study.scheduling.measures import Curve, curve, measure, percentile
 from zscout.lab.study.scheduling.situations import FEATURES, Situation
 from zscout.lab.study.scheduling.summary import Study
-from zscout.lab.study.scheduling.trial import (
-    STRATEGIES,
-    SchedulingJob,
-    SchedulingTrial,
-    play,
-    run,
-)
+from zscout.lab.study.scheduling.trial import STRATEGIES, SchedulingJob, SchedulingTrial, play, run
 from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.replay import HoldRecord, Replay, replay
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
@@ -146,8 +125,7 @@ def test_measures_of_a_schedule_worked_out_by_hand() -> None:
 
 def test_a_sharable_rc_is_in_use_once_however_many_hold_it() -> None:
     asked = Workload(
-        (WorkloadRc("x", sharable=True),),
-        (Arrival(0, request("a", "x", 4)), Arrival(0, request("b", "x", 2))),
+        (WorkloadRc("x", sharable=True),), (Arrival(0, request("a", "x", 4)), Arrival(0, request("b", "x", 2)))
     )
     found = measure(asked, replay(asked))
     assert (found.in_use, found.first, found.end) == (1.0, 1.0, 4 * SECOND)
@@ -155,13 +133,7 @@ def test_a_sharable_rc_is_in_use_once_however_many_hold_it() -> None:
 
 @pytest.mark.parametrize(
     ("values", "share", "found"),
-    [
-        ([], 0.5, 0),
-        ([7], 0.99, 7),
-        ([3, 1, 2, 4], 0.5, 2),
-        ([3, 1, 2, 4], 0.51, 3),
-        (list(range(1, 101)), 0.99, 99),
-    ],
+    [([], 0.5, 0), ([7], 0.99, 7), ([3, 1, 2, 4], 0.5, 2), ([3, 1, 2, 4], 0.51, 3), (list(range(1, 101)), 0.99, 99)],
 )
 def test_a_percentile_is_a_value_that_was_measured(values: list[float], share: float, found: float) -> None:
     assert percentile(values, share) == found
@@ -221,9 +193,7 @@ def test_the_best_is_that_of_exhaustive_search(seed: int) -> None:
 @pytest.mark.parametrize("name", ["paper", "larger", "narrow"])
 def test_where_nothing_within_reach_is_idle_nothing_is_lost(name: str) -> None:
     """With one priority and no sharable RC this is a proof; the study must not contradict it."""
-    found = [
-        one for seed in range(2) for one in run(SchedulingJob(name, seed, "priority"), steps()).situations
-    ]
+    found = [one for seed in range(2) for one in run(SchedulingJob(name, seed, "priority"), steps()).situations]
     unreached = FEATURES.index("unreached")
     assert any(one.behind for one in found)
     assert not any(one.behind for one in found if one.features[unreached] == 0)

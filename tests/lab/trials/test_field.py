@@ -15,12 +15,7 @@ from zscout.drivers.packets import MAX_PACKET
 from zscout.lab.building.plan import Person, Plan
 from zscout.lab.building.plan_file import load_plan, shipped_plans
 from zscout.lab.building.world import World
-from zscout.lab.trials.field import (
-    LATENCY,
-    Field,
-    FieldRun,
-    crewed,
-)
+from zscout.lab.trials.field import LATENCY, Field, FieldRun, crewed
 from zscout.lab.trials.field_figures import Judge, Outcomes, Watcher
 from zscout.lab.trials.watch import PIXELS
 
@@ -117,9 +112,7 @@ def test_what_must_arrive_does_and_what_is_lost_does_not(room: Plan) -> None:
     assert 10 < heard.count("drive") < 50
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"robots": 0}, {"channels": 17}, {"baud": 0}, {"loss": 1.0}, {"frame_rate": 0.0}]
-)
+@pytest.mark.parametrize("wrong", [{"robots": 0}, {"channels": 17}, {"baud": 0}, {"loss": 1.0}, {"frame_rate": 0.0}])
 def test_a_field_that_cannot_be_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="are"):
         replace(Field(), **wrong)  # type: ignore[arg-type]
@@ -162,9 +155,7 @@ def looks(text: str, *, begin: float = 10.0) -> list[Look]:
         (f"{'.' * 8}pp....!!", 1, 0, 0),
     ],
 )
-def test_crossings_and_alarms_are_counted_right(
-    text: str, crossings: int, alerted: int, false_alarms: int
-) -> None:
+def test_crossings_and_alarms_are_counted_right(text: str, crossings: int, alerted: int, false_alarms: int) -> None:
     out, watcher, doing = Outcomes(), Watcher(), ""
     for now, people, word in looks(text):
         step = Step(0, 0, 0, word, "", alert=word == "alert" and doing != "alert")

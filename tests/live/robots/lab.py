@@ -17,13 +17,7 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.tree import BehaviorContext
 from zscout.drivers.packets import DrivePacket, HaltPacket, Packet
 from zscout.lab.building.node_file import node_file
-from zscout.lab.building.plan import (
-    Furniture,
-    Light,
-    Noise,
-    Plan,
-    Robot,
-)
+from zscout.lab.building.plan import Furniture, Light, Noise, Plan, Robot
 from zscout.lab.building.serve import Served
 from zscout.mesh import clock
 from zscout.messages import BehaviorSaid
@@ -100,9 +94,7 @@ class Building(Served):
     def packets(self, kind: type[P], robot: str, *, since: int = 0) -> list[Heard]:
         """What was heard of one kind, from number `since` of all on."""
         number = self.world.bodies[robot].id
-        return [
-            one for one in self.heard[since:] if isinstance(one.packet, kind) and one.packet.robot == number
-        ]
+        return [one for one in self.heard[since:] if isinstance(one.packet, kind) and one.packet.robot == number]
 
     async def drives(self, robot: str, *, since: int = 0, **fields: float) -> Heard:
         """Waits for a drive packet, heard from number `since` on, with these fields; returns it."""
@@ -135,9 +127,7 @@ def like(heard: Iterable[Heard], **fields: float) -> list[Heard]:
 class RobotLab(Lab):
     """A lab with a building of its own in the test's process. Give it a plan, and `Served`'s arguments."""
 
-    def __init__(
-        self, folder: Path, plan: Plan = CLOSET, *, candidates: Sequence[str] = (), **how: Any
-    ) -> None:
+    def __init__(self, folder: Path, plan: Plan = CLOSET, *, candidates: Sequence[str] = (), **how: Any) -> None:
         super().__init__(folder, candidates=candidates, extra=RULES)
         self.env["PYTHONPATH"] = str(ROOT)
         self.building = Building(plan, radio_link=folder / "radio0", **how)

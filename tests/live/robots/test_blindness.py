@@ -32,25 +32,20 @@ class Placed:
     def __init__(self, lab: RobotLab, client: Client, *, speed: float | None = None) -> None:
         self.said: list[BehaviorSaid] = []
         self.behavior = PlaceRobot("scout33", RobotNeeds("robot/scout33"))
-        self.task = asyncio.create_task(
-            self.behavior.perform(lab.context(client, self.said.append, speed=speed))
-        )
+        self.task = asyncio.create_task(self.behavior.perform(lab.context(client, self.said.append, speed=speed)))
         self._building = lab.building
 
     async def says(self, doing: str, detail: str = "", *, since: int = 0) -> None:
         """Waits until it has said so, after its first `since` sayings."""
         await self._comes(
-            lambda: any(one.doing == doing and detail in one.detail for one in self.said[since:]),
-            f"{doing} {detail}",
+            lambda: any(one.doing == doing and detail in one.detail for one in self.said[since:]), f"{doing} {detail}"
         )
 
     async def drives(self, *, left: int | None = None) -> int:
         """Waits until it moves by what it sees on a channel, not the one that it `left`; returns that."""
         building = self._building
         body = building.world.bodies["scout33"]
-        await self._comes(
-            lambda: body.camera not in (None, left) and body.warmth(building.time) == 1, "a picture"
-        )
+        await self._comes(lambda: body.camera not in (None, left) and body.warmth(building.time) == 1, "a picture")
         since = len(building.heard)
         await self._comes(lambda: bool(building.packets(DrivePacket, "scout33", since=since)), "it to drive")
         assert body.camera is not None
@@ -118,9 +113,7 @@ def test_jammed_and_silent_channels_are_left_and_a_dead_robot_is_lost(tmp_path: 
             building.stall(channel)
             await placed.says("wait", f"video/ch{channel} shows nothing at all")
             await placed.drives(left=channel)
-            print(
-                f"stalled: drives on through the other channel after {(clock.now() - stalled) / SECOND:.1f} s"
-            )
+            print(f"stalled: drives on through the other channel after {(clock.now() - stalled) / SECOND:.1f} s")
             building.stall(channel, stalled=False)
             await placed.end()
 

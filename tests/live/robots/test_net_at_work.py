@@ -16,13 +16,7 @@ from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
 from zscout.behaviors.teleop import Pilot, Teleop
 from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket
-from zscout.lab.building.plan import (
-    Furniture,
-    Light,
-    Noise,
-    Plan,
-    Robot,
-)
+from zscout.lab.building.plan import Furniture, Light, Noise, Plan, Robot
 from zscout.messages import BehaviorSaid, ComponentList, ListComponents, MigrateComponent, Placement
 
 pytestmark = pytest.mark.live
@@ -34,10 +28,7 @@ DEN = Plan(
     noise=Noise(sensor=0.3, analog=0.3),
     furniture=(Furniture("sofa", "sofa", 1.3, 1.75, 1.6, 0.8, 0.7, clearance=0.12, shade=0.3),),
     lights=(Light("ceiling", 1.3, 0.7),),
-    robots=(
-        Robot("scout33", 33, 1.3, 1.6, -math.pi / 2, slip=0.0),
-        Robot("scout35", 35, 0.3, 0.3, 0.8, slip=0.0),
-    ),
+    robots=(Robot("scout33", 33, 1.3, 1.6, -math.pi / 2, slip=0.0), Robot("scout35", 35, 0.3, 0.3, 0.8, slip=0.0)),
 )
 """The first robot stands where it may stay, and has to find that out."""
 ROBOTS = ["robot/scout33", "robot/scout35"]
@@ -67,9 +58,7 @@ def test_a_net_at_work(tmp_path: Path) -> None:
             said: list[tuple[str, BehaviorSaid]] = []
             keys = client.mesh.keys
             client.mesh.subscribe(
-                keys.behavior_any,
-                BehaviorSaid,
-                lambda key, word: said.append((keys.sender_of(key).host, word)),
+                keys.behavior_any, BehaviorSaid, lambda key, word: said.append((keys.sender_of(key).host, word))
             )
             own: list[BehaviorSaid] = []
             root = PlaceSensorNetComponent({"robots": ROBOTS, "wanted": 1, "speed": SPEED}).root
@@ -116,8 +105,7 @@ def test_a_net_at_work(tmp_path: Path) -> None:
             heard, killed = len(building.heard), building.time
             building.kill("scout33")
             await comes_true(
-                lambda: playing.done() or bool(building.packets(DrivePacket, "scout35", since=heard)),
-                "the spare",
+                lambda: playing.done() or bool(building.packets(DrivePacket, "scout35", since=heard)), "the spare"
             )
             assert not playing.done()
             assert net.members[ROBOTS[0]].standing == "lost"

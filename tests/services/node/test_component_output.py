@@ -8,12 +8,7 @@ import os
 import pytest
 
 from zscout.messages import MAX_TAIL
-from zscout.services.node.component_output import (
-    BURST,
-    RATE,
-    OutputReader,
-    OutputRing,
-)
+from zscout.services.node.component_output import BURST, RATE, OutputReader, OutputRing
 
 
 def test_the_last_bytes_are_kept_with_their_places() -> None:
@@ -47,9 +42,7 @@ def test_a_character_is_told_once_it_is_whole(text: str) -> None:
     assert set(told[1:]) == {"\ufffd"}
 
 
-@pytest.mark.parametrize(
-    "raw", [b"a\xff", b"a\xff\xff\xff\xff", b"a\x80\x80\x80\x80", b"\xf8\x80\x80\x80\x80z"]
-)
+@pytest.mark.parametrize("raw", [b"a\xff", b"a\xff\xff\xff\xff", b"a\x80\x80\x80\x80", b"\xf8\x80\x80\x80\x80z"])
 def test_what_is_no_utf8_is_replaced_and_holds_nothing_up(raw: bytes) -> None:
     ring = OutputRing()
     ring.write(raw)

@@ -35,11 +35,7 @@ CORES: dict[str, tuple[str, dict[str, str], float | None]] = {
         {"cpu.max": "max 100000", "a/cpu.max": "50000 100000", "a/b/cpu.max": "200000 100000"},
         0.5,
     ),
-    "v2, its own is tighter": (
-        "0::/a/b",
-        {"a/cpu.max": "400000 100000", "a/b/cpu.max": "200000 100000"},
-        2.0,
-    ),
+    "v2, its own is tighter": ("0::/a/b", {"a/cpu.max": "400000 100000", "a/b/cpu.max": "200000 100000"}, 2.0),
     "v2, another's limit": ("0::/a", {"a/cpu.max": "max 100000", "b/cpu.max": "1000 100000"}, None),
     "v2, the way is the host's": ("0::/host/only", {"cpu.max": "100000 100000"}, 1.0),
     "v2, the way leads out": ("0::/../x", {"cpu.max": "100000 100000", "x/cpu.max": "1 100000"}, 1.0),
@@ -94,11 +90,7 @@ MEMORY: dict[str, tuple[str, dict[str, str], HostMemory | None]] = {
         },
         HostMemory(GB, 4 * GB),
     ),
-    "v2, over the limit": (
-        "0::/",
-        {"memory.max": f"{GB}", "memory.current": f"{2 * GB}"},
-        HostMemory(0, GB),
-    ),
+    "v2, over the limit": ("0::/", {"memory.max": f"{GB}", "memory.current": f"{2 * GB}"}, HostMemory(0, GB)),
     "v2, a stat that can't be": (
         "0::/",
         {"memory.max": f"{GB}", "memory.current": f"{GB}", "memory.stat": f"inactive_file {9 * GB}"},
@@ -136,9 +128,7 @@ MEMORY: dict[str, tuple[str, dict[str, str], HostMemory | None]] = {
 
 
 @pytest.mark.parametrize(("of", "files", "expected"), MEMORY.values(), ids=MEMORY)
-def test_memory_of_a_container(
-    tmp_path: Path, of: str, files: dict[str, str], expected: HostMemory | None
-) -> None:
+def test_memory_of_a_container(tmp_path: Path, of: str, files: dict[str, str], expected: HostMemory | None) -> None:
     assert group(tmp_path, of, files).memory() == expected
 
 
@@ -165,9 +155,7 @@ def test_the_time_that_the_tightest_group_used(tmp_path: Path) -> None:
 def test_a_limit_counts_where_it_is_less_than_the_host(tmp_path: Path) -> None:
     host, bound = psutil.virtual_memory(), len(os.sched_getaffinity(0))
     small = group(
-        tmp_path / "small",
-        "0::/",
-        {"cpu.max": "50000 100000", "memory.max": "1000000", "memory.current": "400000"},
+        tmp_path / "small", "0::/", {"cpu.max": "50000 100000", "memory.max": "1000000", "memory.current": "400000"}
     )
     assert host_figures.cores(small) == 0.5
     assert host_figures.memory(small) == HostMemory(600_000, 1_000_000)

@@ -47,9 +47,7 @@ def test_who_uses_more_than_the_limit_is_killed_and_it_is_known_why(waiting: sub
 
 
 @real
-def test_who_stays_below_it_is_left_alone_and_a_group_closes_on_who_is_in_it(
-    waiting: subprocess.Popen[bytes],
-) -> None:
+def test_who_stays_below_it_is_left_alone_and_a_group_closes_on_who_is_in_it(waiting: subprocess.Popen[bytes]) -> None:
     group = ControlGroups().group("test.2", memory=400 * MEGABYTE, cpu=1.5)
     try:
         group.enter(waiting.pid)
@@ -61,20 +59,14 @@ def test_who_stays_below_it_is_left_alone_and_a_group_closes_on_who_is_in_it(
         assert not group.overdrawn()
     finally:
         group.close()
-    left = [
-        *Path("/sys/fs/cgroup/cpu").glob("zscout.*test.2"),
-        *Path("/sys/fs/cgroup/memory").rglob("*test.2"),
-    ]
+    left = [*Path("/sys/fs/cgroup/cpu").glob("zscout.*test.2"), *Path("/sys/fs/cgroup/memory").rglob("*test.2")]
     assert left == []
 
 
 @real
 def test_a_process_gets_the_share_of_a_core_that_it_may_have() -> None:
     group = ControlGroups().group("test.3", memory=0, cpu=0.25)
-    code = (
-        "import time\nend = time.monotonic() + 1.5\n"
-        "while time.monotonic() < end: pass\nprint(time.process_time())"
-    )
+    code = "import time\nend = time.monotonic() + 1.5\nwhile time.monotonic() < end: pass\nprint(time.process_time())"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     try:
         group.enter(process.pid)
@@ -169,9 +161,7 @@ def test_memory_is_limited_by_the_process_itself_where_no_group_does_it() -> Non
         "try:\n    bytearray(200_000_000)\n"
         "except MemoryError:\n    print('refused')\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=HANG
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=HANG)
     assert done.stdout == "refused\n"
 
 
@@ -184,9 +174,7 @@ def test_a_family_is_killed_whatever_groups_it_is_in() -> None:
     family = [subprocess.Popen(["sleep", "60"], env=env, start_new_session=apart) for apart in (True, False)]
     other = subprocess.Popen(["sleep", "60"], env=os.environ | {"ZSCOUT_COMPONENT": "t-11"})
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=HANG
-        )
+        done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=HANG)
         assert done.stdout == "2 0\n"
         assert [process.wait(10) for process in family] == [-9, -9]
         assert other.poll() is None

@@ -21,12 +21,7 @@ from zscout import messages
 from zscout.messages import ComponentUse, LoadReport, Malformed
 from zscout.placement.balancer import Balancer
 from zscout.services.node.load_reporter import Gauge
-from zscout.services.node.process_use import (
-    PAGE,
-    TICK,
-    RunningComponent,
-    UseMeter,
-)
+from zscout.services.node.process_use import PAGE, TICK, RunningComponent, UseMeter
 
 SPIN = "while True: pass"
 PARENT = f"""
@@ -226,9 +221,7 @@ def test_a_real_tree_is_what_psutil_says(started: list[subprocess.Popen[str]]) -
 
 
 @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the system does not tell")
-def test_two_that_share_a_core_have_at_most_half_of_it(
-    started: list[subprocess.Popen[str]],
-) -> None:
+def test_two_that_share_a_core_have_at_most_half_of_it(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PAIR, core=min(os.sched_getaffinity(0)))
     meter = UseMeter(lambda: [RunningComponent("two", "spinner", 0, pid)])
     compute(pid, 0.1)
@@ -240,9 +233,7 @@ def test_two_that_share_a_core_have_at_most_half_of_it(
     assert 0 < use.served < 0.6
 
 
-def test_the_report_of_this_host_is_all_that_the_balancer_knows(
-    started: list[subprocess.Popen[str]],
-) -> None:
+def test_the_report_of_this_host_is_all_that_the_balancer_knows(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PARENT)
     gauge = Gauge("anvil", ("gpu", "arm64"), lambda: [RunningComponent("anvil/one", "spinner", 2, pid)])
     gauge.report()

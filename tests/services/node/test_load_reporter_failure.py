@@ -37,9 +37,7 @@ def test_a_reporter_that_fails_is_seen_to_and_reports_again(
             tokens.append(alive)
 
         watch = watcher.watch(watcher.keys.alive_any(Role.LOAD), on_token)
-        heard = watcher.subscribe(
-            watcher.keys.load("host"), LoadReport, lambda _key, report: reports.append(report)
-        )
+        heard = watcher.subscribe(watcher.keys.load("host"), LoadReport, lambda _key, report: reports.append(report))
         reporter = LoadReporter(mesh)
         reporter.start()
         await until(lambda: len(reports) > 1, within=60)

@@ -13,13 +13,7 @@ import pytest
 
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.services.node.test_load_reporter import (
-    PARENT,
-    Bounds,
-    Proc,
-    compute,
-    start,
-)
+from tests.services.node.test_load_reporter import PARENT, Bounds, Proc, compute, start
 from zscout.messages import LoadReport
 from zscout.services.node.load_reporter import Gauge, TreeLoad
 from zscout.services.node.process_use import PAGE, TreeMeter, faded

@@ -82,9 +82,7 @@ class FakeNode:
         report = LoadReport(self.host, next(self._numbers), 4, (load, load, load), 0.0, 10**9, 10**10, **more)
         self.mesh.put(self.mesh.keys.load(of or self.host), report)
 
-    def run(
-        self, component: str, incarnation: int, spec: ComponentSpec = JOB, phase: Phase = "running"
-    ) -> None:
+    def run(self, component: str, incarnation: int, spec: ComponentSpec = JOB, phase: Phase = "running") -> None:
         """It runs there from now on, or stands by."""
         key = component, incarnation
         self.views[key] = ComponentView(component, incarnation, self.host, spec, phase, movable=self.movable)

@@ -165,9 +165,7 @@ def test_too_many_requests_are_refused_as_busy(monkeypatch: pytest.MonkeyPatch) 
         fleet = PlacerFleet("a")
         fleet.nodes["a"].silent = True
         placer = await fleet.lead()
-        waiting = [
-            asyncio.create_task(fleet.ask(PlaceComponent(name, JOB, wait=10.0), Placement)) for name in "xy"
-        ]
+        waiting = [asyncio.create_task(fleet.ask(PlaceComponent(name, JOB, wait=10.0), Placement)) for name in "xy"]
         await asyncio.sleep(0.1)
         with pytest.raises(Refusal, match="busy"):
             await fleet.ask(PlaceComponent("z", JOB), Placement)

@@ -59,9 +59,7 @@ def test_the_next_placer_carries_on_what_was_published() -> None:
         [survivor] = fleet.nodes.values()
         survivor.report()
         heir = fleet.place(ledger.inherited())
-        await until(
-            lambda: fleet.published[-1].state == "running" and fleet.published[-1].host != placed.host
-        )
+        await until(lambda: fleet.published[-1].state == "running" and fleet.published[-1].host != placed.host)
         assert fleet.published[-1].component == "counter"
         heir.stop()
         ledger.stop()

@@ -92,9 +92,7 @@ def test_a_core_that_raises_fails_the_balancer_once(method: str, monkeypatch: py
     run(story())
 
 
-@pytest.mark.parametrize(
-    "method", ["zscout.placement.balancer.Balancer.rank", "zscout.placement.placer.Placer.handle"]
-)
+@pytest.mark.parametrize("method", ["zscout.placement.balancer.Balancer.rank", "zscout.placement.placer.Placer.handle"])
 def test_a_candidate_whose_balancer_or_placer_fails_steps_down_and_leads_again(
     method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -206,9 +206,7 @@ class FakeFleet:
         return candidate
 
     def rc(self, name: str, **how: Any) -> FakeRc:
-        rc = FakeRc(
-            self.mesh("devices", name.replace("/", "-")), name, sharable=name.startswith("radio"), **how
-        )
+        rc = FakeRc(self.mesh("devices", name.replace("/", "-")), name, sharable=name.startswith("radio"), **how)
         rc.start()
         return rc
 

@@ -6,12 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from zscout.services.rcm.election import (
-    RETRY,
-    SETTLE,
-    TURN,
-    Election,
-)
+from zscout.services.rcm.election import RETRY, SETTLE, TURN, Election
 from zscout.types import SECOND, Ns, Term
 
 SILENCE = 2 * SECOND
@@ -52,18 +47,14 @@ def failed(now: Ns) -> Sight:
         pytest.param([candidate("b")], START, START + SETTLE, id="itself is no better candidate"),
         pytest.param([candidate("a")], START, START + SETTLE + TURN, id="a better one goes first"),
         pytest.param([candidate("c")], START, START + SETTLE, id="a worse one is not waited for"),
-        pytest.param(
-            [candidate("a"), candidate("a", alive=False)], START, START + SETTLE, id="a better one left"
-        ),
+        pytest.param([candidate("a"), candidate("a", alive=False)], START, START + SETTLE, id="a better one left"),
         pytest.param(
             [candidate("a"), candidate("a"), candidate("a", alive=False)],
             START,
             START + SETTLE + TURN,
             id="one of two lives of a better one is left",
         ),
-        pytest.param(
-            [candidate("z", alive=False)], START, START + SETTLE, id="somebody unknown left: no matter"
-        ),
+        pytest.param([candidate("z", alive=False)], START, START + SETTLE, id="somebody unknown left: no matter"),
         pytest.param([came("x")], LATER, LATER + SILENCE, id="a leader: until it is silent for too long"),
         pytest.param(
             [came("x"), heard("x", LATER + SECOND)], LATER, LATER + SECOND + SILENCE, id="it goes on speaking"

@@ -65,9 +65,7 @@ def test_many_who_wait_and_who_ask_for_the_state_share_forecasts(made: list[floa
         await fleet.joined(robot)
         clients = [fleet.client(f"c{number}") for number in range(20)]
         await clients[0].ask("a0", "robot/a", seconds=1000)
-        await asyncio.gather(
-            *(client.ask("next", "robot/a", seconds=10, estimate=True) for client in clients[1:])
-        )
+        await asyncio.gather(*(client.ask("next", "robot/a", seconds=10, estimate=True) for client in clients[1:]))
         assert len(made) == 1
         for _ in range(100):
             await asyncio.gather(*(client.ask("next", "robot/a", estimate=True) for client in clients[1:]))

@@ -26,17 +26,12 @@ def granted() -> Core:
 def reports(core: Core, *, holds: bool = True) -> RcState:
     """What an RC reports that has received all that was published so far."""
     holders = holders_of(core.holders(RC), RC, NOW) if holds else []
-    return RcState(
-        rc=RC, host="d", instance="i", sharable=False, term=TERM, seq=core.seq, holders=list(holders)
-    )
+    return RcState(rc=RC, host="d", instance="i", sharable=False, term=TERM, seq=core.seq, holders=list(holders))
 
 
 def test_a_hold_that_its_rc_does_not_know_is_lost() -> None:
     core = granted()
-    assert discrepancies(reports(core, holds=False), core.holders(RC), NOW, current=True) == (
-        ("h/one/id",),
-        False,
-    )
+    assert discrepancies(reports(core, holds=False), core.holders(RC), NOW, current=True) == (("h/one/id",), False)
 
 
 def test_an_rc_that_presents_what_was_handed_over_has_not_heard_of_it_yet() -> None:

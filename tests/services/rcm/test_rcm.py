@@ -29,11 +29,7 @@ def test_a_grant_is_published_then_the_loser_is_told_then_the_asker_is_answered(
             ("operator", "answer", "drive running"),
         ]
         (preempted,) = survey.notices
-        assert (preempted.outcome, preempted.by, preempted.grant) == (
-            "preempted",
-            "desk/operator/drive",
-            first.grant,
-        )
+        assert (preempted.outcome, preempted.by, preempted.grant) == ("preempted", "desk/operator/drive", first.grant)
         # Why it waits now is told a little later.
         await until(lambda: len(survey.notices) == 2)
         assert survey.notices[1].reason == "needs robot/a (held by drive, priority 10)"
@@ -242,10 +238,7 @@ def test_a_hand_over_is_one_publication_and_can_be_repeated() -> None:
         assert grant_of(answer) > grant_of(first)
         assert len(fleet.published) == count + 1
         assert [holder.client for holder in robots[0].holders] == [new.name]
-        assert [(notice.arc, notice.state) for notice in new.notices] == [
-            ("first", "running"),
-            ("second", "queued"),
-        ]
+        assert [(notice.arc, notice.state) for notice in new.notices] == [("first", "running"), ("second", "queued")]
         assert new.notices[1].place == place
         assert {notice.arc: notice.outcome for notice in old.notices} == dict.fromkeys(
             ("first", "second"), "handed_over"

@@ -13,13 +13,7 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.model import LeadTaken, RcJoined
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rcm.recovery import RecoveredState, recover
-from zscout.types import (
-    SECOND,
-    Grant,
-    Ns,
-    Place,
-    Term,
-)
+from zscout.types import SECOND, Grant, Ns, Place, Term
 
 NOW: Ns = 1000 * SECOND
 OLD, TERM = Term(2, "aa"), Term(3, "bb")
@@ -103,13 +97,9 @@ def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
         pytest.param(BOTH, [RUNS], ["gang"], [], id="a gang that is all there"),
         pytest.param(BOTH, [], ["gang"], [], id="its client is late: the RCs' word is enough"),
         pytest.param(BOTH[:1], [RUNS], ["gang"], [], id="an RC is absent: the core ends it by name"),
-        pytest.param(
-            [BOTH[0], rc("radio/b")], [RUNS], [], ["gang"], id="an RC is there and does not hold it"
-        ),
+        pytest.param([BOTH[0], rc("radio/b")], [RUNS], [], ["gang"], id="an RC is there and does not hold it"),
         pytest.param([BOTH[0], rc("radio/b")], [], [], ["gang"], id="the same, and its client is late"),
-        pytest.param(
-            [BOTH[0], rc("radio/b", hold(seq=4))], [RUNS], [], ["gang"], id="half under an older grant"
-        ),
+        pytest.param([BOTH[0], rc("radio/b", hold(seq=4))], [RUNS], [], ["gang"], id="half under an older grant"),
         pytest.param(
             [rc("robot/a", hold(seq=1)), rc("radio/b", hold(seq=1), hold(term=OLD, seq=9))],
             [RUNS],
@@ -129,17 +119,13 @@ def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
             [],
             id="its client has given it up and wants something else, which it asks for",
         ),
-        pytest.param(
-            BOTH, [client(name="h/two")], ["gang"], [], id="another client has nothing to say about it"
-        ),
+        pytest.param(BOTH, [client(name="h/two")], ["gang"], [], id="another client has nothing to say about it"),
         pytest.param([], [client(asked(place=None))], [], [], id="never answered: it will be asked again"),
         pytest.param(
             BOTH,
             [
                 RUNS,
-                client(
-                    asked("third", place=Place(TERM, 1)), asked("second", place=Place(OLD, 9)), name="h/z"
-                ),
+                client(asked("third", place=Place(TERM, 1)), asked("second", place=Place(OLD, 9)), name="h/z"),
                 client(asked("first", place=Place(OLD, 8)), name="h/y"),
             ],
             ["gang"],
@@ -154,9 +140,7 @@ def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
             ["good"],
             id="nonsense from a client spoils nothing else",
         ),
-        pytest.param(
-            [rc("robot/a", hold(("robot/a",), runtime="NaN"))], [], [], [], id="nonsense from an RC"
-        ),
+        pytest.param([rc("robot/a", hold(("robot/a",), runtime="NaN"))], [], [], [], id="nonsense from an RC"),
         pytest.param(
             [rc("robot/a", hold(("robot/a",), client="nobody"), hold(("robot/a",), name="good"))],
             [],
@@ -224,9 +208,7 @@ ASKED = client(asked(grant=Grant(TERM, 5), needs=tuple(BOUND)))
         pytest.param([rc("robot/a", hold(THREE)), *BY_PATTERN[1:]], id="one RC knows nothing of patterns"),
     ],
 )
-def test_patterns_and_what_meets_them_are_restored(
-    states: list[RcState], clients: list[ClientRequests]
-) -> None:
+def test_patterns_and_what_meets_them_are_restored(states: list[RcState], clients: list[ClientRequests]) -> None:
     found = recover(states, clients, NOW)
     (held,) = found.holds
     rate = {"rate": Fraction(5, 2)}

@@ -54,11 +54,7 @@ def story() -> list[tuple[float, Placements]]:
     say(1260, cordoned=("basil",))
     for at, name, to, dead in ((1270, "watch-1", "crucible", 0.034), (1290, "watch-3", "anvil", 0.041)):
         say(at, placement(name, "moving", "basil", 1001, to=to, movable=True), cordoned=("basil",))
-        say(
-            at + 8,
-            placement(name, "running", to, 1002, moves=1, dead=dead, movable=True),
-            cordoned=("basil",),
-        )
+        say(at + 8, placement(name, "running", to, 1002, moves=1, dead=dead, movable=True), cordoned=("basil",))
     say(1800)
     # anvil is crowded, and one moves off by hand
     say(1900, placement("counter", "moving", "anvil", 1001, to="basil", movable=True))
@@ -116,6 +112,4 @@ def report_of(host: str, at: int, loads: dict[str, float], names: list[str]) -> 
         uses.append(ComponentUse(name, name.split("-")[0], 1, cpu * swing, round(memory * (1 + at / 36000))))
     busy = 0.2 + 0.05 * math.sin(at / 200 + ord(host[0])) + sum(one.cpu for one in uses)
     loads[host] += (busy - loads[host]) * (1 - math.exp(-REPORT_EVERY / 60))
-    return LoadReport(
-        host, at, 4, (loads[host],) * 3, min(100.0, busy * 25), 3 << 30, 4 << 30, components=tuple(uses)
-    )
+    return LoadReport(host, at, 4, (loads[host],) * 3, min(100.0, busy * 25), 3 << 30, 4 << 30, components=tuple(uses))

@@ -26,12 +26,7 @@ NET: Final = Sender("anvil", "net")
 BUILDING: Final = Sender("anvil", "living_room")
 WIDTH, DEPTH, PIXELS = 6.0, 4.5, 150
 """Metres, and pixels of each."""
-SOFA, TABLE, SHELF, BED = (
-    (0.2, 2.4, 1.1, 1.9),
-    (2.4, 1.6, 1.4, 0.9),
-    (4.9, 0.1, 1.0, 0.5),
-    (4.3, 3.2, 1.6, 1.1),
-)
+SOFA, TABLE, SHELF, BED = ((0.2, 2.4, 1.1, 1.9), (2.4, 1.6, 1.4, 0.9), (4.9, 0.1, 1.0, 0.5), (4.3, 3.2, 1.6, 1.1))
 """Furniture: left, bottom, width and depth in metres."""
 
 CAMERA = "framegrabber/fgrab1"
@@ -161,20 +156,13 @@ def wait(tracker: RobotTracker, timeline: Timeline, at: float, robot: str, why: 
     timeline.arc(at, f"{robot}-hide", "waiting", "framegrabber/* is held by scout33-hide and scout34-hide")
 
 
-def said(
-    tracker: RobotTracker, at: float, path: str, doing: str, detail: str, robot: str, **more: Any
-) -> None:
+def said(tracker: RobotTracker, at: float, path: str, doing: str, detail: str, robot: str, **more: Any) -> None:
     fields = {"path": f"place_sensor_net/{path}", "doing": doing, "detail": detail, "robot": f"robot/{robot}"}
     tracker.behavior(at, NET, told(BehaviorSaid, **fields, **more))
 
 
 def _turn(
-    tracker: RobotTracker,
-    timeline: Timeline,
-    robot: str,
-    task: str,
-    turn: Turn,
-    grants: dict[tuple[int, float], Grant],
+    tracker: RobotTracker, timeline: Timeline, robot: str, task: str, turn: Turn, grants: dict[tuple[int, float], Grant]
 ) -> list[tuple[float, Any]]:
     """What happens in one turn, by second."""
     begin, end, camera, steps = turn
@@ -193,19 +181,13 @@ def _turn(
         _free(tracker, timeline, at, arc, robot, camera)
         if (robot, end) == (OPERATOR[2], OPERATOR[0]):
             timeline.arc(at, arc, "preempted", "by drive (priority 10) on robot/scout34")
-            timeline.event(
-                at, f"{arc} is preempted by drive (priority 10) on robot/{robot}, and waits again", "WARN"
-            )
+            timeline.event(at, f"{arc} is preempted by drive (priority 10) on robot/{robot}, and waits again", "WARN")
             said(tracker, at, path, "wait", "the hold is over", robot)
         else:
             timeline.arc(at, arc, "done")
             said(tracker, at, path, "", "", robot)
 
-    return [
-        (begin, start),
-        *((begin + after, step(doing, detail)) for after, doing, detail in steps),
-        (end, stop),
-    ]
+    return [(begin, start), *((begin + after, step(doing, detail)) for after, doing, detail in steps), (end, stop)]
 
 
 def _rcs(robot: str, camera: int) -> tuple[str, ...]:
@@ -255,15 +237,11 @@ def _building(tracker: RobotTracker, at: float, tenth: int) -> None:
         held = any(begin <= at < end for begin, end, _, _ in TURNS[robot])
         held |= robot == OPERATOR[2] and OPERATOR[0] <= at < OPERATOR[1]
         hidden = at >= HIDDEN.get(robot, math.inf)
-        robots.append(
-            {"name": robot, "x": x, "y": y, "heading": heading, "camera": int(held), "hidden": hidden}
-        )
+        robots.append({"name": robot, "x": x, "y": y, "heading": heading, "camera": int(held), "hidden": hidden})
     begin, end = PERSON
     there = begin <= at < end
     people = [{"name": "walker", "x": 5.6 - 0.6 * (at - begin), "y": 1.2}] if there else []
-    tracker.floor.poses(
-        at, BUILDING, told(BuildingPoses, time=at * 2, speed=2.0, robots=robots, people=people)
-    )
+    tracker.floor.poses(at, BUILDING, told(BuildingPoses, time=at * 2, speed=2.0, robots=robots, people=people))
     if tracker.floor.wants_plan(at) is not None:
         plan = BuildingPlan("living_room", WIDTH, DEPTH, png())
         tracker.floor.plan(at, BUILDING, msgspec.json.decode(msgspec.json.encode(plan), type=BuildingPlan))
@@ -308,19 +286,13 @@ def _second(tracker: RobotTracker, timeline: Timeline, at: float) -> None:
     for robot in ROBOTS:
         figures = {"commands": 5 + math.sin(at / 5 + ord(robot[-1])), "latency_ms": 20 + 4 * math.sin(at)}
         tracker.state(
-            at,
-            told(RcState, rc=f"robot/{robot}", host="cart", instance="i", sharable=False, figures=figures),
+            at, told(RcState, rc=f"robot/{robot}", host="cart", instance="i", sharable=False, figures=figures)
         )
     if at == 50:
         tracker.state(
             at,
             told(
-                RcState,
-                rc="robot/scout36",
-                host="cart",
-                instance="i",
-                sharable=False,
-                health="radio/rf0 is not there",
+                RcState, rc="robot/scout36", host="cart", instance="i", sharable=False, health="radio/rf0 is not there"
             ),
         )
 

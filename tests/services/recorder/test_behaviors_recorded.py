@@ -23,25 +23,13 @@ def test_a_sender_s_last_word_comes_through_whatever_it_says(tmp_path: Path) -> 
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
         for number in range(1000):
-            say(
-                tracker,
-                number / 1000,
-                f"flood/{number % 3}",
-                "search",
-                Sender("bad", "one"),
-                detail=f"{number}",
-            )
+            say(tracker, number / 1000, f"flood/{number % 3}", "search", Sender("bad", "one"), detail=f"{number}")
             if number % 250 == 0:
                 say(tracker, number / 1000, "net/quiet", f"step{number}")
         for tenth in range(10, 30):
             tracker.tick(tenth / 10)
     shown = lanes(path, "/behavior/**")
-    assert [states for _, states in shown["/behavior/net/quiet"]] == [
-        ["step0"],
-        ["step250"],
-        ["step500"],
-        ["step750"],
-    ]
+    assert [states for _, states in shown["/behavior/net/quiet"]] == [["step0"], ["step250"], ["step500"], ["step750"]]
     flood = [shown[f"/behavior/flood/{number}"] for number in range(3)]
     assert {lane[-1][1][0] for lane in flood} == {f"search · {number}" for number in (997, 998, 999)}
     kept = sum(len(lane) for lane in flood)

@@ -27,9 +27,7 @@ def test_a_picture_that_is_old_says_so(tmp_path: Path) -> None:
         tracker.no_frame(0, CAMERA)
         tracker.holds[CAMERA] = {GRANT: HolderRow("hide", robots=("robot/scout33",))}
         tracker.frame(1, CAMERA, head(1), picture)
-        say(
-            tracker, 1.5, "net/a/watch", "alert", camera=CAMERA, boxes=[[1, 2, 30, 40]], robot="robot/scout33"
-        )
+        say(tracker, 1.5, "net/a/watch", "alert", camera=CAMERA, boxes=[[1, 2, 30, 40]], robot="robot/scout33")
         for at in (4, 7):
             tracker.no_frame(at, CAMERA)
         tracker.frame(8, CAMERA, head(2), picture)
@@ -53,10 +51,7 @@ def test_boxes_end_with_what_they_mark(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     picture = jpeg(0, "scout33", None)
     next_grant, box = Grant(Term(1, "rcm"), 8), [10, 10, 20, 20]
-    holds = {
-        GRANT: HolderRow("a", robots=("robot/a",)),
-        next_grant: HolderRow("b", robots=("robot/b",)),
-    }
+    holds = {GRANT: HolderRow("a", robots=("robot/a",)), next_grant: HolderRow("b", robots=("robot/b",))}
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
         tracker.holds[CAMERA] = holds
@@ -82,13 +77,7 @@ def test_what_is_no_picture_is_left_out(tmp_path: Path, monkeypatch: pytest.Monk
     good = jpeg(0, "scout33", None)
     size = good.index(b"\xff\xc0") + 5
     with Timeline("lab", path=path) as timeline:
-        for bad in (
-            b"",
-            b"\xff\xd8",
-            png(),
-            good[:size],
-            good[:size] + b"\xff\xff\xff\xff" + good[size + 4 :],
-        ):
+        for bad in (b"", b"\xff\xd8", png(), good[:size], good[:size] + b"\xff\xff\xff\xff" + good[size + 4 :]):
             timeline.robots.frame(0, "framegrabber/bad", head(1), bad)
         for number in range(4):
             timeline.robots.frame(1, f"framegrabber/cam{number}", head(1), good)
@@ -103,9 +92,7 @@ def test_what_is_no_picture_is_left_out(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @given(st.integers(1, 200), st.integers(1, 200), st.integers(1, 100), st.data())
-def test_the_head_of_a_picture_tells_its_size(
-    width: int, height: int, quality: int, data: st.DataObject
-) -> None:
+def test_the_head_of_a_picture_tells_its_size(width: int, height: int, quality: int, data: st.DataObject) -> None:
     picture = np.full((height, width, 3), 90, np.uint8)
     as_jpeg = bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
     as_png = bytes(cv2.imencode(".png", picture)[1])
@@ -115,9 +102,5 @@ def test_the_head_of_a_picture_tells_its_size(
     # Whatever is cut off or spoiled, an answer is a size or none, and no error.
     cut = data.draw(st.integers(0, len(as_jpeg) - 1))
     spoiled = as_jpeg[:cut] + data.draw(st.binary(max_size=8)) + as_jpeg[cut + 1 :]
-    for size in (
-        jpeg_size(as_jpeg[:cut]),
-        jpeg_size(spoiled),
-        png_size(as_png[: len(as_png) * cut // len(as_jpeg)]),
-    ):
+    for size in (jpeg_size(as_jpeg[:cut]), jpeg_size(spoiled), png_size(as_png[: len(as_png) * cut // len(as_jpeg)])):
         assert size is None or min(size) > 0

@@ -38,10 +38,7 @@ def test_an_hour_of_placements_at_a_glance(tmp_path: Path) -> None:
         picture = settled_picture(client, tmp_path / "picture.png")
         views = client.get_state().views
     assert [report for view in views for report in view.reports] == []
-    assert {view.name for view in views} >= {
-        "What runs on each host",
-        f"Load average (1 min) per host   {MARK_WORDS}",
-    }
+    assert {view.name for view in views} >= {"What runs on each host", f"Load average (1 min) per host   {MARK_WORDS}"}
     left = picture.crop((0, 0, round(WIDTH * PANES), HEIGHT))
     # The lanes of the six components, the first of them an ARC's colour too.
     for colour in PALETTE[:6]:
@@ -97,7 +94,5 @@ def test_the_study_s_plots_show_all_and_compare(tmp_path: Path) -> None:
     assert heights[0] > 0.85
     assert 0.25 < heights[1] < 0.5
     # Most of the 12 marks stand clear of the curves, about as many of each host.
-    stack = even.crop(
-        (even.width // 100, round(even.height * 0.57), even.width // 12, round(even.height * 0.88))
-    )
+    stack = even.crop((even.width // 100, round(even.height * 0.57), even.width // 12, round(even.height * 0.88)))
     assert all(len(pixels(stack, rgb(colour))) > 40 for colour in COLOURS[:3])

@@ -134,17 +134,12 @@ def test_what_a_late_recorder_reads_did_not_happen_now(tmp_path: Path) -> None:
         (1, "placed", "newer"),
         (3, "restarted", "counter"),
     ]
-    assert lanes(path, "/host/**") == {
-        "/host/anvil": [(1, ["newer"]), (6, [""])],
-        "/host/basil": [(2, ["counter"])],
-    }
+    assert lanes(path, "/host/**") == {"/host/anvil": [(1, ["newer"]), (6, [""])], "/host/basil": [(2, ["counter"])]}
     assert "counter (counter) runs on basil already" in events(path)
     assert "crucible is being emptied: nothing is placed there any more" in events(path)
 
 
-def test_bad_names_are_left_out_and_lanes_are_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_names_are_left_out_and_lanes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_HOSTS", 2)
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
@@ -244,9 +239,7 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
                         there.clear()
                         mesh.put(
                             mesh.keys.placements,
-                            Placements(
-                                TERM, [placement("counter", "running", "basil", 2, moves=1, dead=0.5)]
-                            ),
+                            Placements(TERM, [placement("counter", "running", "basil", 2, moves=1, dead=0.5)]),
                         )
                         await there.wait()
                     stop.set()

@@ -56,9 +56,7 @@ def test_a_minute_of_robots_at_a_glance(tmp_path: Path) -> None:
         assert len(pixels(floor, rgb(colour), 30)) > 20, f"{colour:08X}"
     # The first camera has the detector's box, the second is the operator's.
     middle = (WIDTH + left) // 2
-    one, two = (
-        picture.crop((start, CAMERAS[0], end, CAMERAS[1])) for start, end in ((left, middle), (middle, WIDTH))
-    )
+    one, two = (picture.crop((start, CAMERAS[0], end, CAMERAS[1])) for start, end in ((left, middle), (middle, WIDTH)))
     frame = pixels(one, rgb(ALERT))
     across, down = ([spot[axis] for spot in frame] for axis in (0, 1))
     assert len(frame) > 200

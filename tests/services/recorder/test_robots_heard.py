@@ -31,12 +31,7 @@ def test_how_many_pictures_a_recorder_takes_is_set_in_the_node_file(tmp_path: Pa
         assert made is not None
         return made.frames
 
-    assert [frames(""), frames("frames = 0"), frames("frames = 0.5"), frames("frames = 30")] == [
-        2,
-        0,
-        0.5,
-        30,
-    ]
+    assert [frames(""), frames("frames = 0"), frames("frames = 0.5"), frames("frames = 30")] == [2, 0, 0.5, 30]
     asked = RecorderJob(RecorderConfig(tmp_path, "127.0.0.1", 0, 0.5), default_fleet(), "here")
     assert decode_job(encode_job(asked)).recorder.frames == 0.5
     for bad, words in (("31", "write a number from 0 to 30"), ("-1", "write"), ('"2"', "write a number")):
@@ -71,9 +66,7 @@ def test_who_takes_no_pictures_does_not_look(tmp_path: Path) -> None:
                             await asyncio.sleep(0.02)
                         assert not publisher.watched
                         assert watched.empty()
-                        recorders.append(
-                            asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop))
-                        )
+                        recorders.append(asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop)))
                         assert await watched.get()
                         token.close()
                         assert not await watched.get()
@@ -113,9 +106,7 @@ def test_a_recorder_sees_what_robots_do(tmp_path: Path) -> None:
             assert blind.stdin is not None
             blind.stdin.close()
             assert await asyncio.to_thread(blind.wait, HANG) == 0
-            async with await ZenohMesh.open(
-                lab.fleet.name, Sender("here", "recorder"), lab.fleet.mesh
-            ) as ears:
+            async with await ZenohMesh.open(lab.fleet.name, Sender("here", "recorder"), lab.fleet.mesh) as ears:
                 with Timeline("lab", path=path) as timeline:
                     stop = asyncio.Event()
                     running = asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop))
@@ -125,9 +116,7 @@ def test_a_recorder_sees_what_robots_do(tmp_path: Path) -> None:
                         await looked.wait()
                         number = 0
                         # Until a plan and a picture have been shown.
-                        while number < 8 or not (
-                            timeline.robots.shown.floor and timeline.robots.shown.cameras
-                        ):
+                        while number < 8 or not (timeline.robots.shown.floor and timeline.robots.shown.cameras):
                             number += 1
                             frames.put(FrameHead(number, number / 10, 160, 120, held.grant), picture)
                             walks.put(BuildingPoses(number, robots=[Placed("scout33", 3, 2, camera=1)]))

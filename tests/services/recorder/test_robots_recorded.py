@@ -35,17 +35,12 @@ def test_a_minute_reads_as_it_was(tmp_path: Path) -> None:
     warned = [at for _, at, level in rows(path, "/events", "TextLog:level") if level == ["WARN"]]
     assert warned == [30, 35, 50]
     told_by = colours(path, "/behavior/**")
-    assert all(
-        shade == DOING[text.split(" · ")[0]] for lane in told_by.values() for text, shade in lane.items()
-    )
+    assert all(shade == DOING[text.split(" · ")[0]] for lane in told_by.values() for text, shade in lane.items())
 
     # Two pictures a second of each camera that was looked through; whom it shows is told by its holder.
     names = [(at, text) for at, text, _ in captions(path, "fgrab1")]
     assert names[:3] == [(0, "scout33 · search"), (3, "scout33 · approach"), (8, "scout33 · enter")]
-    assert [name for name in names if 14 <= name[0] <= 36][-2:] == [
-        (28, "scout33 · watch"),
-        (35, "scout33 · alert"),
-    ]
+    assert [name for name in names if 14 <= name[0] <= 36][-2:] == [(28, "scout33 · watch"), (35, "scout33 · alert")]
     assert (30, "scout34 · operator", bright(OPERATOR)) in captions(path, "fgrab2")
     blobs = list(rows(path, "/camera/fgrab1", "EncodedImage:blob"))
     assert sum(value is not None for _, _, value in blobs) == 2 * 60
@@ -69,11 +64,7 @@ def test_a_minute_reads_as_it_was(tmp_path: Path) -> None:
 
 
 def test_what_behaviors_do_has_colours_well_apart() -> None:
-    near = {
-        (one, two)
-        for one, two in combinations(DOING, 2)
-        if math.dist(lab_of(DOING[one]), lab_of(DOING[two])) < 20
-    }
+    near = {(one, two) for one, two in combinations(DOING, 2) if math.dist(lab_of(DOING[one]), lab_of(DOING[two])) < 20}
     assert not near
     floor = (HIDDEN, IN_THE_OPEN, OPERATOR, PERSON)
     assert min(math.dist(lab_of(one), lab_of(two)) for one, two in combinations(floor, 2)) > 40
@@ -87,9 +78,7 @@ def test_places_on_the_floor_are_pixels_of_its_plan(tmp_path: Path) -> None:
         tracker.floor.poses(0, BUILDING, poses([Placed("early", 1, 1)]))
         assert tracker.floor.wants_plan(0) == BUILDING
         tracker.floor.plan(0.1, BUILDING, BuildingPlan("room", 6.0, 4.5, png()))
-        tracker.floor.poses(
-            1, BUILDING, poses([Placed("a", 0, 4.5, math.pi / 2), Placed("b", 6, 0), *far[:1]], far)
-        )
+        tracker.floor.poses(1, BUILDING, poses([Placed("a", 0, 4.5, math.pi / 2), Placed("b", 6, 0), *far[:1]], far))
         # Too soon after the last, and then nothing new.
         tracker.floor.poses(1.01, BUILDING, poses([Placed("a", 3, 3)]))
         tracker.floor.poses(2, BUILDING, poses([Placed("a", 0, 4.5, math.pi / 2), Placed("b", 6, 0)], far))

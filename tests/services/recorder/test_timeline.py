@@ -227,16 +227,7 @@ def test_live_viewers_get_what_the_file_gets(tmp_path: Path) -> None:
         assert timeline.url is not None
         play_table1(timeline)
         # `--save` also listens for loggers of its own, hence the port and the bind address.
-        command: list[str | Path] = [
-            RERUN,
-            "--save",
-            copy,
-            "--bind",
-            "127.0.0.1",
-            "--port",
-            "auto",
-            timeline.url,
-        ]
+        command: list[str | Path] = [RERUN, "--save", copy, "--bind", "127.0.0.1", "--port", "auto", timeline.url]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as viewer:
             try:
                 assert becomes_equal(viewer, path, copy)
@@ -275,10 +266,7 @@ def test_a_port_that_is_taken_is_a_clear_error(tmp_path: Path) -> None:
 def test_bad_addresses_and_paths_are_clear_errors(tmp_path: Path) -> None:
     with pytest.raises(TimelineError, match=r"can't listen on 192.0.2.1, port 0 \(Cannot assign"):
         Timeline("lab", path=None, bind="192.0.2.1", port=0)
-    for path, words in (
-        (tmp_path, "Is a directory"),
-        (tmp_path / "no" / "run.rrd", "No such file or directory"),
-    ):
+    for path, words in ((tmp_path, "Is a directory"), (tmp_path / "no" / "run.rrd", "No such file or directory")):
         with pytest.raises(TimelineError) as caught:
             Timeline("lab", path=path)
         assert f"can't write the recording {path} ({words})" in str(caught.value)

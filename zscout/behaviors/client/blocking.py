@@ -76,9 +76,7 @@ class BlockingHeld:
 class Lab:
     """A client whose event loop runs in a thread of its own."""
 
-    def __init__(
-        self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None
-    ) -> None:
+    def __init__(self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> None:
         self._loop = uvloop.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="zscout", daemon=True)
         self._thread.start()
@@ -109,13 +107,7 @@ class Lab:
 
     @contextmanager
     def hold(
-        self,
-        name: str,
-        needs: Needs,
-        *,
-        priority: int = 0,
-        min_runtime: float = 1.0,
-        keep: bool = False,
+        self, name: str, needs: Needs, *, priority: int = 0, min_runtime: float = 1.0, keep: bool = False
     ) -> Iterator[BlockingHeld]:
         """Waits for all of `needs`; gives them back at the end of the body."""
         attempt = hold(self.client, name, needs, priority=priority, min_runtime=min_runtime, keep=keep)

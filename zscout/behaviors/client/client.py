@@ -12,14 +12,7 @@ from typing import Any, Generic, Self, TypeVar
 
 from zscout.behaviors.client.handover import Handover
 from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN, RcmLink
-from zscout.behaviors.client.request import (
-    CommandRefused,
-    Needs,
-    OpenArc,
-    RequestRefused,
-    RequestStore,
-    amounts,
-)
+from zscout.behaviors.client.request import CommandRefused, Needs, OpenArc, RequestRefused, RequestStore, amounts
 from zscout.config.fleet import Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh

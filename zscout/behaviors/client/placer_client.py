@@ -87,9 +87,7 @@ class PlacerClient:
             f"{self._timeout:.0f} s; see zscout status, and the log of zscout-node where it leads",
         )
 
-    async def request_once(
-        self, operation: PlacementOperation, done: Callable[[Placement], bool]
-    ) -> Placement:
+    async def request_once(self, operation: PlacementOperation, done: Callable[[Placement], bool]) -> Placement:
         """Does not repeat the operation where `done(placement)` says that it was done though its answer is
         missing. Raises RequestRefused, PlacerSilent."""
 

@@ -302,9 +302,7 @@ class RequestStore:
         """All, as it is reported to an RCM that takes the lead. What is expected has no place: it is this
         client's if the RCs report it so, and nothing is queued for it otherwise."""
         now = self._now()
-        expected = [
-            msgspec.structs.replace(arc.open_request(now), place=None) for arc in self.expected.values()
-        ]
+        expected = [msgspec.structs.replace(arc.open_request(now), place=None) for arc in self.expected.values()]
         return [*(arc.open_request(now) for arc in self.open), *expected]
 
     def move(self, arc: OpenArc, notice: Notice) -> None:

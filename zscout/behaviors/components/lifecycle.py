@@ -67,8 +67,7 @@ class ComponentLifecycle:
         self._away: EndReport | None = None
         """How, once that is so."""
         self._supervisor = Supervisor(
-            f"component {job.client}",
-            lambda error: self.end(EndReport("failed", _words(error))),
+            f"component {job.client}", lambda error: self.end(EndReport("failed", _words(error)))
         )
 
     async def run(self) -> EndReport:
@@ -143,9 +142,7 @@ class ComponentLifecycle:
                 # Once restored it has as long again to be activated, or handed an ARC.
                 called = self._activated, client.expected_came
                 if not await _first(STAND_BY, *called, self._restored) or not await _first(STAND_BY, *called):
-                    return EndReport(
-                        "stopped", f"it stood by for {STAND_BY:g} s and nothing was handed to it"
-                    )
+                    return EndReport("stopped", f"it stood by for {STAND_BY:g} s and nothing was handed to it")
             return await self._perform(client, made, movable)
         finally:
             watch.close()

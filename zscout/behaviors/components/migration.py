@@ -56,18 +56,14 @@ def state_of(component: Component) -> bytes:
     if not isinstance(state, bytes):
         raise NotMoved("move_failed", f"checkpoint() gave {type(state).__name__}; return bytes")
     if len(state) > MAX_CHECKPOINT:
-        raise NotMoved(
-            "too_large", f"checkpoint() gave {len(state)} bytes; at most {MAX_CHECKPOINT} are carried"
-        )
+        raise NotMoved("too_large", f"checkpoint() gave {len(state)} bytes; at most {MAX_CHECKPOINT} are carried")
     return state
 
 
 class OutgoingMove:
     """One move of `component`, as it was ordered."""
 
-    def __init__(
-        self, client: Client, component: Component, gate: SafePointGate, order: MoveComponent
-    ) -> None:
+    def __init__(self, client: Client, component: Component, gate: SafePointGate, order: MoveComponent) -> None:
         self._client, self._component, self._gate = client, component, gate
         self._name, self.to, self.incarnation = order.component, order.to, order.to_incarnation
         self._patience = order.patience
@@ -116,8 +112,7 @@ class OutgoingMove:
         if not going_on:
             self._client.take_back()
             raise NotMoved(
-                "move_failed",
-                f"incarnation {self.incarnation} on {self.to} ended; its ARCs are asked anew here",
+                "move_failed", f"incarnation {self.incarnation} on {self.to} ended; its ARCs are asked anew here"
             )
 
     async def _give(self, state: bytes, requests: list[OpenRequest]) -> None:

@@ -22,13 +22,7 @@ from typing import BinaryIO, Final
 import uvloop
 
 from zscout.behaviors.components import channel
-from zscout.behaviors.components.channel import (
-    BadFrame,
-    ComponentJob,
-    ComponentReport,
-    EndReport,
-    Order,
-)
+from zscout.behaviors.components.channel import BadFrame, ComponentJob, ComponentReport, EndReport, Order
 from zscout.behaviors.components.lifecycle import ComponentLifecycle
 from zscout.behaviors.components.processes import kill_family
 

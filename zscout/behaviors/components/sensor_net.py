@@ -108,9 +108,7 @@ class TreeComponent(Component):
             publisher(status)
             printer(status)
 
-        tree = BehaviorContext(
-            context.client, context.safe_point, publish, speed=self.speed, name=context.component
-        )
+        tree = BehaviorContext(context.client, context.safe_point, publish, speed=self.speed, name=context.component)
         try:
             async with supervised(context.component) as supervisor:
                 supervisor.spawn(publisher.keep_publishing())
@@ -166,7 +164,5 @@ class PlaceSensorNetComponent(TreeComponent):
 
     def _spec_for(self, robot: str, path: str) -> ComponentSpec:
         return ComponentSpec(
-            kind="place_robot",
-            params={**self._shared, "robot": robot, "above": path},
-            restart="always",
+            kind="place_robot", params={**self._shared, "robot": robot, "above": path}, restart="always"
         )

@@ -105,9 +105,7 @@ def _places(light: NDArray[np.float32], lit: float) -> tuple[DarkPlace, ...]:
         for place in _at_level(smooth, lit, level):
             rivals = [other for other in found if place.left <= other.right and other.left <= place.right]
             # A lighter level may widen what a darker one found; it must not water it down.
-            if any(
-                place.darkness > 1.6 * other.darkness + 0.02 or place.width < other.width for other in rivals
-            ):
+            if any(place.darkness > 1.6 * other.darkness + 0.02 or place.width < other.width for other in rivals):
                 continue
             found = [*(other for other in found if other not in rivals), place]
     return tuple(sorted(found, key=lambda place: place.distance))

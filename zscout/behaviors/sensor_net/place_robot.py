@@ -171,8 +171,7 @@ class RobotTask(Behavior):
             camera=robot.framegrabber if step.boxes or step.quiet else "",
             alert=step.alert,
             boxes=[
-                (round(x * across), round(y * down), round(w * across), round(h * down))
-                for x, y, w, h in step.boxes
+                (round(x * across), round(y * down), round(w * across), round(h * down)) for x, y, w, h in step.boxes
             ],
         )
         return not step.over

@@ -47,15 +47,11 @@ class PlaceSensorNet(Behavior):
         mesh = self._mesh = context.client.mesh
         directory = RcDirectory(mesh)
         self._now()
-        self._components = {
-            component_of(context.name or self.name, robot): robot for robot in self.net.members
-        }
+        self._components = {component_of(context.name or self.name, robot): robot for robot in self.net.members}
         declared = [
             directory.watch(),
             mesh.subscribe(mesh.keys.behavior_any, BehaviorSaid, self._on_status),
-            mesh.subscribe(
-                mesh.keys.placements, Placements, lambda _, news: self._on_placements(news.components)
-            ),
+            mesh.subscribe(mesh.keys.placements, Placements, lambda _, news: self._on_placements(news.components)),
         ]
         try:
             async with supervised(self.path) as self._supervisor:

@@ -206,9 +206,7 @@ class Scout:
         good = picture is not None and defect is None
         blind = self.blindness.see(now, good, channel, came=picture is not None)
         act = self.hider.see(now, picture, defect)
-        step = Step(
-            act.left, act.right, act.lasts, act.doing, act.why, blind=blind, over=self.task != self._task
-        )
+        step = Step(act.left, act.right, act.lasts, act.doing, act.why, blind=blind, over=self.task != self._task)
         if self._task == "hide" or step.over or step.blind:
             return step
         if picture is None or not good:

@@ -22,13 +22,7 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
 
 ASK_NODES: Final = 1.0
-STYLES: Final = {
-    "running": "green",
-    "waiting": "yellow",
-    "backing_off": "yellow",
-    "ended": "dim",
-    "given_up": "red",
-}
+STYLES: Final = {"running": "green", "waiting": "yellow", "backing_off": "yellow", "ended": "dim", "given_up": "red"}
 
 
 @click.command()

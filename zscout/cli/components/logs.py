@@ -11,14 +11,7 @@ from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.cli import common
-from zscout.cli.components.placing import (
-    OVER,
-    component_argument,
-    host_option,
-    placer_of,
-    standing,
-    unknown_here,
-)
+from zscout.cli.components.placing import OVER, component_argument, host_option, placer_of, standing, unknown_here
 from zscout.cli.fleet.fleet_view import see_hosts
 from zscout.messages import Output, Placement, ReadOutput
 
@@ -32,9 +25,7 @@ UNKNOWN: Final = 3
 @click.command()
 @component_argument
 @click.option("-f", "--follow", is_flag=True, help="Go on until it has ended, wherever it moves.")
-@click.option(
-    "--lines", type=click.IntRange(0, 100_000), help="Only the last so many lines of what there is."
-)
+@click.option("--lines", type=click.IntRange(0, 100_000), help="Only the last so many lines of what there is.")
 @host_option("--host", "What it wrote there; else where it ran last.")
 @common.runs
 async def logs(name: str, follow: bool, lines: int | None, host: str | None) -> None:
@@ -119,9 +110,7 @@ class Reader:
         if self._host is None:
             return None
         key = self._client.mesh.keys.component(self._host)
-        reply = await self._client.mesh.ask_one(
-            key, ReadOutput(self._name, self._at), Output, timeout=READ_TIMEOUT
-        )
+        reply = await self._client.mesh.ask_one(key, ReadOutput(self._name, self._at), Output, timeout=READ_TIMEOUT)
         output = reply.message if reply is not None else None
         if output is None or output.incarnation < self._incarnation:
             return None

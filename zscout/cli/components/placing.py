@@ -68,9 +68,7 @@ class Progress(terminal.LiveLine):
             self.print(text)
 
     @asynccontextmanager
-    async def within(
-        self, seconds: float | None, late: Callable[[], str], interrupted: str
-    ) -> AsyncIterator[None]:
+    async def within(self, seconds: float | None, late: Callable[[], str], interrupted: str) -> AsyncIterator[None]:
         """Bounds what is awaited inside. Raises Failed with `late()` when the time is over; by Ctrl-C says on
         stderr what stays as it is."""
         try:
@@ -149,6 +147,4 @@ host_argument = click.argument("host", type=common.NAME, shell_complete=completi
 
 def host_option(name: str, help: str, **more: Any) -> Callable[[F], F]:  # noqa: A002 - click's word
     """An option that names a host."""
-    return click.option(
-        name, metavar="HOST", type=common.NAME, shell_complete=completion.hosts, help=help, **more
-    )
+    return click.option(name, metavar="HOST", type=common.NAME, shell_complete=completion.hosts, help=help, **more)

@@ -83,9 +83,7 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
         try:
             params = msgspec.json.decode(given, type=dict[str, Any])
         except BAD_JSON:
-            raise BadInput(
-                f'--params: {quoted(given)} is not a JSON object; write one, as in {{"a": 1}}'
-            ) from None
+            raise BadInput(f'--params: {quoted(given)} is not a JSON object; write one, as in {{"a": 1}}') from None
     seen: set[str] = set()
     for setting in settings:
         key, equals, value = setting.partition("=")
@@ -109,12 +107,8 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
 
 @click.command(context_settings={"show_default": False})
 @click.argument("kind", type=common.NAME, shell_complete=completion.kinds)
-@click.option(
-    "--name", metavar="NAME", type=common.NAME, help="What the component is called. Default: its kind."
-)
-@click.option(
-    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON."
-)
+@click.option("--name", metavar="NAME", type=common.NAME, help="What the component is called. Default: its kind.")
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON.")
 @click.option("--params", metavar="JSON", help="All parameters, as a JSON object.")
 @host_option("--host", "Run nowhere but there; given several times, on one of them.", multiple=True)
 @click.option("--label", metavar="LABEL", type=common.NAME, multiple=True, help="What its host must have.")
@@ -157,9 +151,7 @@ async def start(
     """
     name = kind if name is None else name
     if len(name) > MAX_COMPONENT_NAME:
-        raise BadInput(
-            f"the name {quoted(name)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name"
-        )
+        raise BadInput(f"the name {quoted(name)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name")
     spec = gather_spec(kind, **wanted)
     stays = f"{name} stays placed; to end it: zscout stop {name}"
     async with placing("start", {name}, as_json=as_json) as (shown, placer):
@@ -267,9 +259,7 @@ async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> No
 
         def lasting() -> str:
             records = (placer.placements.get(name) for name in names)
-            return "; ".join(
-                f"{one.component} {standing(one)}" for one in records if one and one.state not in OVER
-            )
+            return "; ".join(f"{one.component} {standing(one)}" for one in records if one and one.state not in OVER)
 
         def late() -> str:
             return f"after {terminal.span(timeout or 0)} {lasting()}; {stays}"

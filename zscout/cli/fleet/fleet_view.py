@@ -92,9 +92,7 @@ class FleetView:
 
     def forget_gone(self) -> None:
         now = self.mesh.now()
-        self.hosts = {
-            name: host for name, host in self.hosts.items() if host.gone is None or now - host.gone < GONE
-        }
+        self.hosts = {name: host for name, host in self.hosts.items() if host.gone is None or now - host.gone < GONE}
 
     def all_hosts(self) -> dict[str, Host]:
         """All hosts, with the fleet's candidates that are not there: they should be."""

@@ -39,8 +39,7 @@ async def keys(as_json: bool) -> None:
         own, links = client.mesh.keys, client.mesh.links()
         if as_json:
             alive = [
-                {**token._asdict(), "token": own.alive(token), "keys": served(own, token, sharable)}
-                for token in tokens
+                {**token._asdict(), "token": own.alive(token), "keys": served(own, token, sharable)} for token in tokens
             ]
             terminal.print_json({"fleet": own.fleet, "base": own.base, "links": links, "alive": alive})
         else:
@@ -89,9 +88,7 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
 
 
 def _print(own: Keys, tokens: list[Token], links: int, sharable: set[str] | None) -> None:
-    terminal.print_line(
-        f"Fleet {own.fleet}: {len(tokens)} alive, {links} links; all keys lie under {own.base}/"
-    )
+    terminal.print_line(f"Fleet {own.fleet}: {len(tokens)} alive, {links} links; all keys lie under {own.base}/")
     rows: list[tuple[str, ...]] = []
     # Two lives of one name are two tokens, and serve the same keys.
     for token in {token[:3]: token for token in tokens}.values():

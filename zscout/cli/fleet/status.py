@@ -26,9 +26,7 @@ MAX_FIGURES_SHOWN: Final = 12
 
 @click.command()
 @click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
-@click.option(
-    "--devices", "every", is_flag=True, help="Show the figures of all devices: rates, drops, latency."
-)
+@click.option("--devices", "every", is_flag=True, help="Show the figures of all devices: rates, drops, latency.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
 @common.runs
 async def status(watch: bool, every: bool, as_json: bool) -> None:
@@ -183,9 +181,7 @@ class Standing:
             "holds": list(map(structs.asdict, holds)),
             "queue": list(map(structs.asdict, queue)),
             "more": state.more if state is not None else 0,
-            "hosts": [
-                self._host_object(name, host, now) for name, host in self.fleet_view.all_hosts().items()
-            ],
+            "hosts": [self._host_object(name, host, now) for name, host in self.fleet_view.all_hosts().items()],
         }
 
     def _host_object(self, name: str, host: Host, now: Ns) -> dict[str, Any]:

@@ -87,9 +87,7 @@ async def view(file: Path | None, web: bool, bind: str, port: int | None, out: P
     if file is not None:
         file = _checked(file)
     if not web and not has_display():
-        raise common.Failed(
-            "no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser"
-        )
+        raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
     # The page comes last, so what it shows needs its own port first.
     async with _source(file, bind, None if web else port, out) as (recording, recorder):
         shown = recording.url or recording.file
@@ -156,15 +154,11 @@ def _checked(file: Path) -> Path:
     """The whole path of FILE, which may begin with a dash. Raises BadInput where it can't be a recording."""
     try:
         if not file.is_file():
-            raise BadInput(
-                f"{file}: there is no such file; recordings of nodes and of zscout view lie in runs/"
-            )
+            raise BadInput(f"{file}: there is no such file; recordings of nodes and of zscout view lie in runs/")
         with file.open("rb") as recording:
             begin = recording.read(len(MAGIC))
     except OSError as error:
-        raise BadInput(
-            f"{file}: can't be read: {error.strerror}; check the path and its permissions"
-        ) from None
+        raise BadInput(f"{file}: can't be read: {error.strerror}; check the path and its permissions") from None
     if begin != MAGIC:
         raise BadInput(f"{file}: is not a Rerun recording; name a .rrd file")
     if file.suffix != ".rrd":
@@ -230,9 +224,7 @@ class Child:
             async with asyncio.timeout(START):
                 yield
         except TimeoutError:
-            raise common.Failed(
-                f"{self.what} did not start within {START:g} s; is this host overloaded?"
-            ) from None
+            raise common.Failed(f"{self.what} did not start within {START:g} s; is this host overloaded?") from None
 
     async def failed(self) -> Exception:
         """Why it ended, in its own last words."""
@@ -315,9 +307,7 @@ def viewer(*arguments: str, log: str = "error") -> AbstractAsyncContextManager[C
     spec = find_spec("rerun_cli")
     binary = Path(spec.origin).with_name("rerun") if spec is not None and spec.origin is not None else None
     if binary is None or not os.access(binary, os.X_OK):
-        raise common.Failed(
-            "the Rerun viewer is not installed; install the package rerun-sdk for this platform"
-        )
+        raise common.Failed("the Rerun viewer is not installed; install the package rerun-sdk for this platform")
     return child("the viewer", [str(binary), *arguments], {"RUST_LOG": log})
 
 

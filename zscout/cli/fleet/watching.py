@@ -76,12 +76,7 @@ class Displayed(Protocol):
 
 
 async def show(
-    shown: Displayed,
-    news: asyncio.Event,
-    refresh: Callable[[], Awaitable[None]],
-    *,
-    watch: bool,
-    as_json: bool,
+    shown: Displayed, news: asyncio.Event, refresh: Callable[[], Awaitable[None]], *, watch: bool, as_json: bool
 ) -> None:
     """Shows it once; with `watch` again as there is news and each second, after a `refresh`, until somebody
     presses q."""

@@ -34,10 +34,7 @@ def demo() -> None:
 def recording_option(command: F) -> F:
     """`--out FILE`."""
     return click.option(
-        "--out",
-        metavar="FILE",
-        type=click.Path(path_type=Path),
-        help="The recording. Default: runs/demo-….rrd",
+        "--out", metavar="FILE", type=click.Path(path_type=Path), help="The recording. Default: runs/demo-….rrd"
     )(command)
 
 
@@ -124,9 +121,7 @@ def table1(out: Path | None, as_json: bool) -> int:
     help="Keep a Rerun recording of each trial there.",
 )
 @common.json_option("Print one JSON object.")
-def placement(
-    policies: tuple[Policy, ...], scenarios: tuple[str, ...], out: Path | None, as_json: bool
-) -> int:
+def placement(policies: tuple[Policy, ...], scenarios: tuple[str, ...], out: Path | None, as_json: bool) -> int:
     """Place three Place Sensor Nets on three live nodes under each policy (Figure 3 of the paper).
 
     Each trial starts three nodes on this machine, apart from every other fleet; each reports the load of what

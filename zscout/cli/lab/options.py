@@ -73,9 +73,7 @@ def parse_seeds(text: str, most: int | None = None) -> range:
     first, last = int(found[1] or 0), int(found[2])
     seeds = range(first, last + 1) if found[1] else range(last)
     if not seeds:
-        raise BadInput(
-            f"--seeds {quoted(text)} is no seed at all; write at least 1, or the smaller one first"
-        )
+        raise BadInput(f"--seeds {quoted(text)} is no seed at all; write at least 1, or the smaller one first")
     if seeds[-1] > MAX_SEED:
         raise BadInput(f"--seeds {quoted(text)}: a seed is at most {MAX_SEED}")
     if most is not None and len(seeds) > most:
@@ -93,9 +91,7 @@ def parse_numbers(text: str, option: str, low: int, high: int) -> list[int]:
             raise BadInput(f"{option} {quoted(text)}: write numbers and ranges of them, as in 1-4,8")
         begin, end = int(ends[0]), int(ends[1])
         if not low <= begin <= end <= high:
-            raise BadInput(
-                f"{option} {quoted(text)}: {quoted(part)} is not within {low} to {high}, or backwards"
-            )
+            raise BadInput(f"{option} {quoted(text)}: {quoted(part)} is not within {low} to {high}, or backwards")
         if len(listed) + end - begin >= MAX_LISTED:
             raise BadInput(f"{option} {quoted(text)}: these are more than {MAX_LISTED} numbers; give fewer")
         listed += range(begin, end + 1)

@@ -14,9 +14,7 @@ from zscout.scheduling.strategies import STRATEGIES
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option(
-    "--strategy", type=click.Choice(list(STRATEGIES)), default="priority", help="How RCs are shared out."
-)
+@click.option("--strategy", type=click.Choice(list(STRATEGIES)), default="priority", help="How RCs are shared out.")
 @common.json_option("Print one JSON object instead of the table.")
 @rrd_option(what="")
 def replay(file: Path, strategy: StrategyName, as_json: bool, rrd: Path | None) -> None:

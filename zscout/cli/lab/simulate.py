@@ -43,10 +43,7 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     help="Of all that is random in it: the same seed, the same building and noise.",
 )
 @click.option(
-    "--speed",
-    type=click.FloatRange(0, 100, min_open=True),
-    default=1.0,
-    help="The building's seconds in one of ours.",
+    "--speed", type=click.FloatRange(0, 100, min_open=True), default=1.0, help="The building's seconds in one of ours."
 )
 @click.option(
     "--frames",
@@ -70,10 +67,7 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     help="Rate of the radio's line; the line is as much faster as the building is.",
 )
 @click.option(
-    "--loss",
-    type=click.FloatRange(0, 1),
-    default=0.0,
-    help="Share of the radio's packets that no robot hears.",
+    "--loss", type=click.FloatRange(0, 1), default=0.0, help="Share of the radio's packets that no robot hears."
 )
 @click.option(
     "--radio",
@@ -89,10 +83,7 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     help="Write a node file with all the devices: zscout-node FILE serves them.",
 )
 @click.option(
-    "--framegrabbers",
-    type=click.IntRange(1, MAX_FRAMEGRABBERS),
-    default=2,
-    help="How many the node file has.",
+    "--framegrabbers", type=click.IntRange(1, MAX_FRAMEGRABBERS), default=2, help="How many the node file has."
 )
 @click.option("--mesh", is_flag=True, help="Show recorders and operators on the mesh who is where.")
 @click.option(

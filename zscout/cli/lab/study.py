@@ -12,14 +12,7 @@ import click
 
 from zscout import terminal
 from zscout.cli import common
-from zscout.cli.lab.options import (
-    DefaultGroup,
-    check_rrd,
-    jobs_option,
-    numbers_option,
-    rrd_option,
-    seeds_option,
-)
+from zscout.cli.lab.options import DefaultGroup, check_rrd, jobs_option, numbers_option, rrd_option, seeds_option
 from zscout.config.strict import BadInput
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.trial import STRATEGIES, SchedulingJob, run_timed
@@ -94,9 +87,7 @@ def schedule(
     compared = list(dict.fromkeys(strategies)) or list(STRATEGIES)
     trials = len(chosen) * len(compared) * len(seeds)
     if trials > MAX_SCHEDULES:
-        raise BadInput(
-            f"--seeds: {trials} trials are more than {MAX_SCHEDULES}; ask for fewer seeds or families"
-        )
+        raise BadInput(f"--seeds: {trials} trials are more than {MAX_SCHEDULES}; ask for fewer seeds or families")
     check_rrd(rrd)
     # numpy is wanted from here on.
     from zscout.lab.study.process_pool import run_trials
@@ -165,9 +156,7 @@ def placement(seeds: range, as_json: bool, rrd: Path | None) -> None:
     help="One that is shipped, `drawn` (another one for each seed), or a TOML file; repeat it for several. "
     "Default: all shipped, and drawn.",
 )
-@click.option(
-    "--seconds", type=click.FloatRange(1, 3_600), default=180.0, help="Of the building, that each run takes."
-)
+@click.option("--seconds", type=click.FloatRange(1, 3_600), default=180.0, help="Of the building, that each run takes.")
 @click.option(
     "--starts",
     type=click.IntRange(1, MAX_SEEDS),

@@ -71,16 +71,11 @@ def _rc_option(kind: str) -> Callable[[F], F]:
 )
 @click.option("--speed", type=click.FloatRange(0.1, 1.0), default=0.6, help="Of the robot's top speed.")
 @click.option("--stand-by", is_flag=True, help="Take the robot at the first key that drives, not at once.")
-@click.option(
-    "--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="A game pad's left stick as well."
-)
+@click.option("--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="A game pad's left stick as well.")
 @click.option("--no-picture", is_flag=True, help="Drive without looking.")
 @click.option("--no-view", is_flag=True, help="Open no viewer; the picture's address is printed.")
 @click.option(
-    "--record",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.rrd",
-    help="Keep what was seen.",
+    "--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.rrd", help="Keep what was seen."
 )
 @common.json_option("Print JSON lines: taken, waiting, free, and what came of it.")
 @common.runs
@@ -127,15 +122,11 @@ async def drive(
         state = await common.state_of(client)
         if all(rc.rc != robot for rc in state.rcs):
             there = sorted(rc.rc for rc in state.rcs if rc.rc.startswith("robot/"))
-            raise BadInput(
-                f"there is no {quoted(robot)} on the mesh; there are: {', '.join(there) or 'no robots'}"
-            )
+            raise BadInput(f"there is no {quoted(robot)} on the mesh; there are: {', '.join(there) or 'no robots'}")
         pilot, end = Pilot(speed), asyncio.Event()
         needs = RobotNeeds(robot, radio, video, framegrabber, rate)
         console = stack.enter_context(_Console(robot, as_json=as_json))
-        teleop = Teleop(
-            client, needs, pilot, priority=fleet.operator_priority, changed=lambda: console.update(teleop)
-        )
+        teleop = Teleop(client, needs, pilot, priority=fleet.operator_priority, changed=lambda: console.update(teleop))
         hands = Hands(teleop, end)
         stack.enter_context(terminal.typed_keys(hands.key, end.set))
         if pad is not None:
@@ -162,9 +153,7 @@ async def _stream(
     await asyncio.to_thread(importlib.import_module, "zscout.cli.operator.picture_recording")
     from zscout.cli.operator.picture_recording import PictureRecording
 
-    stream = stack.enter_context(
-        PictureRecording("drive", robot, port=free_port("127.0.0.1", 0), file=record)
-    )
+    stream = stack.enter_context(PictureRecording("drive", robot, port=free_port("127.0.0.1", 0), file=record))
     window = view and has_display()
     words = f"picture at {stream.url}" if window else f"see the picture with: rerun {stream.url}"
     console.event("picture", words, url=stream.url)
@@ -182,9 +171,7 @@ async def show_pictures(teleop: Teleop, stream: PictureRecording, console: _Cons
         if robot is None or held is None:
             await asyncio.sleep(REFRESH)
             continue
-        stream.words(
-            (mesh.now() - zero) / SECOND, f"{robot.robot} is yours, seen through {robot.framegrabber}"
-        )
+        stream.words((mesh.now() - zero) / SECOND, f"{robot.robot} is yours, seen through {robot.framegrabber}")
         with mesh.frames(mesh.keys.frame(robot.framegrabber)) as frames:
             while teleop.robot is robot:
                 frame = await frames.next(REFRESH)
@@ -300,17 +287,14 @@ class Hands:
 
 
 @contextmanager
-def game_pad(
-    device: Path, moved: Callable[[float, float], None], button: Callable[[int], None]
-) -> Iterator[None]:
+def game_pad(device: Path, moved: Callable[[float, float], None], button: Callable[[int], None]) -> Iterator[None]:
     """Calls `moved(forward, right)`, -1 to 1 each, as the left stick moves, and `button` with the number of
     one that is pressed. A pad that is unplugged moves to 0, 0. Raises BadInput for what can't be opened."""
     try:
         descriptor = os.open(device, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
         raise BadInput(
-            f"--pad: {quoted(str(device))} can't be opened ({error.strerror}); "
-            "name a joystick, as in /dev/input/js0"
+            f"--pad: {quoted(str(device))} can't be opened ({error.strerror}); name a joystick, as in /dev/input/js0"
         ) from None
     loop = asyncio.get_running_loop()
     stick = {ACROSS: 0.0, ALONG: 0.0}

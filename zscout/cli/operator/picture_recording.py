@@ -66,9 +66,7 @@ class PictureRecording(Drawing):
                 sinks.append(rr.FileSink(file))
             self.recording.set_sinks(*sinks, default_blueprint=layout)
         except (OSError, RuntimeError, ValueError) as error:
-            raise TimelineError(
-                f"can't record to {file} ({error}); name a file that can be written"
-            ) from error
+            raise TimelineError(f"can't record to {file} ({error}); name a file that can be written") from error
 
     def words(self, at: float, text: str) -> None:
         self.log(at, "events", rr.TextLog(clean_text(text)))

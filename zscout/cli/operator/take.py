@@ -29,9 +29,7 @@ MAX_ANSWER = 4_096
 @hold_options
 @click.pass_context
 @common.runs
-async def take(
-    ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any
-) -> int:
+async def take(ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
     Says who will be preempted and asks, on stderr; without a terminal it needs

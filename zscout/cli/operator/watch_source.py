@@ -14,16 +14,7 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.motion import MAX_SIDE
 from zscout.config.strict import BadInput, quoted
-from zscout.drivers.capture import (
-    FILE_RATE,
-    FILE_RATES,
-    MAX_PIXELS,
-    MISSES,
-    Capture,
-    kind_of,
-    seconds,
-    shown,
-)
+from zscout.drivers.capture import FILE_RATE, FILE_RATES, MAX_PIXELS, MISSES, Capture, kind_of, seconds, shown
 
 OPEN_TIMEOUT: Final = 5.0
 READ_TIMEOUT: Final = 2.0
@@ -70,9 +61,7 @@ class VideoFile:
                     head = file.read(HEAD)
         except (OSError, ValueError) as error:
             why = (error.strerror if isinstance(error, OSError) else None) or error
-            raise BadInput(
-                f"{quoted(self.name)} can't be read ({why}); name a video file, a URL or a device"
-            ) from None
+            raise BadInput(f"{quoted(self.name)} can't be read ({why}); name a video file, a URL or a device") from None
         if not stat.S_ISREG(mode):
             raise BadInput(f"{quoted(self.name)} is no file; name a video file, a URL or a device")
         nothing = BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")

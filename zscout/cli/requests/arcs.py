@@ -119,9 +119,7 @@ async def _end(named: str, word: str, *, every: bool, as_json: bool) -> None:
         found = _choose(await common.state_of(client), named, word, every=every)
         done = [(target, await _operate(client, target, word)) for target in found]
     if as_json:
-        arcs = [
-            {**target._asdict(), "state": notice.state, "outcome": notice.outcome} for target, notice in done
-        ]
+        arcs = [{**target._asdict(), "state": notice.state, "outcome": notice.outcome} for target, notice in done]
         terminal.print_json({"op": word, "arcs": arcs})
         return
     for target, notice in done:
@@ -147,9 +145,7 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
     if len(found) > 1 and not every:
         listed = ", ".join(_full(target) for target in found[:MAX_LISTED])
         rest = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
-        raise common.Failed(
-            f"{len(found)} ARCs are called {quoted(named)}: {listed}{rest}; name one so, or add --all"
-        )
+        raise common.Failed(f"{len(found)} ARCs are called {quoted(named)}: {listed}{rest}; name one so, or add --all")
     return found
 
 
@@ -167,9 +163,7 @@ async def _operate(client: Client, target: Target, word: str) -> Notice:
         problem = next((reply.problem for reply in replies if reply.problem is not None), None)
         if problem is not None and problem.code not in TRY_AGAIN:
             raise common.Failed(f"{_full(target)} was not ended: {problem.message}")
-    raise common.NobodyThere(
-        "the RCM did not answer: it may be done or not; see zscout status, and try again"
-    )
+    raise common.NobodyThere("the RCM did not answer: it may be done or not; see zscout status, and try again")
 
 
 # Its story
@@ -211,9 +205,7 @@ async def _described(client: Client, view: View, state: RcmState) -> dict[str, A
 def _need(seen: NeedContention, view: View) -> dict[str, Any]:
     """One need; of a hold `need` is what was asked for, and `rc` what it has."""
     met = {rc: need for need, rc in view.bound.items()} if isinstance(view, HoldView) else {}
-    holders = [
-        hold_json(hold) | {"rc": rc.rc, "params": hold.needs[rc.rc]} for rc in seen.rcs for hold in rc.holds
-    ]
+    holders = [hold_json(hold) | {"rc": rc.rc, "params": hold.needs[rc.rc]} for rc in seen.rcs for hold in rc.holds]
     need, params = met.get(seen.need, seen.need), view.needs[seen.need]
     return seen.as_json() | {"need": need, "params": params, "holders": holders}
 

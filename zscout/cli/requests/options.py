@@ -24,13 +24,7 @@ Needs = dict[str, dict[str, Decimal]]
 F = TypeVar("F", bound=Callable[..., Any])
 
 _NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
-_UNITS: Final = {
-    "": Decimal(1),
-    "s": Decimal(1),
-    "ms": Decimal("0.001"),
-    "m": Decimal(60),
-    "h": Decimal(3600),
-}
+_UNITS: Final = {"": Decimal(1), "s": Decimal(1), "ms": Decimal("0.001"), "m": Decimal(60), "h": Decimal(3600)}
 
 
 def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
@@ -130,9 +124,7 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
         name = need
         if need in needs:
             if not is_pattern(need):
-                raise BadInput(
-                    f"{need} is named twice; name each RC once, all its parameters after one colon"
-                )
+                raise BadInput(f"{need} is named twice; name each RC once, all its parameters after one colon")
             if "#" in need:
                 raise BadInput(f"{need} is named twice; leave the numbers out, and they are given")
             numbered = (f"{need}#{number}" for number in range(2, MAX_NEEDS + 2))
@@ -204,17 +196,14 @@ def hold_options(command: F) -> F:
             help="For how long, from the grant: 5, 1.5, 300ms, 2m, 1h.",
         ),
         click.option(
-            "--name",
-            help="What the ARC is called. Default: the command's name, else request (take: operator).",
+            "--name", help="What the ARC is called. Default: the command's name, else request (take: operator)."
         ),
     ):
         command = option(command)
     return command
 
 
-def gather(
-    ctx: click.Context, needs: Any, name: str | None, default_name: str = "request", **rest: Any
-) -> HoldOptions:
+def gather(ctx: click.Context, needs: Any, name: str | None, default_name: str = "request", **rest: Any) -> HoldOptions:
     """Checks what can be checked before anybody is asked. Raises BadInput, BadName, Failed."""
     command: tuple[str, ...] = ctx.meta["command"]
     if command:

@@ -37,15 +37,10 @@ REFRESH: Final = 1.0
 @click.command(cls=CommandAfterDashes)
 @click.argument("needs", nargs=-1, required=True, type=Need(), metavar="NEED...")
 @click.option(
-    "--priority",
-    type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
-    default=0,
-    help="Higher ones preempt lower ones.",
+    "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Higher ones preempt lower ones."
 )
 @click.option("--keep", is_flag=True, help="Go on past the minimum runtime, until something else needs it.")
-@click.option(
-    "--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once."
-)
+@click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
 @hold_options
 @click.pass_context
 @common.runs
@@ -156,9 +151,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     rcs, left = _held_text(held), held.remaining
     length = "until it is needed elsewhere" if arc.keep else f"for {span(left)}"
     details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
-    report.event(
-        "granted", f"{arc.name} holds {rcs} {length}", **details, grant=grant, remaining=round(left, 3)
-    )
+    report.event("granted", f"{arc.name} holds {rcs} {length}", **details, grant=grant, remaining=round(left, 3))
     try:
         code = None
         if wanted.command:
@@ -336,9 +329,7 @@ class Report(LiveLine):
         met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
         in_way = [rc.text() for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         ahead = f", {arc.ahead} ahead" if arc.ahead else ""
-        waits = (
-            f"{arc.name} waits {span(self._since(arc))}{ahead}{f', {start}' if start else ''}: {arc.reason}"
-        )
+        waits = f"{arc.name} waits {span(self._since(arc))}{ahead}{f', {start}' if start else ''}: {arc.reason}"
         self.draw("\n  ".join([waits, *in_way]))
         # Without the estimate: it changes all the time.
         if self.watched or self._printed == _how(arc):
@@ -367,9 +358,7 @@ def _how(arc: OpenArc) -> object:
 
 def _aged(state: RcmState, seconds: float) -> RcmState:
     """The state as it is so much later, if nothing has happened."""
-    holds = [
-        replace(hold, held=hold.held + seconds, remaining=hold.remaining - seconds) for hold in state.holds
-    ]
+    holds = [replace(hold, held=hold.held + seconds, remaining=hold.remaining - seconds) for hold in state.holds]
     return replace(state, holds=holds)
 
 

@@ -84,9 +84,7 @@ class Air:
         phase = float(rng.uniform(0, 2 * np.pi))
         beat = np.sin(self._rows * rng.uniform(0.25, 0.6) + self._columns * rng.uniform(0.2, 0.9) + phase)
         share = 0.5 + 0.45 * beat.astype(np.float32)
-        mixed = share * pictures[0] + (1 - share) * np.roll(
-            pictures[1], int(rng.integers(0, COLUMNS)), axis=1
-        )
+        mixed = share * pictures[0] + (1 - share) * np.roll(pictures[1], int(rng.integers(0, COLUMNS)), axis=1)
         for other in pictures[2:]:
             mixed = 0.6 * mixed + 0.4 * other
         shift = np.cumsum(rng.normal(0, 3.0, ROWS)).astype(np.float32)[:, None]

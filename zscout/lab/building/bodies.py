@@ -7,13 +7,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from zscout.drivers.packets import (
-    CameraPacket,
-    DrivePacket,
-    HaltPacket,
-    Packet,
-    StopPacket,
-)
+from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet, StopPacket
 from zscout.lab.building.plan import Robot
 
 WHEEL_BASE: Final = 0.11

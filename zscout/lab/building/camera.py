@@ -86,13 +86,7 @@ class Camera:
     # Light
 
     def _paint_floor(
-        self,
-        x: float,
-        y: float,
-        heading: float,
-        seen: Geometry,
-        moving: list[Cylinder],
-        picture: Floats,
+        self, x: float, y: float, heading: float, seen: Geometry, moving: list[Cylinder], picture: Floats
     ) -> None:
         cell = self._lit.cell
         depths = seen.depth[HORIZON:]
@@ -115,9 +109,7 @@ class Camera:
             light[:, shaded] *= 1 - 0.6 * np.exp(square * (-0.5 / (body.radius * 1.3) ** 2))
         picture[HORIZON:] = light
 
-    def _paint_upright(
-        self, x: float, y: float, seen: Geometry, moving: list[Cylinder], picture: Floats
-    ) -> None:
+    def _paint_upright(self, x: float, y: float, seen: Geometry, moving: list[Cylinder], picture: Floats) -> None:
         flat = seen.surface.ravel()
         pixels = np.flatnonzero(flat >= 2)
         if not len(pixels):

@@ -98,9 +98,7 @@ class Caster:
         self.first_moving = FIRST_BOX + len(boxes)
         """Number of the surface of the first thing that moves."""
 
-    def cast(
-        self, x: float, y: float, heading: float, moving: list[Cylinder], columns: slice = ALL
-    ) -> Geometry:
+    def cast(self, x: float, y: float, heading: float, moving: list[Cylinder], columns: slice = ALL) -> Geometry:
         """What is seen from (x, y) along `heading`, with what moves beside the plan's own boxes; `columns`
         limits it, and all shapes of the answer, to a part of the picture."""
         forward = np.array([np.cos(heading), np.sin(heading)], np.float32)

@@ -15,18 +15,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from zscout.lab.building.plan import (
-    Covering,
-    Furniture,
-    Kind,
-    Light,
-    Noise,
-    Person,
-    Plan,
-    Receiver,
-    Robot,
-    Rug,
-)
+from zscout.lab.building.plan import Covering, Furniture, Kind, Light, Noise, Person, Plan, Receiver, Robot, Rug
 from zscout.lab.building.world import World
 
 TRIES: Final = 30
@@ -90,9 +79,7 @@ def drawn_plan(seed: int, *, robots: int = 4) -> Plan:
             return with_robots(plan, robots, seed=seed)
         except ValueError:
             continue
-    raise ValueError(
-        f"no room of {TRIES} drawn from seed {seed} had {HIDES} places to hide; take another seed"
-    )
+    raise ValueError(f"no room of {TRIES} drawn from seed {seed} had {HIDES} places to hide; take another seed")
 
 
 def with_robots(plan: Plan, count: int, *, seed: int = 0) -> Plan:
@@ -132,9 +119,7 @@ def hiding_places(plan: Plan) -> list[float]:
 def _room(rng: np.random.Generator, name: str) -> Plan:
     width, depth = (round(float(side), 2) for side in rng.uniform(3.2, 6.5, 2))
     door = round(float(rng.uniform(0.8, width - 0.8)), 2)
-    furniture = [
-        Furniture("door", "solid", door, 0.02, DOOR, 0.04, 2.05, shade=0.75),
-    ]
+    furniture = [Furniture("door", "solid", door, 0.02, DOOR, 0.04, 2.05, shade=0.75)]
     # Nobody puts furniture in front of a door.
     taken = [_Footprint(door, 0.5, DOOR, 1.0, 0.0)]
     low = [LOW[int(at)] for at in rng.choice(len(LOW), int(rng.integers(2, 4)), replace=False)]
@@ -201,9 +186,7 @@ class _Footprint(NamedTuple):
     def corners(self) -> list[tuple[float, float]]:
         cos, sin = math.cos(self.turn), math.sin(self.turn)
         halves = [(a * self.width / 2, b * self.depth / 2) for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-        middles = [
-            (a * self.width / 2, b * self.depth / 2) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1), (0, 0))
-        ]
+        middles = [(a * self.width / 2, b * self.depth / 2) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1), (0, 0))]
         return [(self.x + a * cos - b * sin, self.y + a * sin + b * cos) for a, b in halves + middles]
 
     def clear_of(self, others: Sequence[_Footprint], way: float) -> bool:
@@ -215,12 +198,7 @@ class _Footprint(NamedTuple):
 
 
 def _put(
-    rng: np.random.Generator,
-    template: Template,
-    width: float,
-    depth: float,
-    taken: list[_Footprint],
-    number: int,
+    rng: np.random.Generator, template: Template, width: float, depth: float, taken: list[_Footprint], number: int
 ) -> Furniture | None:
     """A piece of this kind where it has room; None where it has none."""
     wide, deep, high, clearance, shade = (
@@ -292,8 +270,7 @@ def _people(
 def _walkable(start: tuple[float, float], end: tuple[float, float], taken: Sequence[_Footprint]) -> bool:
     steps = max(2, round(math.dist(start, end) / 0.1))
     return all(
-        piece.gap(start[0] + (end[0] - start[0]) * n / steps, start[1] + (end[1] - start[1]) * n / steps)
-        > STRIDE
+        piece.gap(start[0] + (end[0] - start[0]) * n / steps, start[1] + (end[1] - start[1]) * n / steps) > STRIDE
         for n in range(steps + 1)
         for piece in taken
     )

@@ -19,12 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from zscout.lab.building.plan import (
-    Light,
-    Noise,
-    Plan,
-    Receiver,
-)
+from zscout.lab.building.plan import Light, Noise, Plan, Receiver
 from zscout.lab.building.solids import Cuboids, Floats, cuboids_of
 
 FINEST: Final = 0.025
@@ -121,9 +116,7 @@ def _shade_into(mask: NDArray[np.uint8], shadows: Floats, cell: float) -> None:
         cv2.fillConvexPoly(mask, cv2.convexHull(points), 0, shift=_SHIFT)
 
 
-def _floor_direct(
-    plan: Plan, lights: list[Light], boxes: Cuboids, cell: float, shape: tuple[int, int]
-) -> Floats:
+def _floor_direct(plan: Plan, lights: list[Light], boxes: Cuboids, cell: float, shape: tuple[int, int]) -> Floats:
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     x, y = (x + 0.5) * cell, (y + 0.5) * cell
     total = np.zeros(shape, np.float32)
@@ -180,9 +173,7 @@ def _patches(plan: Plan, boxes: Cuboids) -> NDArray[np.int32]:
         return min(20, max(2, round(height / 0.12) + 1)), min(ATLAS_WIDTH, max(2, round(length / 0.15) + 1))
 
     sizes = [patch(length, plan.height) for length in (plan.width, plan.depth) * 2]
-    for width, depth, low, high in zip(
-        boxes.half_width * 2, boxes.half_depth * 2, boxes.low, boxes.high, strict=True
-    ):
+    for width, depth, low, high in zip(boxes.half_width * 2, boxes.half_depth * 2, boxes.low, boxes.high, strict=True):
         sizes += [patch(length, high - low) for length in (width, depth, width, depth)]
         sizes.append(patch(width, depth) if low > 0 else (1, 1))
     table = np.zeros((len(sizes), 3), np.int32)

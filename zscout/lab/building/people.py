@@ -76,9 +76,7 @@ class Walker:
         if not self.here:
             return []
         shade = self._person.shade
-        legs = [
-            Cylinder(x, y, radius, 0.0, _HIP, shade * 0.7, light, person=True) for x, y, radius in self.feet()
-        ]
+        legs = [Cylinder(x, y, radius, 0.0, _HIP, shade * 0.7, light, person=True) for x, y, radius in self.feet()]
         return [*legs, Cylinder(self.x, self.y, 0.18, _HIP, _TALL, shade, light, person=True)]
 
     def _wait(self, seconds: float) -> float:

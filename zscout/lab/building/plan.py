@@ -155,12 +155,6 @@ class Plan(Struct, frozen=True, forbid_unknown_fields=True):
     walls: Annotated[tuple[Wall, ...], Meta(max_length=MAX_WALLS)] = msgspec.field(name="wall", default=())
     furniture: Annotated[tuple[Furniture, ...], Meta(max_length=MAX_FURNITURE)] = ()
     rugs: Annotated[tuple[Rug, ...], Meta(max_length=MAX_RUGS)] = msgspec.field(name="rug", default=())
-    lights: Annotated[tuple[Light, ...], Meta(max_length=MAX_LIGHTS)] = msgspec.field(
-        name="light", default=()
-    )
-    people: Annotated[tuple[Person, ...], Meta(max_length=MAX_PEOPLE)] = msgspec.field(
-        name="person", default=()
-    )
-    robots: Annotated[tuple[Robot, ...], Meta(max_length=MAX_ROBOTS)] = msgspec.field(
-        name="robot", default=()
-    )
+    lights: Annotated[tuple[Light, ...], Meta(max_length=MAX_LIGHTS)] = msgspec.field(name="light", default=())
+    people: Annotated[tuple[Person, ...], Meta(max_length=MAX_PEOPLE)] = msgspec.field(name="person", default=())
+    robots: Annotated[tuple[Robot, ...], Meta(max_length=MAX_ROBOTS)] = msgspec.field(name="robot", default=())

@@ -109,8 +109,7 @@ def _check_point(point: tuple[float, ...], plan: Plan, where: Where, beyond: flo
     if not (-beyond <= x <= plan.width + beyond and -beyond <= y <= plan.depth + beyond):
         raise where.bad(
             f"({x:g}, {y:g}) is outside",
-            f"write x from {0 - beyond:g} to {plan.width + beyond:g}, y from {0 - beyond:g} to "
-            f"{plan.depth + beyond:g}",
+            f"write x from {0 - beyond:g} to {plan.width + beyond:g}, y from {0 - beyond:g} to {plan.depth + beyond:g}",
         )
 
 

@@ -86,12 +86,7 @@ class Served:
             await stack.enter_async_context(self.video)
             self.radio = stack.enter_context(
                 RadioLine(
-                    self._baud,
-                    self._on_packet,
-                    speed=self.speed,
-                    loss=self._loss,
-                    seed=self.seed,
-                    link=self._link,
+                    self._baud, self._on_packet, speed=self.speed, loss=self._loss, seed=self.seed, link=self._link
                 )
             )
             # Pictures of this size are done sooner than threads are started on them.

@@ -127,18 +127,13 @@ def _access(served: Served) -> dict[str, Any]:
         "seed": served.seed,
         "speed": served.speed,
         "frames": served.frame_rate,
-        "radio": {
-            "port": str(link.absolute()) if link is not None else served.radio.port,
-            "baud": served.radio.baud,
-        },
+        "radio": {"port": str(link.absolute()) if link is not None else served.radio.port, "baud": served.radio.baud},
         "http": served.video.page,
         "channels": [
             {"channel": number, "video": f"video/{name}", "url": served.video.url(name)}
             for number, name in enumerate(served.channels, 1)
         ],
-        "robots": [
-            {"name": robot.name, "rc": f"robot/{robot.name}", "id": robot.id} for robot in served.plan.robots
-        ],
+        "robots": [{"name": robot.name, "rc": f"robot/{robot.name}", "id": robot.id} for robot in served.plan.robots],
         "node": None,
         "mesh": None,
     }

@@ -85,9 +85,7 @@ class VideoServer:
         except (OSError, OverflowError) as error:
             number = error.errno if isinstance(error, OSError) else errno.EINVAL
             reason = "in use" if number == errno.EADDRINUSE else os.strerror(number or 0)
-            raise BadInput(
-                f"can't serve on {self._host}, port {self._port} ({reason}); choose another"
-            ) from None
+            raise BadInput(f"can't serve on {self._host}, port {self._port} ({reason}); choose another") from None
         self._port = self._server.sockets[0].getsockname()[1]
         return self
 
@@ -118,9 +116,7 @@ class VideoServer:
     @property
     def watched(self) -> tuple[str, ...]:
         """The channels that somebody waits for frames of, stalled ones left out."""
-        return tuple(
-            name for name, channel in self._channels.items() if channel.watchers and not channel.stalled
-        )
+        return tuple(name for name, channel in self._channels.items() if channel.watchers and not channel.stalled)
 
     def show(self, channel: str, jpeg: bytes) -> None:
         """The newest frame of a channel."""
@@ -155,9 +151,7 @@ class VideoServer:
             else:
                 writer.close()
 
-    async def _answer(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, full: bool
-    ) -> None:
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, full: bool) -> None:
         asked = await _request(reader)
         if asked is None:
             return
@@ -179,9 +173,7 @@ class VideoServer:
         else:
             await self._stream(self._channels[name], reader, writer)
 
-    async def _single(
-        self, channel: Channel, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
+    async def _single(self, channel: Channel, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         watcher = StreamClient()
         channel.watchers.add(watcher)
         try:
@@ -195,9 +187,7 @@ class VideoServer:
         self.sent += 1
         await _send_whole(writer, HTTPStatus.OK, _JPEG, channel.frame)
 
-    async def _stream(
-        self, channel: Channel, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
+    async def _stream(self, channel: Channel, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         sock: socket.socket = writer.get_extra_info("socket")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         watcher = StreamClient()
@@ -219,9 +209,7 @@ class VideoServer:
             channel.watchers.discard(watcher)
             leaving.cancel()
 
-    async def _refuse(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, status: HTTPStatus
-    ) -> None:
+    async def _refuse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, status: HTTPStatus) -> None:
         self.refused += 1
         await _send_whole(writer, status, "text/plain; charset=utf-8", f"{status.phrase}\n".encode())
         # Closed with something unread, the answer might not arrive.

@@ -13,18 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zscout.lab.building.light import light_of
-from zscout.lab.building.plan import (
-    ROBOT_HEIGHT,
-    Furniture,
-    Light,
-    Plan,
-)
-from zscout.lab.building.solids import (
-    Cuboids,
-    as_arrays,
-    cuboids_of,
-    parts,
-)
+from zscout.lab.building.plan import ROBOT_HEIGHT, Furniture, Light, Plan
+from zscout.lab.building.solids import Cuboids, as_arrays, cuboids_of, parts
 from zscout.lab.building.world import World
 from zscout.messages.behaviors import MAX_PEOPLE, MAX_PLAN, MAX_ROBOTS, BuildingPlan, BuildingPoses, Placed
 
@@ -153,9 +143,7 @@ class _Sheet:
             half = light.width / 2
             way = np.array([[half, 0], [-half, 0]] if along_x else [[0, half], [0, -half]], np.float32)
             ends = self._pixels(way + np.array([light.x, light.y], np.float32))
-            cv2.polylines(
-                self.pixels, [ends], False, _WINDOW, max(3, round(self.scale * 0.06)), cv2.LINE_AA, _SUB
-            )
+            cv2.polylines(self.pixels, [ends], False, _WINDOW, max(3, round(self.scale * 0.06)), cv2.LINE_AA, _SUB)
             return
         ((x, y),) = self._pixels(np.array([[light.x, light.y]], np.float32))
         radius = max(4, round(self.scale * 0.05)) << _SUB

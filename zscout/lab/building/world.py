@@ -8,12 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from zscout.lab.building.bodies import (
-    RADIUS,
-    WHEEL_BASE,
-    Body,
-    Pose,
-)
+from zscout.lab.building.bodies import RADIUS, WHEEL_BASE, Body, Pose
 from zscout.lab.building.camera import Camera, Picture
 from zscout.lab.building.casting import Cylinder, columns_of
 from zscout.lab.building.collisions import SLACK, Obstacles
@@ -100,9 +95,7 @@ class World:
                 continue
             self._drive(body, left, right, dt, near)
 
-    def _drive(
-        self, body: Body, left: float, right: float, dt: float, feet: list[tuple[float, float, float]]
-    ) -> None:
+    def _drive(self, body: Body, left: float, right: float, dt: float, feet: list[tuple[float, float, float]]) -> None:
         turn = (right - left) / WHEEL_BASE * dt
         forward = (left + right) / 2 * dt
         middle = body.heading + turn / 2

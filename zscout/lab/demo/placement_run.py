@@ -19,13 +19,7 @@ from zscout.lab import LabError
 from zscout.lab.demo.runner import HOSTS, DemoRunner
 from zscout.lab.demo.screen import keep_recording
 from zscout.mesh import Mesh, ZenohMesh
-from zscout.messages import (
-    ComponentSpec,
-    HostRanking,
-    LoadReport,
-    Placements,
-    RankAsk,
-)
+from zscout.messages import ComponentSpec, HostRanking, LoadReport, Placements, RankAsk
 from zscout.types import Policy
 
 NETS: Final = 3

@@ -43,12 +43,7 @@ GUARDS: Final = (15.0, 60.0)
 walks by."""
 WORST: Final = 150.0
 """Seconds of ours after which the demo ends, placed or not."""
-PATROL: Final[tuple[tuple[Way, float], ...]] = (
-    ("forward", 2.25),
-    ("left", 1.5),
-    ("forward", 2.25),
-    ("right", 1.5),
-)
+PATROL: Final[tuple[tuple[Way, float], ...]] = (("forward", 2.25), ("left", 1.5), ("forward", 2.25), ("right", 1.5))
 """What the operator does, in seconds of the building."""
 
 
@@ -169,9 +164,7 @@ class RobotsDemo(DemoRunner):
     async def _operator(self, client: Client) -> None:
         """In the middle of it, a human takes one robot, drives it about and gives it back."""
         await asyncio.sleep(TAKEOVER / self.speed)
-        robot = next(
-            (one for one in self.robots if self.seen.doing.get(one) not in (None, "wait")), self.robots[0]
-        )
+        robot = next((one for one in self.robots if self.seen.doing.get(one) not in (None, "wait")), self.robots[0])
         pilot = Pilot(0.5)
         teleop = Teleop(client, RobotNeeds(robot), pilot, priority=client.fleet.operator_priority)
         driving = asyncio.create_task(teleop.run())

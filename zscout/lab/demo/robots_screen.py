@@ -112,6 +112,4 @@ def _picture(demo: RobotsDemo, screen: DemoScreen) -> Group:
         table.add_row(robot, Text(doing, style=style), "yes" if robot in seen.truly else "")
     counts = f"{len(seen.hidden)} hidden, {len(seen.watching)} watching, "
     counts += f"{terminal.many(seen.alerts, 'alert')}, {terminal.many(seen.preemptions, 'preemption')}"
-    return Group(
-        head, Text(f"{HARDWARE}; {at}"), Text(""), table, Text(counts), Text(""), *screen.latest(shown)
-    )
+    return Group(head, Text(f"{HARDWARE}; {at}"), Text(""), table, Text(counts), Text(""), *screen.latest(shown))

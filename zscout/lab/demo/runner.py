@@ -119,9 +119,7 @@ class DemoRunner(ABC):
             node = [*launch.prefix()[1:], sys.executable, "-m", "zscout.node", str(file)]
             await self.start(f"node {host}", node)
 
-    async def start(
-        self, name: str, arguments: Sequence[str], *, piped: bool = False
-    ) -> asyncio.subprocess.Process:
+    async def start(self, name: str, arguments: Sequence[str], *, piped: bool = False) -> asyncio.subprocess.Process:
         """Starts a Python process; one that is `piped` talks through pipes, else its output is logged."""
         with self._log(name).open("wb") as log:
             process = await asyncio.create_subprocess_exec(
@@ -149,9 +147,7 @@ class DemoRunner(ABC):
 
         def seen(token: Token, alive: bool) -> None:
             if alive:
-                missing.difference_update(
-                    (token.role, token.name, token.host if token.role == Role.NODE else "")
-                )
+                missing.difference_update((token.role, token.name, token.host if token.role == Role.NODE else ""))
             if not missing:
                 complete.set()
 
@@ -167,9 +163,7 @@ class DemoRunner(ABC):
         except TimeoutError:
             logs = (self._log(name).read_text(errors="replace").strip() for name in self._processes)
             words = next((log for log in logs if "ERROR" in log or "WARN" in log), "")[-SHOWN:]
-            raise LabError(
-                f"{otherwise} in time; {words or 'is this machine very busy? try again'}"
-            ) from None
+            raise LabError(f"{otherwise} in time; {words or 'is this machine very busy? try again'}") from None
 
     async def _watch_end(self, name: str, process: asyncio.subprocess.Process) -> None:
         code = await process.wait()

@@ -52,9 +52,7 @@ class DemoScreen:
 
         return [Text(line, overflow="ellipsis", no_wrap=True) for line in self._events[-count:]]
 
-    async def play(
-        self, make: Callable[[Path], D], draw: Callable[[D], Group], out: Path | None
-    ) -> tuple[D, Path]:
+    async def play(self, make: Callable[[Path], D], draw: Callable[[D], Group], out: Path | None) -> tuple[D, Path]:
         """Runs the demo that `make` makes for a temporary folder, and returns it and its recording, which
         stays even where the demo failed. `draw` gives the picture at any moment."""
         with _recording(out) as path, tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
@@ -106,7 +104,4 @@ def how_to_view(path: Path) -> list[str]:
     """Where the recording is, and how to look at it."""
     # A newcomer's shell does not find it yet: it lies in .venv/bin.
     me = "zscout" if shutil.which("zscout") else os.path.relpath(sys.argv[0])
-    return [
-        f"Recording: {path}",
-        f"Look at it: {me} view {path}, or in a browser: {me} view --web {path}",
-    ]
+    return [f"Recording: {path}", f"Look at it: {me} view {path}, or in a browser: {me} view --web {path}"]

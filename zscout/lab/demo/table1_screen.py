@@ -28,11 +28,7 @@ STYLES: Final = {
     "-": "bright_black",
 }
 """The colours of the recording, by ARC."""
-SOURCES: Final = {
-    "RCM": "what the RCM published",
-    "ARCs": "what the ARCs' bodies saw",
-    "paper": "Table 2 of the paper",
-}
+SOURCES: Final = {"RCM": "what the RCM published", "ARCs": "what the ARCs' bodies saw", "paper": "Table 2 of the paper"}
 WIDE: Final = 26
 """Columns left of the first second."""
 
@@ -70,9 +66,7 @@ async def play(out: Path | None, *, as_json: bool) -> int:
     return 1 if wrong else 0
 
 
-def _report(
-    tables: dict[str, Table], wrong: list[Difference], seen: Observed, path: Path, took: float
-) -> None:
+def _report(tables: dict[str, Table], wrong: list[Difference], seen: Observed, path: Path, took: float) -> None:
     console = terminal.console()
     terminal.print_line("")
     for source, meaning in SOURCES.items():
@@ -110,9 +104,7 @@ def _lines(tables: dict[str, Table], wrong: Set[tuple[str, int]] = frozenset()) 
             line.append(f"{source:<{WIDE - 20}}", style="bright_black")
             for second, cell in enumerate(table[rc]):
                 marked = (rc, second) in wrong
-                line.append(
-                    f"{cell[:2]:<3}", style="bold white on red" if marked else STYLES.get(cell, "bold")
-                )
+                line.append(f"{cell[:2]:<3}", style="bold white on red" if marked else STYLES.get(cell, "bold"))
             line.rstrip()
             yield line
 

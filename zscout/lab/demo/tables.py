@@ -121,8 +121,7 @@ def differences(expected: Table, published: Table, bodies: Table) -> list[Differ
     for rc, cells in expected.items():
         for second, cell in enumerate(cells):
             one, two = (
-                row[second] if second < len(row) else "?"
-                for row in (published.get(rc, []), bodies.get(rc, []))
+                row[second] if second < len(row) else "?" for row in (published.get(rc, []), bodies.get(rc, []))
             )
             if (one, two) != (cell, cell):
                 found.append(Difference(rc, second, cell, one, two))

@@ -19,15 +19,7 @@ import zenoh
 
 from zscout.keyexpr import Keys, Sender
 from zscout.mesh import Mesh, MeshError
-from zscout.mesh.transport import (
-    Collector,
-    OnSample,
-    Quality,
-    Transport,
-    TransportPublisher,
-    TransportQuery,
-    Undeclare,
-)
+from zscout.mesh.transport import Collector, OnSample, Quality, Transport, TransportPublisher, TransportQuery, Undeclare
 from zscout.types import SECOND, Ns
 
 

@@ -17,12 +17,7 @@ from zscout.lab.plots.recording import (
 )
 from zscout.lab.study.placement.simulation import PlacementOutcome
 from zscout.lab.study.placement.study import SCENARIOS, PlacementReport
-from zscout.types import (
-    POLICIES,
-    SECOND,
-    Ns,
-    Policy,
-)
+from zscout.types import POLICIES, SECOND, Ns, Policy
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -52,9 +47,7 @@ def record(path: Path, report: PlacementReport, outcomes: Outcomes) -> None:
                 line = rr.SeriesLines(colors=[colour], names=[host], widths=[width])
                 draw_curve(stream, f"{scenario}/{policy}/load/{host}", line, curve)
                 if marks[host]:
-                    points = rr.SeriesPoints(
-                        colors=[colour], names=[f"▲ {host}"], markers="up", marker_sizes=[5.0]
-                    )
+                    points = rr.SeriesPoints(colors=[colour], names=[f"▲ {host}"], markers="up", marker_sizes=[5.0])
                     draw_curve(stream, f"{scenario}/{policy}/placed/{host}", points, marks[host])
 
 
@@ -77,12 +70,7 @@ def _marks(outcome: PlacementOutcome, apart: float) -> dict[str, Points]:
 
 def _top(outcomes: Outcomes, scenario: str) -> float:
     """The highest load average of a scenario, under whatever policy: all its plots have one scale."""
-    curves = [
-        curve
-        for (name, _), outcome in outcomes.items()
-        for curve in outcome.curves.values()
-        if name == scenario
-    ]
+    curves = [curve for (name, _), outcome in outcomes.items() for curve in outcome.curves.values() if name == scenario]
     return max((load for curve in curves for _, load in curve), default=1.0) or 1.0
 
 
@@ -133,7 +121,6 @@ def _words(report: PlacementReport) -> str:
         ]
     lines += ["", "## A mixed batch on unlike hosts", "| metric, policy | last end | mean |", "|---|---|---|"]
     lines += [
-        f"| {one.metric}, {one.policy} | {one.makespan:.0f} s | {one.completion:.0f} s |"
-        for one in report.batches
+        f"| {one.metric}, {one.policy} | {one.makespan:.0f} s | {one.completion:.0f} s |" for one in report.batches
     ]
     return "\n".join(lines)

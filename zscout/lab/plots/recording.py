@@ -27,9 +27,7 @@ WRITE_SECONDS: Final = 10.0
 
 
 @contextmanager
-def recording(
-    path: Path, application: str, blueprint: rrb.Blueprint, summary: str
-) -> Iterator[rr.RecordingStream]:
+def recording(path: Path, application: str, blueprint: rrb.Blueprint, summary: str) -> Iterator[rr.RecordingStream]:
     """A recording that replaces what was there; `summary`, in Markdown, is shown beside its tabs.
 
     Raises BadInput where the file can't be written."""
@@ -47,9 +45,7 @@ def recording(
         stream.disconnect()
 
 
-def tabs_and_summary(
-    tabs: Sequence[rrb.Container], time: str, shares: tuple[int, int] = (68, 32)
-) -> rrb.Blueprint:
+def tabs_and_summary(tabs: Sequence[rrb.Container], time: str, shares: tuple[int, int] = (68, 32)) -> rrb.Blueprint:
     """Plots in tabs, and the summary beside them; `shares` of the width."""
     import rerun.blueprint as rrb
 
@@ -72,23 +68,17 @@ def whole_time(end: Ns) -> rrb.archetypes.TimeAxis:
     boundary, seconds = rr.TimeRangeBoundary, end / SECOND
     return rrb.archetypes.TimeAxis(
         view_range=rr.TimeRange(
-            start=boundary.absolute(seconds=-MARGIN * seconds),
-            end=boundary.absolute(seconds=(1 + MARGIN) * seconds),
+            start=boundary.absolute(seconds=-MARGIN * seconds), end=boundary.absolute(seconds=(1 + MARGIN) * seconds)
         )
     )
 
 
 def draw_curve(
-    stream: rr.RecordingStream,
-    entity: str,
-    look: rr.SeriesLines | rr.SeriesPoints,
-    points: Sequence[tuple[Ns, float]],
+    stream: rr.RecordingStream, entity: str, look: rr.SeriesLines | rr.SeriesPoints, points: Sequence[tuple[Ns, float]]
 ) -> None:
     """Points over virtual time."""
     import rerun as rr
 
     stream.log(entity, look, static=True)
     times = rr.TimeColumn(VIRTUAL_TIME, duration=[at / SECOND for at, _ in points])
-    stream.send_columns(
-        entity, indexes=[times], columns=rr.Scalars.columns(scalars=[value for _, value in points])
-    )
+    stream.send_columns(entity, indexes=[times], columns=rr.Scalars.columns(scalars=[value for _, value in points]))

@@ -133,9 +133,7 @@ def _report(strategy: str, workload: Workload, played: Replay, observed: _Observ
         yield from _listed(f"{arc}: {observed.reasons.get(arc, '')}" for arc in played.unserved)
 
 
-def _table(
-    workload: Workload, played: Replay, arcs: Sequence[ArcId], winners: set[ArcId | None]
-) -> Iterator[str]:
+def _table(workload: Workload, played: Replay, arcs: Sequence[ArcId], winners: set[ArcId | None]) -> Iterator[str]:
     columns = columns_of(played.holds)
     short, prefixed = short_names(arcs)
     colours = {arc: COLOURS[number % len(COLOURS)] for number, arc in enumerate(arcs)}
@@ -150,26 +148,16 @@ def _table(
         if arc is None:
             return click.style("-".rjust(width), dim=True)
         text = short[arc].rjust(width)
-        return (
-            click.style(text, fg=OPERATOR, bold=True)
-            if arc in winners
-            else click.style(text, fg=colours[arc])
-        )
+        return click.style(text, fg=OPERATOR, bold=True) if arc in winners else click.style(text, fg=colours[arc])
 
     for begin in range(0, len(heads), per_block):
         part = slice(begin, begin + per_block)
         if begin:
             yield ""
-        yield f"{'seconds':<{label}}  " + " ".join(
-            click.style(head.rjust(width), dim=True) for head in heads[part]
-        )
+        yield f"{'seconds':<{label}}  " + " ".join(click.style(head.rjust(width), dim=True) for head in heads[part])
         for rc, row in rows:
             yield f"{rc:<{label}}  " + " ".join(cell(arc) for arc in row[part])
-    notes = (
-        []
-        if columns.by_second
-        else [f"a column reaches to the next one's time, the last to {_s(columns.end)} s"]
-    )
+    notes = [] if columns.by_second else [f"a column reaches to the next one's time, the last to {_s(columns.end)} s"]
     notes += [f"{short[arcs[0]]} is {arcs[0]}, and so on"] if prefixed else []
     notes += [f"{columns.cut} more columns are left out: --json has all"] if columns.cut else []
     if notes:

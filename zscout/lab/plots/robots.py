@@ -56,9 +56,7 @@ def _curves(stream: rr.RecordingStream, grid: Sequence[FieldFigures]) -> None:
         colour, legend = COLOURS[number % len(COLOURS)], f"{channels} channel{'s' * (channels != 1)}"
         for name, _, value in CURVES:
             points = [
-                (one.robots, value(one))
-                for one in grid
-                if one.channels == channels and math.isfinite(value(one))
+                (one.robots, value(one)) for one in grid if one.channels == channels and math.isfinite(value(one))
             ]
             if not points:
                 continue
@@ -92,9 +90,7 @@ def _blueprint(grid: Sequence[FieldFigures], radio: Sequence[FieldFigures]) -> r
         ]
         tabs.append(rrb.Grid(*curves, grid_columns=2, name="Robots and channels"))
     if radio:
-        bars = [
-            rrb.BarChartView(origin=f"/radio/{name}", name=f"{title}, by radio") for name, title, _ in CURVES
-        ]
+        bars = [rrb.BarChartView(origin=f"/radio/{name}", name=f"{title}, by radio") for name, title, _ in CURVES]
         tabs.append(rrb.Grid(*bars, grid_columns=2, name="The radio"))
     return tabs_and_summary(tabs or [rrb.Grid(name="Starts")], ROBOTS)
 
@@ -126,15 +122,9 @@ def _words(
                 for one in figures
             ]
     if starts:
-        lines += [
-            "",
-            "## One robot, random starts",
-            "| building | hidden in the dark | and facing the light |",
-        ]
+        lines += ["", "## One robot, random starts", "| building | hidden in the dark | and facing the light |"]
         lines += ["|---|---|---|"]
-        lines += [
-            f"| {one.building} | {one.dark} of {one.starts} | {one.good} of {one.starts} |" for one in starts
-        ]
+        lines += [f"| {one.building} | {one.dark} of {one.starts} | {one.good} of {one.starts} |" for one in starts]
     return "\n".join(lines)
 
 

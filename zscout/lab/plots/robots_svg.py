@@ -45,9 +45,7 @@ def plots(grid: Sequence[FieldFigures], radio: Sequence[FieldFigures]) -> dict[s
     if grid:
         across, named = "robots", lambda one: str(one.robots)
         by = _lines(grid, lambda one: _plural(one.channels, "channel"), named)
-        drawn["robots-placed.svg"] = Plot(
-            "Until all are placed", across, "seconds", by(lambda o: o.all_placed)
-        )
+        drawn["robots-placed.svg"] = Plot("Until all are placed", across, "seconds", by(lambda o: o.all_placed))
         drawn["robots-noticed.svg"] = Plot(
             "Walks that were noticed", across, "%", by(lambda one: _percent(one.noticed_spread)), 100
         )
@@ -65,9 +63,7 @@ def write(folder: Path, grid: Sequence[FieldFigures], radio: Sequence[FieldFigur
         try:
             (folder / name).write_text(svg(plot), encoding="utf-8")
         except OSError as error:
-            raise BadInput(
-                f"--svg {folder}: {name} can't be written ({error.strerror}); give another folder"
-            ) from None
+            raise BadInput(f"--svg {folder}: {name} can't be written ({error.strerror}); give another folder") from None
 
 
 def svg(plot: Plot) -> str:
@@ -115,9 +111,7 @@ def svg(plot: Plot) -> str:
     return "\n".join([*out, "</svg>", ""])
 
 
-def _line(
-    number: int, name: str, points: Sequence[tuple[float, Quantiles]], y: Callable[[float], float]
-) -> list[str]:
+def _line(number: int, name: str, points: Sequence[tuple[float, Quantiles]], y: Callable[[float], float]) -> list[str]:
     colour = COLOURS[number % len(COLOURS)]
     shown = [(at, spread) for at, spread in points if not math.isnan(spread.median)]
     out = [
@@ -131,9 +125,7 @@ def _line(
     for at, spread in shown:
         never = spread.median == math.inf
         fill = "white" if never else colour
-        out.append(
-            f'<circle cx="{at:.1f}" cy="{y(spread.median):.1f}" r="3.5" fill="{fill}" stroke="{colour}"/>'
-        )
+        out.append(f'<circle cx="{at:.1f}" cy="{y(spread.median):.1f}" r="3.5" fill="{fill}" stroke="{colour}"/>')
     level = TOP + 10 + number * 18
     out.append(f'<circle cx="{WIDTH - RIGHT + 14}" cy="{level}" r="3.5" fill="{colour}"/>')
     out.append(_text(WIDTH - RIGHT + 24, level + 4, name, "start"))
@@ -141,9 +133,7 @@ def _line(
 
 
 def _lines(
-    figures: Sequence[FieldFigures],
-    legend: Callable[[FieldFigures], str],
-    tick: Callable[[FieldFigures], str],
+    figures: Sequence[FieldFigures], legend: Callable[[FieldFigures], str], tick: Callable[[FieldFigures], str]
 ) -> Callable[[Callable[[FieldFigures], Quantiles]], Lines]:
     """Sorts figures into lines, of whatever is to be drawn."""
 

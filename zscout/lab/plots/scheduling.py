@@ -6,14 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from zscout.lab.plots.recording import (
-    COLOURS,
-    VIRTUAL_TIME,
-    draw_curve,
-    recording,
-    tabs_and_summary,
-    whole_time,
-)
+from zscout.lab.plots.recording import COLOURS, VIRTUAL_TIME, draw_curve, recording, tabs_and_summary, whole_time
 from zscout.lab.study.scheduling.measures import Curve
 from zscout.lab.study.scheduling.summary import FamilyReport, SchedulingReport
 from zscout.types import SECOND
@@ -78,9 +71,7 @@ def _blueprint(report: SchedulingReport, curves: Mapping[tuple[str, str], Curve]
         ]
         # The curves' legend says whose colour it is; the bars' would cover them.
         bars = [
-            rrb.BarChartView(
-                origin=f"/{family.family}/{field}", name=title, plot_legend=rrb.PlotLegend(visible=False)
-            )
+            rrb.BarChartView(origin=f"/{family.family}/{field}", name=title, plot_legend=rrb.PlotLegend(visible=False))
             for field, title, _ in BARS
         ]
         return rrb.Vertical(*plots, rrb.Horizontal(*bars), row_shares=[3, 3, 2], name=family.family)
@@ -99,15 +90,8 @@ def _words(report: SchedulingReport) -> str:
             for one in family.strategies
         ]
         if (found := family.degenerate) is not None:
-            lines += [
-                "",
-                f"`priority` is behind in {found.behind / found.situations:.1%} of situations.",
-            ]
+            lines += ["", f"`priority` is behind in {found.behind / found.situations:.1%} of situations."]
     if report.rule is not None:
         rule = report.rule
-        lines += [
-            "",
-            "## What foretells it",
-            f"`{rule}`: right in {rule.hit_rate:.1%} of other seeds' cases.",
-        ]
+        lines += ["", "## What foretells it", f"`{rule}`: right in {rule.hit_rate:.1%} of other seeds' cases."]
     return "\n".join(lines)

@@ -101,9 +101,7 @@ class _Worker(Generic[J, A]):
             with theirs:
                 self._process.start()
         except OSError as error:
-            raise LabError(
-                f"a process can't be started ({error.strerror}); use fewer with --jobs 1"
-            ) from None
+            raise LabError(f"a process can't be started ({error.strerror}); use fewer with --jobs 1") from None
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -118,9 +116,7 @@ class _Worker(Generic[J, A]):
         try:
             answer: A | Exception = self.pipe.recv()
         except (EOFError, OSError):
-            return LabError(
-                "a process of the study died, perhaps for want of memory; use fewer with --jobs 1"
-            )
+            return LabError("a process of the study died, perhaps for want of memory; use fewer with --jobs 1")
         return answer
 
     def kill(self) -> None:

@@ -75,8 +75,7 @@ def plan_of(building: str, seed: int) -> Plan:
         return load_plan(shipped[building])
     if not building.endswith(".toml"):
         raise BadInput(
-            f"--building {quoted(building)} is unknown; give {', '.join(buildings())}, or a file that ends "
-            "in .toml"
+            f"--building {quoted(building)} is unknown; give {', '.join(buildings())}, or a file that ends in .toml"
         )
     return load_plan(Path(building))
 
@@ -120,8 +119,7 @@ def radio(bauds: Iterable[int]) -> list[Field]:
 def turns(slots: Iterable[int]) -> list[Field]:
     """Four robots that take turns on one channel, with longer and shorter slots to hide in."""
     return [
-        Field(robots=SLOT_ROBOTS, channels=SLOT_CHANNELS, slots=Slots(hide=float(slot)))
-        for slot in sorted(set(slots))
+        Field(robots=SLOT_ROBOTS, channels=SLOT_CHANNELS, slots=Slots(hide=float(slot))) for slot in sorted(set(slots))
     ]
 
 
@@ -273,9 +271,7 @@ class StudyPlan:
     turns: Sequence[Field] = ()
 
     @staticmethod
-    def of(
-        robots: Sequence[int], channels: Sequence[int], bauds: Sequence[int], slots: Sequence[int]
-    ) -> StudyPlan:
+    def of(robots: Sequence[int], channels: Sequence[int], bauds: Sequence[int], slots: Sequence[int]) -> StudyPlan:
         """Only what is given is tried; without anything, all."""
         everything = not (robots or channels or bauds or slots)
         return StudyPlan(

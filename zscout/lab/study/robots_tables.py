@@ -59,9 +59,7 @@ def print_report(found: RobotsReport, names: Sequence[str], seeds: int, seconds:
 
 def _means(figures: Sequence[FieldFigures]) -> str:
     """`4 robots, 1 channel`; nothing for none."""
-    return "".join(
-        f"{one.robots} robots, {one.channels} channel{'s' * (one.channels != 1)}" for one in figures
-    )
+    return "".join(f"{one.robots} robots, {one.channels} channel{'s' * (one.channels != 1)}" for one in figures)
 
 
 def _cells(one: FieldFigures) -> list[str]:
@@ -88,7 +86,6 @@ def spread_text(spread: Quantiles) -> str:
     if math.isnan(spread.median):
         return "-"
     low, median, high = (
-        f"{value:.0f}" if math.isfinite(value) else "never"
-        for value in (spread.low, spread.median, spread.high)
+        f"{value:.0f}" if math.isfinite(value) else "never" for value in (spread.low, spread.median, spread.high)
     )
     return f"{median}{' s' * (median != 'never')} ({low}-{high})"

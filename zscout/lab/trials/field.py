@@ -212,10 +212,7 @@ class FieldRun:
         priority, slot = self.field.slots.of(task)
         needs = {
             f"robot/{player.name}": {},
-            RADIO: {
-                "command_rate": Fraction(str(self.field.command_rate)),
-                "packet_size": Fraction(MAX_PACKET),
-            },
+            RADIO: {"command_rate": Fraction(str(self.field.command_rate)), "packet_size": Fraction(MAX_PACKET)},
             player.video or "video/*": {"transmitters": Fraction(1)},
             "framegrabber/*": {},
         }

@@ -18,12 +18,7 @@ import numpy as np
 from zscout.behaviors.perception.hiding.hider import Hider
 from zscout.behaviors.perception.hiding.state import WheelCommand
 from zscout.behaviors.perception.lens import Picture
-from zscout.drivers.packets import (
-    CameraPacket,
-    DrivePacket,
-    Packet,
-    StopPacket,
-)
+from zscout.drivers.packets import CameraPacket, DrivePacket, Packet, StopPacket
 from zscout.lab.building.air import Air
 from zscout.lab.building.bodies import Pose
 from zscout.lab.building.plan import Plan

@@ -140,9 +140,7 @@ class ComponentHost:
             case MoveComponent():
                 check_name(operation.to, "host")
                 if operation.to == self.mesh.me.host or operation.to_incarnation <= operation.incarnation:
-                    raise Refused(
-                        "bad_request", "it moves to another host, and gets a higher incarnation there"
-                    )
+                    raise Refused("bad_request", "it moves to another host, and gets a higher incarnation there")
                 return await self._find(operation.component, operation.incarnation).move(operation)
             case RestoreComponent():
                 process = self._find(operation.component, operation.incarnation)
@@ -177,9 +175,7 @@ class ComponentHost:
             message = f"no kind {start.spec.kind!r} is installed here; there are {there}"
             raise Refused("unknown_kind", message[:MAX_ERROR])
         if len(self._living) >= self._rules.max:
-            raise Refused(
-                "too_many", f"{len(self._living)} components run here; [components] max allows no more"
-            )
+            raise Refused("too_many", f"{len(self._living)} components run here; [components] max allows no more")
         if self._stopping:
             raise Refused("not_allowed", "this node is stopping")
         name = start.component
@@ -218,9 +214,7 @@ class ComponentHost:
             raise Refused("not_allowed", message[:MAX_ERROR])
         size = len(msgspec.json.encode(start.spec.params))
         if size > MAX_PARAMS_SIZE:
-            raise Refused(
-                "too_large", f"params are {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are taken"
-            )
+            raise Refused("too_large", f"params are {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are taken")
 
     async def _list(self, component: str | None) -> ComponentList:
         kinds = await asyncio.to_thread(installed_kinds)

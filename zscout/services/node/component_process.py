@@ -32,15 +32,7 @@ from zscout.behaviors.components.processes import VARIABLE, kill_family
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import new_instance
 from zscout.mesh import Refused, Supervisor, clock
-from zscout.messages import (
-    ComponentView,
-    HowEnded,
-    MoveComponent,
-    Moved,
-    Phase,
-    RestoreComponent,
-    StartComponent,
-)
+from zscout.messages import ComponentView, HowEnded, MoveComponent, Moved, Phase, RestoreComponent, StartComponent
 from zscout.services.node.component_output import OutputReader, OutputRing
 from zscout.services.node.limits import ComponentGroup, ControlGroups
 from zscout.types import SECOND, Ns
@@ -102,9 +94,7 @@ class ComponentProcess:
     @property
     def leaving(self) -> bool:
         """Whether it will have ended before long, of itself or because it was ordered to."""
-        return (
-            self.phase == "stopping" or self.moved is not None or self._gone or self._end_report is not None
-        )
+        return self.phase == "stopping" or self.moved is not None or self._gone or self._end_report is not None
 
     def begin(self, supervisor: Supervisor) -> None:
         """Starts it; `supervisor` is its host's. What fails at it ends this component alone, as `failed`."""
@@ -139,9 +129,7 @@ class ComponentProcess:
             async with asyncio.timeout(grace):
                 await self.over.wait()
         except TimeoutError:
-            self._kill(
-                EndReport("stopped", f"it was killed: it had not ended {grace:g} s after it was asked to")
-            )
+            self._kill(EndReport("stopped", f"it was killed: it had not ended {grace:g} s after it was asked to"))
         await self.over.wait()
 
     async def checkpoint(self) -> bytes:
@@ -358,9 +346,7 @@ class ComponentProcess:
             return self._verdict
         code = self._child.returncode if self._child is not None else None
         if code == -signal.SIGKILL and self._group.overdrawn():
-            return EndReport(
-                "failed", f"killed: used more memory than its limit of {self._group.memory} bytes"
-            )
+            return EndReport("failed", f"killed: used more memory than its limit of {self._group.memory} bytes")
         if code is not None and code < 0:
             try:
                 name = signal.Signals(-code).name

@@ -53,14 +53,7 @@ class LoadReporter:
     One that fails is logged, and withdraws its liveliness token: the host is seen to report no load. It
     starts again after RESTARTS seconds: a node that runs devices does not end for want of figures."""
 
-    def __init__(
-        self,
-        mesh: Mesh,
-        labels: Iterable[str] = (),
-        running: Running = tuple,
-        *,
-        tree: bool = False,
-    ) -> None:
+    def __init__(self, mesh: Mesh, labels: Iterable[str] = (), running: Running = tuple, *, tree: bool = False) -> None:
         self.mesh = mesh
         self._tree = tree
         self._labels, self._running = tuple(labels), running
@@ -139,12 +132,7 @@ class Gauge:
     """Measures one host again and again. Takes 30 ms to make; use it from one thread at a time."""
 
     def __init__(
-        self,
-        host: str,
-        labels: tuple[str, ...] = (),
-        running: Running = tuple,
-        *,
-        load: TreeLoad | None = None,
+        self, host: str, labels: tuple[str, ...] = (), running: Running = tuple, *, load: TreeLoad | None = None
     ) -> None:
         self._host, self._labels = host, labels
         self._cgroup = Cgroup()

@@ -111,9 +111,7 @@ class UseMeter:
         running = list(self._running())[:MAX_COMPONENTS]
         trees = _trees(self._proc, self._now(), {one.pid for one in running}) if running else {}
         last, self._last = self._last, {one: trees[one.pid] for one in running if one.pid in trees}
-        return tuple(
-            _use(one, last.get(one) or _Tree(tree.started), tree) for one, tree in self._last.items()
-        )
+        return tuple(_use(one, last.get(one) or _Tree(tree.started), tree) for one, tree in self._last.items())
 
 
 def _use(one: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
@@ -148,9 +146,7 @@ class TreeMeter:
     Where the system does not tell how long threads waited, `wanted` is how many could run at this moment. Use
     it from one thread at a time. Raises OSError where there is no /proc."""
 
-    def __init__(
-        self, root: int | None = None, *, proc: Path = PROC, now: Callable[[], float] = since_boot
-    ) -> None:
+    def __init__(self, root: int | None = None, *, proc: Path = PROC, now: Callable[[], float] = since_boot) -> None:
         self._root = os.getpid() if root is None else root
         self._proc, self._now = proc, now
         self._last = self._look()

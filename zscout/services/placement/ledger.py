@@ -73,9 +73,7 @@ class PlacementLedger:
 
     async def _catch_up(self) -> None:
         for _ in range(TRIES):
-            reply = await self.mesh.ask_one(
-                self.mesh.keys.placer, ListPlacements(), Placements, timeout=ASK_TIMEOUT
-            )
+            reply = await self.mesh.ask_one(self.mesh.keys.placer, ListPlacements(), Placements, timeout=ASK_TIMEOUT)
             if reply is not None and reply.message is not None:
                 # What was published meanwhile is newer than the answer or the same.
                 listed = reply.message

@@ -31,9 +31,7 @@ class LoadBalancer:
     """Answers which hosts are best, until it is stopped or fails. What it knows of hosts comes from their
     reports alone, so a new leader's balancer knows all that report within a second."""
 
-    def __init__(
-        self, mesh: Mesh, on_failure: Callable[[Exception], object], rng: random.Random | None = None
-    ) -> None:
+    def __init__(self, mesh: Mesh, on_failure: Callable[[Exception], object], rng: random.Random | None = None) -> None:
         self.mesh = mesh
         self.core = Balancer(rng or random.Random())  # noqa: S311 - lots and noise, not secrets
         self._supervisor = Supervisor("the load balancer", on_failure)

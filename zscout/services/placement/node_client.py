@@ -90,7 +90,5 @@ class NodeClient:
             return answered("refused", reply.problem.message if reply.problem is not None else "")
         return answered("moved", dead=reply.message.dead)
 
-    async def _ask(
-        self, host: HostName, message: msgspec.Struct, kind: type[R], timeout: float
-    ) -> Reply[R] | None:
+    async def _ask(self, host: HostName, message: msgspec.Struct, kind: type[R], timeout: float) -> Reply[R] | None:
         return await self.mesh.ask_one(self.mesh.keys.component(host), message, kind, timeout=timeout)

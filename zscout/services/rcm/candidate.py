@@ -133,9 +133,7 @@ class Candidate:
         if term > self.known:
             self.known = term
         if self.rcm is not None and term > self.rcm.term:
-            log.warning(
-                "stepping down: term %d of another RCM is above %d", term.counter, self.rcm.term.counter
-            )
+            log.warning("stepping down: term %d of another RCM is above %d", term.counter, self.rcm.term.counter)
             self._stop_leading()
             self._changed.set()
 

@@ -92,9 +92,7 @@ class Rcm:
         supervisor, receive = self.supervisor, self._receive
         self.registry = RequestRegistry(mesh, self.core, term, supervisor)
         self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer)
-        self.requests = RequestHandler(
-            mesh, fleet, self.core, self.registry, self.membership, supervisor, receive
-        )
+        self.requests = RequestHandler(mesh, fleet, self.core, self.registry, self.membership, supervisor, receive)
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, Grants)
         self.seq = 0
@@ -217,9 +215,7 @@ class Rcm:
         if not changed and rcs is None:
             return
         revoked = [
-            _revocation(effect, self.registry.name(effect.arc))
-            for effect in changed
-            if isinstance(effect, HoldEnded)
+            _revocation(effect, self.registry.name(effect.arc)) for effect in changed if isinstance(effect, HoldEnded)
         ]
         now = self.mesh.now()
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
@@ -260,9 +256,7 @@ class Rcm:
         except MeshError as error:
             log.warning("%s", error)
 
-    def _on_ballot(
-        self, rc: RcName, proposal: int, overdue: asyncio.TimerHandle, reply: Reply[Ballot] | None
-    ) -> None:
+    def _on_ballot(self, rc: RcName, proposal: int, overdue: asyncio.TimerHandle, reply: Reply[Ballot] | None) -> None:
         overdue.cancel()
         ballot = reply.message if reply is not None else None
         if ballot is not None and ballot.proposal == proposal:

@@ -106,9 +106,7 @@ def _recover_hold(
     if all(name in held or name not in result.rcs for name in some.rcs):
         remaining = min(holder.remaining for holder in held.values())
         end = now + round(remaining * SECOND)
-        result.holds.append(
-            RecoveredHold(request, some.place, grant, end - request.min_runtime, end, some.bound)
-        )
+        result.holds.append(RecoveredHold(request, some.place, grant, end - request.min_runtime, end, some.bound))
     else:
         result.waiting.append(RecoveredRequest(request, some.place))
 

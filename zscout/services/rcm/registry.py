@@ -142,9 +142,7 @@ class RequestRegistry:
             **details,
         )
 
-    def report(
-        self, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]
-    ) -> None:
+    def report(self, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]) -> None:
         """Publishes what follows from an instant's effects. For the `answered` ARCs a grant, and for
         the `given_up` ones the end of a hold, is the answer to an operation, and no notice."""
         for effect in effects:
@@ -205,9 +203,7 @@ class RequestRegistry:
         self._estimated.discard(arc)
         self._ended[arc] = (now + REMEMBER, notice)
         self._ended.move_to_end(arc)
-        while self._ended and (
-            len(self._ended) > MAX_REMEMBERED or next(iter(self._ended.values()))[0] < now
-        ):
+        while self._ended and (len(self._ended) > MAX_REMEMBERED or next(iter(self._ended.values()))[0] < now):
             self._ended.popitem(last=False)
 
     # Forecasts: one serves all that are wanted in the same instant

@@ -227,14 +227,7 @@ class RequestHandler:
         self._moving.add(query)
         self._membership.find(to, partial(self._on_new_client, query, operation, sender, to))
 
-    def _on_new_client(
-        self,
-        query: Query,
-        operation: HandOver,
-        sender: ClientId,
-        to: ClientId,
-        found: bool,
-    ) -> None:
+    def _on_new_client(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId, found: bool) -> None:
         try:
             if not found:
                 raise Refused("unknown_client", f"{to} is not on the mesh")

@@ -16,14 +16,7 @@ import msgspec
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Sender
 from zscout.mesh import MeshError, ZenohMesh
-from zscout.services.recorder.process import (
-    BAD_SETTINGS,
-    RecorderJob,
-    Recording,
-    decode_job,
-    new_recording,
-    prune,
-)
+from zscout.services.recorder.process import BAD_SETTINGS, RecorderJob, Recording, decode_job, new_recording, prune
 from zscout.services.recorder.recorder import Recorder, RecorderFailed
 from zscout.services.recorder.timeline import Timeline
 
@@ -34,9 +27,7 @@ MAX_JOB = 1_000_000
 
 def main() -> None:
     """Exit codes: 0 when it was ended, 1 when it failed, BAD_SETTINGS where trying again would not help."""
-    logging.basicConfig(
-        level="INFO", format="%(asctime)s recorder %(levelname)s %(message)s", stream=sys.stderr
-    )
+    logging.basicConfig(level="INFO", format="%(asctime)s recorder %(levelname)s %(message)s", stream=sys.stderr)
     try:
         # Libraries write to standard output as they like: what this program writes there goes round them.
         with os.fdopen(os.dup(1), "wb") as out:

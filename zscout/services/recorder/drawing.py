@@ -77,9 +77,7 @@ class Drawing:
 
     def curve(self, entity: str, name: str, colour: int, width: float, **more: Any) -> None:
         """How the points of this entity are joined."""
-        self.log(
-            None, entity, rr.SeriesLines(names=[clean_text(name)], colors=[colour], widths=[width], **more)
-        )
+        self.log(None, entity, rr.SeriesLines(names=[clean_text(name)], colors=[colour], widths=[width], **more))
 
     def event(self, at: float, text: str, level: str = "INFO") -> None:
         """One line in words; `level` is one of Rerun's, WARN for what people should look at."""

@@ -203,14 +203,11 @@ class FloorPlan:
         spots = [self._pixel(one) for one in robots]
         walkers = [self._pixel(one) for one in people]
         shades = [
-            look.colour or (HIDDEN if one.hidden else IN_THE_OPEN)
-            for one, look in zip(robots, looks, strict=True)
+            look.colour or (HIDDEN if one.hidden else IN_THE_OPEN) for one, look in zip(robots, looks, strict=True)
         ]
         self._draw_trails(at, names, spots, shades)
         self._draw(at, "robots", spots, shades)
-        self._draw(
-            at, "headings", [self._vector(one.heading, ARROW) for one in robots], shades, origins=spots
-        )
+        self._draw(at, "headings", [self._vector(one.heading, ARROW) for one in robots], shades, origins=spots)
         seen = [
             [spot, *(self._beside(spot, one.heading + turn * VIEW / 8, SIGHT) for turn in range(-4, 5)), spot]
             for one, spot in zip(robots, spots, strict=True)
@@ -252,9 +249,7 @@ class FloorPlan:
             places.append((x, round(y, 1)))
         return places
 
-    def _draw_trails(
-        self, at: float, names: Sequence[str], spots: Sequence[Spot], shades: Sequence[int]
-    ) -> None:
+    def _draw_trails(self, at: float, names: Sequence[str], spots: Sequence[Spot], shades: Sequence[int]) -> None:
         step = MOVED * (self.size or (1, 1))[0] / self._metres[0]
         for name, spot in zip(names, spots, strict=True):
             if name not in self._trails and len(self._trails) >= MAX_TRAILS:
@@ -276,10 +271,7 @@ class FloorPlan:
 
     def _is_near(self, one: Placed) -> bool:
         width, depth = self._metres
-        return (
-            -MARGIN * width <= one.x <= (1 + MARGIN) * width
-            and -MARGIN * depth <= one.y <= (1 + MARGIN) * depth
-        )
+        return -MARGIN * width <= one.x <= (1 + MARGIN) * width and -MARGIN * depth <= one.y <= (1 + MARGIN) * depth
 
     def _pixel(self, one: Placed) -> Spot:
         """The plan's rows begin at the largest y."""

@@ -121,9 +121,7 @@ class HostTracker:
             self._looks.add(mark)
             colour, marker = MARKS[mark]
             # Those of one name have one line in the legend.
-            look = rr.SeriesPoints(
-                names=["components"], colors=[colour], markers=[marker], marker_sizes=[7.0]
-            )
+            look = rr.SeriesPoints(names=["components"], colors=[colour], markers=[marker], marker_sizes=[7.0])
             self._drawing.log(None, entity, look)
         stack = self._marked.get(host)
         if stack is None or at - stack.at > SAME_MOMENT:
@@ -184,9 +182,7 @@ class HostTracker:
 
         What was not known before is shown, but did not happen now."""
         there = {placement.component for placement in news.components}
-        self._take_in(
-            at, news, forgotten=self._components.keys() - there - set(fresher), fresher=fresher, seen=False
-        )
+        self._take_in(at, news, forgotten=self._components.keys() - there - set(fresher), fresher=fresher, seen=False)
 
     def _take_in(
         self, at: float, news: Placements, *, forgotten: Collection[str], fresher: Collection[str], seen: bool

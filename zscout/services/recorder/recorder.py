@@ -232,9 +232,7 @@ class Recorder:
                     failed = 0
             self._placer_wanted.clear()
             self._fresher = fresher = set[str]()
-            reply = await self.mesh.ask_one(
-                self.mesh.keys.placer, ListPlacements(), Placements, timeout=READ_TIMEOUT
-            )
+            reply = await self.mesh.ask_one(self.mesh.keys.placer, ListPlacements(), Placements, timeout=READ_TIMEOUT)
             self._fresher = None
             if reply is None or reply.message is None:
                 failed += 1

@@ -46,13 +46,9 @@ class Timeline(Drawing):
     can't be written.
     """
 
-    def __init__(
-        self, fleet: str, *, path: Path | None, bind: str = "127.0.0.1", port: int | None = None
-    ) -> None:
+    def __init__(self, fleet: str, *, path: Path | None, bind: str = "127.0.0.1", port: int | None = None) -> None:
         start = datetime.now(UTC)
-        super().__init__(
-            rr.RecordingStream(APPLICATION, recording_id=f"{fleet}-{start.strftime('%Y%m%dT%H%M%S.%fZ')}")
-        )
+        super().__init__(rr.RecordingStream(APPLICATION, recording_id=f"{fleet}-{start.strftime('%Y%m%dT%H%M%S.%fZ')}"))
         self.url: str | None = None
         """Where a viewer finds the live server: `rerun URL`."""
         self._path = path
@@ -147,9 +143,7 @@ class Timeline(Drawing):
     def _layout(self, *, live: bool) -> rrb.Blueprint:
         """Panes for what there is; those of a live view may fill yet."""
         robots = self.robots.shown
-        rc_rows, arc_rows, host_rows = (
-            lanes.rows for lanes in (self._rc_lanes, self._arc_lanes, self.hosts.lanes)
-        )
+        rc_rows, arc_rows, host_rows = (lanes.rows for lanes in (self._rc_lanes, self._arc_lanes, self.hosts.lanes))
         if live:
             least = LIVE_ROWS if robots.any else 1
             rc_rows, arc_rows, host_rows = max(rc_rows, least), max(arc_rows, least), LIVE_HOST_ROWS

@@ -21,14 +21,7 @@ import numpy as np
 from zscout.behaviors.perception.darkness import View, analyse
 from zscout.behaviors.perception.hiding import phases
 from zscout.behaviors.perception.hiding.compass import BANDS, strip_and_tones
-from zscout.behaviors.perception.hiding.state import (
-    FORM,
-    MAX_CHECKPOINT,
-    HidingState,
-    Phase,
-    Step,
-    WheelCommand,
-)
+from zscout.behaviors.perception.hiding.state import FORM, MAX_CHECKPOINT, HidingState, Phase, Step, WheelCommand
 from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture, garbled
 
 
@@ -90,9 +83,7 @@ class Hider:
         there is no newer one; `defect`: what `garbled` gave for it, if the caller knows. Raises ValueError
         for an array of another form."""
         if picture is not None and (picture.shape != (ROWS, COLUMNS) or picture.dtype != np.uint8):
-            raise ValueError(
-                f"a picture is uint8 of shape (120, 160), not {picture.dtype} of {picture.shape}"
-            )
+            raise ValueError(f"a picture is uint8 of shape (120, 160), not {picture.dtype} of {picture.shape}")
         robot = self._robot
         passed = self._passed(now)
         if robot.stopped:

@@ -22,15 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zscout.behaviors.perception.darkness import View
-from zscout.behaviors.perception.hiding.compass import (
-    BANDS,
-    SCALE,
-    Strip,
-    Tones,
-    brighter,
-    floor_strip,
-    turned,
-)
+from zscout.behaviors.perception.hiding.compass import BANDS, SCALE, Strip, Tones, brighter, floor_strip, turned
 from zscout.behaviors.perception.lens import COLUMNS, Picture
 
 MAX_CHECKPOINT: Final = 64_000
@@ -385,9 +377,7 @@ class HidingState(msgspec.Struct):
         for place in view.places:
             heading = self.heading + place.bearing
             x, y = self.point(heading, place.distance)
-            self.sightings.append(
-                Sighting(heading, place.distance, place.width, place.height, place.darkness, x, y)
-            )
+            self.sightings.append(Sighting(heading, place.distance, place.width, place.height, place.darkness, x, y))
         self.openings.append(self.opening(view))
 
     def opening(self, view: View) -> Opening:

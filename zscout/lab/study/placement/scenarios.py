@@ -41,8 +41,7 @@ def unlike_machines(seed: int) -> list[Machine]:
     names: list[HostName] = ["ash", "birch", "cedar"]
     Random(seed).shuffle(names)  # noqa: S311 - a simulation
     return [
-        Machine(name, speed=speed, memory=memory)
-        for name, speed, memory in zip(names, SPEEDS, MEMORIES, strict=True)
+        Machine(name, speed=speed, memory=memory) for name, speed, memory in zip(names, SPEEDS, MEMORIES, strict=True)
     ]
 
 
@@ -61,10 +60,7 @@ def mixed_batch(seed: int) -> list[SimulatedJob]:
         SimulatedJob(f"large{number}", "large", at(), cpu=1, memory=700_000_000, work=30, greedy=True)
         for number in range(6)
     ]
-    light = [
-        SimulatedJob(f"light{number}", "light", at(), cpu=0.1, memory=40_000_000, work=3)
-        for number in range(12)
-    ]
+    light = [SimulatedJob(f"light{number}", "light", at(), cpu=0.1, memory=40_000_000, work=3) for number in range(12)]
     return heavy + large + light
 
 

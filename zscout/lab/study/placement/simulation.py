@@ -16,15 +16,7 @@ from typing import Final
 from zscout.messages import ComponentUse, LoadReport
 from zscout.placement.balancer import LOAD_TIME, Balancer
 from zscout.placement.model import REPORT_EVERY, THRASHING, RankQuery
-from zscout.types import (
-    SECOND,
-    ComponentId,
-    HostName,
-    Kind,
-    Metric,
-    Ns,
-    Policy,
-)
+from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns, Policy
 
 STEP: Final[Ns] = SECOND // 10
 GAIN: Final = 1 - math.exp(-STEP / LOAD_TIME)
@@ -151,9 +143,7 @@ class _Host:
             memory_total=machine.memory,
             speed=machine.speed,
             components=tuple(
-                ComponentUse(
-                    job.component, job.kind, 1, job.wants(machine.speed) * share, job.memory, served=share
-                )
+                ComponentUse(job.component, job.kind, 1, job.wants(machine.speed) * share, job.memory, served=share)
                 for job in active
             ),
         )

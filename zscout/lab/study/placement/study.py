@@ -20,14 +20,7 @@ from zscout.lab.study.placement.scenarios import (
 )
 from zscout.lab.study.placement.simulation import PlacementOutcome, simulate
 from zscout.placement.balancer import Balancer
-from zscout.types import (
-    METRICS,
-    POLICIES,
-    SECOND,
-    Metric,
-    Ns,
-    Policy,
-)
+from zscout.types import METRICS, POLICIES, SECOND, Metric, Ns, Policy
 
 SCENARIOS: Final[Mapping[str, Ns]] = {"simultaneous": 0, "staggered": STAGGER}
 """The paper's Figure 3 (a) and (b): from one Place Sensor Net to the next, in ns."""

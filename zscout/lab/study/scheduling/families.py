@@ -113,9 +113,7 @@ def wide_among_narrow(random: Random) -> Workload:
 
 
 def _renamed(request: ArcRequest, prefix: str) -> ArcRequest:
-    return ArcRequest(
-        prefix + request.arc, request.client, request.needs, request.priority, request.min_runtime
-    )
+    return ArcRequest(prefix + request.arc, request.client, request.needs, request.priority, request.min_runtime)
 
 
 def _family(name: str, summary: str, mix: Mix, *, together: bool = False) -> Family:

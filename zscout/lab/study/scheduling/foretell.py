@@ -86,8 +86,7 @@ def fit(features: Matrix, behind: Flags, fitted: Flags) -> Rule | None:
     if not conditions:
         return None
     best, foretold = max(
-        ((condition, condition.holds(known)) for condition in conditions),
-        key=lambda pair: _score(pair[1], truth),
+        ((condition, condition.holds(known)) for condition in conditions), key=lambda pair: _score(pair[1], truth)
     )
     chosen = [best]
     second = max(conditions, key=lambda condition: _score(foretold & condition.holds(known), truth))

@@ -16,16 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    Arc,
-    ArcStatus,
-    LeadTaken,
-    Propose,
-    RcJoined,
-    RecoveredHold,
-    RecoveredRequest,
-    Vote,
-)
+from zscout.scheduling.model import Arc, ArcStatus, LeadTaken, Propose, RcJoined, RecoveredHold, RecoveredRequest, Vote
 from zscout.scheduling.replay import play_instant
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.workload import WorkloadRc, excess

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 from zscout.lab.study.scheduling.families import FAMILIES
-from zscout.lab.study.scheduling.summary import (
-    Degeneracy,
-    FamilyReport,
-    SchedulingReport,
-    StrategyReport,
-)
+from zscout.lab.study.scheduling.summary import Degeneracy, FamilyReport, SchedulingReport, StrategyReport
 from zscout.terminal import print_line, print_table
 
 
@@ -65,9 +60,7 @@ def _strategy(one: StrategyReport, together: bool) -> list[str]:
         f"{took.p99:.0f} us",
     ]
     return (
-        [*cells, f"{one.first:.1%}", f"{took.first_median:.0f} us", f"{took.first_p99:.0f} us"]
-        if together
-        else cells
+        [*cells, f"{one.first:.1%}", f"{took.first_median:.0f} us", f"{took.first_p99:.0f} us"] if together else cells
     )
 
 

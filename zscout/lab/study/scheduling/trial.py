@@ -8,12 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from zscout.lab.study.scheduling.families import FAMILIES
-from zscout.lab.study.scheduling.measures import (
-    Curve,
-    Measures,
-    curve,
-    measure,
-)
+from zscout.lab.study.scheduling.measures import Curve, Measures, curve, measure
 from zscout.lab.study.scheduling.situations import Observer, Situation
 from zscout.scheduling import strategies
 from zscout.scheduling.replay import replay
