@@ -1,8 +1,7 @@
-"""Stories as text, for any core: a player carries out the commands of each line, and what they led to stands
-under it.
+"""Stories as text, for any core: a player carries out the commands of each line, and what they led to stands under it.
 
-One line is one batch of events; several commands of one instant are joined by `;`. Lines that start with
-`#` are comments, indented lines are the effects, and a blank line separates. Times are seconds.
+One line is one batch of events; several commands of one instant are joined by `;`. Lines that start with `#` are
+comments, indented lines are the effects, and a blank line separates. Times are seconds.
 """
 
 from __future__ import annotations

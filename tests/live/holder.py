@@ -2,10 +2,9 @@
 
     python -m tests.live.holder NAME        (the fleet is the one that ZSCOUT_FLEET names)
 
-Orders come as JSON lines on stdin, what happens goes out as JSON lines on stdout, with `at` in ns of this
-host's clock. Orders: {"order": "ask", "arc", "needs", "priority", "min_runtime", "keep"},
-{"order": "command", "rc", "do", "ttl"} under the last grant of this process, {"order": "end"}.
-It ends when its stdin does.
+Orders come as JSON lines on stdin, what happens goes out as JSON lines on stdout, with `at` in ns of this host's clock.
+Orders: {"order": "ask", "arc", "needs", "priority", "min_runtime", "keep"}, {"order": "command", "rc", "do", "ttl"}
+under the last grant of this process, {"order": "end"}. It ends when its stdin does.
 """
 
 from __future__ import annotations

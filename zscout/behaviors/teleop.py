@@ -73,11 +73,10 @@ STOP: Final = Wheels(0.0, 0.0, 0.0)
 class Pilot:
     """From keys and sticks to wheels: what the operator wants at any moment. Pure; time is passed in.
 
-    A terminal reports no releases: a key that is held down comes again and again, first after a delay of a
-    quarter to half a second, then some 30 times a second. So a press drives for FIRST seconds, which bridges
-    the delay, a repetition for NEXT, and a released key stops the robot by itself soon after. A stick reports
-    its position; that counts until it reports otherwise, and a pad without reports counts as released
-    after STICK_TIMEOUT.
+    A terminal reports no releases: a key that is held down comes again and again, first after a delay of a quarter to
+    half a second, then some 30 times a second. So a press drives for FIRST seconds, which bridges the delay, a
+    repetition for NEXT, and a released key stops the robot by itself soon after. A stick reports its position; that
+    counts until it reports otherwise, and a pad without reports counts as released after STICK_TIMEOUT.
     """
 
     def __init__(self, speed: float = 0.6) -> None:

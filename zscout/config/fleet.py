@@ -75,8 +75,7 @@ class Timing(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlacementPolicy(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [placement]: how hard a fleet tries to place, and whether it moves what pays. Durations in
-    ns."""
+    """The table [placement]: how hard a fleet tries to place, and whether it moves what pays. Durations in ns."""
 
     start_timeout: Annotated[Ns, seconds("0.05", "600", "A start without an answer for this long has failed.")] = (
         15 * SECOND

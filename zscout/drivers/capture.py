@@ -60,10 +60,9 @@ class CapturedFrame:
 class Capture:
     """Reads one source in a thread of its own, until `stop`.
 
-    `source` is a device (`/dev/video0`, or its number), a URL (`http://`, `rtsp://`, ...) or else a file,
-    which is read at its own rate, and from its start again when it ends. `open_timeout` and `read_timeout`
-    are seconds; a source that gives no picture for `read_timeout` is opened again. All attributes may be read
-    from any thread.
+    `source` is a device (`/dev/video0`, or its number), a URL (`http://`, `rtsp://`, ...) or else a file, which is read
+    at its own rate, and from its start again when it ends. `open_timeout` and `read_timeout` are seconds; a source that
+    gives no picture for `read_timeout` is opened again. All attributes may be read from any thread.
     """
 
     def __init__(self, source: str, *, open_timeout: float = 2.0, read_timeout: float = 1.5) -> None:

@@ -1,8 +1,7 @@
 """A resource controller (RC) on the mesh: the part that every driver shares.
 
-A driver (`driver.py`) controls its device; `ResourceController` owns the keys, checks every command against
-the hold in force when it is carried out, votes, and puts the device into its safe state when its holder is
-gone.
+A driver (`driver.py`) controls its device; `ResourceController` owns the keys, checks every command against the hold in
+force when it is carried out, votes, and puts the device into its safe state when its holder is gone.
 """
 
 from __future__ import annotations

@@ -136,8 +136,7 @@ class _Subscription:
 
 
 class Mesh:
-    """One process's place on the mesh, an async context manager: typed queries, publications, liveliness, and
-    a clock.
+    """One process's place on the mesh, an async context manager: typed queries, publications, liveliness, and a clock.
 
     Declare once per purpose, never per request: Zenoh keeps memory for every key that was ever declared."""
 
@@ -356,8 +355,7 @@ class Mesh:
         return self._transport.subscriber(key, on_sample)
 
     def poll_latest(self, key: str, kind: type[S], *, depth: int = RING_DEPTH) -> PolledSubscription[S]:
-        """Keeps the latest `depth` publications on `key`, without waking the event loop, until they are
-        taken."""
+        """Keeps the latest `depth` publications on `key`, without waking the event loop, until they are taken."""
         return PolledSubscription(*self._transport.ring(key, depth), kind, depth)
 
     # Frames
@@ -411,8 +409,7 @@ class Mesh:
 
 
 class _Collector(Collector):
-    """Passes replies to `each` in the event loop, until that returns true. Calls `over` then, or at the end,
-    once."""
+    """Passes replies to `each` in the event loop, until that returns true. Calls `over` then, or at the end, once."""
 
     def __init__(self, inbox: Inbox, each: OnReply, over: Callable[[], None]) -> None:
         self._inbox, self._each, self._over = inbox, each, over

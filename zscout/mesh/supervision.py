@@ -34,10 +34,9 @@ T = TypeVar("T")
 class Supervisor:
     """Owns the tasks, timers and guarded handlers of one service.
 
-    The first of them that raises is logged with its traceback, `on_failure(error)` is called, once, and all
-    others are cancelled. Failures after that, of tasks that are being cancelled, are logged only. A
-    supervisor that failed or was cancelled runs nothing any more: a service that starts again takes a new
-    one.
+    The first of them that raises is logged with its traceback, `on_failure(error)` is called, once, and all others are
+    cancelled. Failures after that, of tasks that are being cancelled, are logged only. A supervisor that failed or was
+    cancelled runs nothing any more: a service that starts again takes a new one.
     """
 
     def __init__(self, name: str, on_failure: Callable[[Exception], object]) -> None:

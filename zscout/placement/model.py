@@ -1,14 +1,13 @@
 """What the load balancer knows of hosts and kinds of components, and how each metric scores a host.
 
-The greater score is the better host, whatever the unit. `load_average`, `processor_speed` and
-`available_memory` are the paper's (section 5). `composite` predicts how fast the component would run there: a
-processor shared by all who want it, and a memory that must hold it.
+The greater score is the better host, whatever the unit. `load_average`, `processor_speed` and `available_memory` are
+the paper's (section 5). `composite` predicts how fast the component would run there: a processor shared by all who want
+it, and a memory that must hold it.
 
-Metric `auto` (the paper's open question: which figures predict how well a component runs) keeps each
-placement with every metric's score of the chosen host, and, once the component has run for a while, with how
-well it ran. The metric whose scores agree best with that, by Spearman's rank correlation over the latest
-placements, is used for the next. One placement in ten is made by the metrics in turn: a bad host that is
-never tried is never known to be one.
+Metric `auto` (the paper's open question: which figures predict how well a component runs) keeps each placement with
+every metric's score of the chosen host, and, once the component has run for a while, with how well it ran. The metric
+whose scores agree best with that, by Spearman's rank correlation over the latest placements, is used for the next. One
+placement in ten is made by the metrics in turn: a bad host that is never tried is never known to be one.
 """
 
 from __future__ import annotations

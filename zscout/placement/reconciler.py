@@ -18,8 +18,7 @@ RUNNING: Final = ("running", "stopping")
 
 
 class Reconciler:
-    """Compares what tokens, hosts and earlier placers report with the placer's records, and acts on each
-    difference."""
+    """Compares what tokens, hosts and earlier placers report with the placer's records, and acts on each difference."""
 
     def __init__(self, state: PlacementState, lifecycle: Lifecycle, migrations: Migrations) -> None:
         self.state, self.lifecycle, self.migrations = state, lifecycle, migrations

@@ -11,13 +11,12 @@ A pass:
    are out, it is off limits and all others go on.
 6. Run a pass of `priority` over the rest.
 
-Nobody waits long for a search. Its time is counted in steps, a pass takes one slice of them, and another pass
-is asked for at once, so that the RCM answers between two slices. A search works on a snapshot: when the group
-has changed, it starts again from what is left of the best set. A group has only so many slices and rounds of
-votes, whatever happens meanwhile; then the best set that needs no more votes is taken, or `priority` decides.
+Nobody waits long for a search. Its time is counted in steps, a pass takes one slice of them, and another pass is asked
+for at once, so that the RCM answers between two slices. A search works on a snapshot: when the group has changed, it
+starts again from what is left of the best set. A group has only so many slices and rounds of votes, whatever happens
+meanwhile; then the best set that needs no more votes is taken, or `priority` decides.
 
-In each pass the outcome is worth at least what that of `priority` is, among the ARCs that no reservation
-holds back.
+In each pass the outcome is worth at least what that of `priority` is, among the ARCs that no reservation holds back.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """What a pass could change at all, in groups that can be decided apart.
 
-Most of a busy fleet is settled. A running ARC that no startable ARC could preempt stays; an ARC needing its
-exclusive RCs waits. The others are undecided. The index of the queue gives
-whom to look at: all but watchers, the watchers of RCs at which something was freed, and, where a running ARC
-may have to end, the watchers of what it holds.
+Most of a busy fleet is settled. A running ARC that no startable ARC could preempt stays; an ARC needing its exclusive
+RCs waits. The others are undecided. The index of the queue gives whom to look at: all but watchers, the watchers of RCs
+at which something was freed, and, where a running ARC may have to end, the watchers of what it holds.
 
-Undecided ARCs that share no RC, not even by way of others, are decided apart: so a slow voter delays no ARC
-outside its group, and the cost is that of the groups.
+Undecided ARCs that share no RC, not even by way of others, are decided apart: so a slow voter delays no ARC outside its
+group, and the cost is that of the groups.
 """
 
 from __future__ import annotations

@@ -171,8 +171,7 @@ class Optimal(Strategy):
 
 
 def decide(group: ConflictGroup, actions: Actions) -> bool:
-    """Takes the best set of a group, or leaves it to `priority`. False: votes are out; nothing changes
-    yet."""
+    """Takes the best set of a group, or leaves it to `priority`. False: votes are out; nothing changes yet."""
     proposals = None
     while proposals is None:
         if len(group.nogoods) > MAX_VETOES:

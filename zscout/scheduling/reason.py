@@ -1,5 +1,4 @@
-"""Why an ARC waits, or why a hold or a wait ended: data in effects and messages, text where people read
-it."""
+"""Why an ARC waits, or why a hold or a wait ended: data in effects and messages, text where people read it."""
 
 from __future__ import annotations
 
@@ -68,8 +67,7 @@ class Party(NamedTuple):
 
 
 class Reason(NamedTuple):
-    """A reason; `str` of it is its text. `number` counts `rcs`, of which the first `SHOWN` are named, or is a
-    quota."""
+    """A reason; `str` of it is its text. `number` counts `rcs`, of which the first `SHOWN` are named, or is a quota."""
 
     code: ReasonCode
     rcs: tuple[RcName, ...] = ()

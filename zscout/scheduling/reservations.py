@@ -1,16 +1,14 @@
 """Bounded waiting: once an ARC has waited for the fleet's patience it is *due*, and nobody may pass it.
 
-Shortest-first starves, and so does the larger set of ARCs where it is preferred to a smaller one. The remedy
-is that of batch schedulers, reservation with conservative backfill (Mu'alem and Feitelson, IEEE TPDS 12(6),
-2001), on distinct RCs instead of many equal processors, and with a date: what is reserved is the time from
-which the ARC is due, so that no ARC is held back that would be over by then. Minimum runtimes are
-exact, so reservations are.
+Shortest-first starves, and so does the larger set of ARCs where it is preferred to a smaller one. The remedy is that of
+batch schedulers, reservation with conservative backfill (Mu'alem and Feitelson, IEEE TPDS 12(6), 2001), on distinct RCs
+instead of many equal processors, and with a date: what is reserved is the time from which the ARC is due, so that no
+ARC is held back that would be over by then. Minimum runtimes are exact, so reservations are.
 
-From half its patience on, an ARC is *starving*. In the order of priority, then of waiting, each
-starving ARC is given the earliest time, from when it is due, at which its RCs are free of the holders
-that are not preempted for it, and of the ARCs that were starving before it. An ARC of equal or lower priority
-that shares an RC with it may start only if it is over by then, or if the RC is sharable and accepts it
-beside everyone concerned.
+From half its patience on, an ARC is *starving*. In the order of priority, then of waiting, each starving ARC is given
+the earliest time, from when it is due, at which its RCs are free of the holders that are not preempted for it, and of
+the ARCs that were starving before it. An ARC of equal or lower priority that shares an RC with it may start only if it
+is over by then, or if the RC is sharable and accepts it beside everyone concerned.
 
 `docs/scheduling.md` states the promise that follows, and what else was tried.
 """
@@ -48,8 +46,7 @@ class ReservationConflict(NamedTuple):
 def reservations(state: SchedulerState, patience: Ns, last: Reservations | None) -> Reservations:
     """What is reserved now: the `last` that was found, if nothing has changed that it depends on.
 
-    Passing time alone does not change the RCs or their order; for an ARC already due no backfill is
-    possible."""
+    Passing time alone does not change the RCs or their order; for an ARC already due no backfill is possible."""
     state.index.mark_starving(state.now - patience // 2, state.queued)
     if last is not None and last.made_of == _versions(state):
         return last

@@ -330,8 +330,7 @@ class SchedulerState:
         return hold
 
     def expired_arcs(self) -> Iterator[Arc]:
-        """The running ARCs whose minimum runtime is over by now, each once; the caller may end others
-        meanwhile."""
+        """The running ARCs whose minimum runtime is over by now, each once; the caller may end others meanwhile."""
         while self._ends and self._ends[0][0] <= self.now:
             arc = self.running.get(heapq.heappop(self._ends)[1])
             if arc is not None and arc.hold is not None and arc.hold.end <= self.now:

@@ -63,8 +63,7 @@ class Client:
     def connect(
         cls, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None
     ) -> Connecting[Self]:
-        """Joins the mesh: await the result, or enter it. `name` must be the only one of this host; the
-        default is.
+        """Joins the mesh: await the result, or enter it. `name` must be the only one of this host; the default is.
 
         Without a `fleet`, the one that ZSCOUT_FLEET names, or the default. Raises MeshError, BadInput."""
         return Connecting(cls._connect(name, fleet, host))

@@ -160,8 +160,7 @@ class OpenArc:
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
 
     def take_first(self, notice: Notice, now: Ns) -> bool:
-        """Applies the first notice of an expected request. False if it is none: an old one, or not
-        credible."""
+        """Applies the first notice of an expected request. False if it is none: an old one, or not credible."""
         self.state = "asking"
         if notice.state != "ended" and self.take(notice, now):
             return True

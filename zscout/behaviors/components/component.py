@@ -149,8 +149,7 @@ def installed_kinds() -> dict[str, str]:
 
 
 def load_kind(kind: str, where: str) -> type[Component]:
-    """The class of a kind at `where`, as `installed_kinds` gives it. Raises BadKind, and what its import
-    raises."""
+    """The class of a kind at `where`, as `installed_kinds` gives it. Raises BadKind, and what its import raises."""
     module_name, _, attributes = where.partition(":")
     found: Any = importlib.import_module(module_name.strip())
     for attribute in attributes.partition("[")[0].strip().split("."):

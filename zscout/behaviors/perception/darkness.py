@@ -95,8 +95,7 @@ def analyse(picture: Picture) -> View:
 
 
 def _places(light: NDArray[np.float32], lit: float) -> tuple[DarkPlace, ...]:
-    """Candidates of all levels; of those that overlap, the widest at the darkest level that still holds
-    it."""
+    """Candidates of all levels; of those that overlap, the widest at the darkest level that still holds it."""
     # A little smoothing along the rows: noise does not break a gap, edges between rows stay.
     smooth = light.copy()
     smooth[:, 1:-1] = (light[:, :-2] + light[:, 1:-1] + light[:, 2:]) / 3

@@ -52,8 +52,7 @@ _LINEAR: Final = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 
 
 def grey_picture(data: bytes) -> NDArray[np.uint8] | None:
-    """A JPEG picture from outside, grey, of shape (height, width); None for what is none or has over
-    MAX_PIXELS."""
+    """A JPEG picture from outside, grey, of shape (height, width); None for what is none or has over MAX_PIXELS."""
     size = jpeg_size(data)
     if size is None or size[0] * size[1] > MAX_PIXELS:
         return None

@@ -36,8 +36,7 @@ BLOCKS: Final = 20
 LEARN: Final = 6.0
 """Seconds in which the background follows what is no motion."""
 ABSORB: Final = 30.0
-"""Seconds in which it follows what is. The variance is fed by the square of it, and so
-follows much sooner."""
+"""Seconds in which it follows what is. The variance is fed by the square of it, and so follows much sooner."""
 WARM: Final = 1.0
 """Seconds of the first look: all is background, and nothing is reported."""
 WARM_PICTURES: Final = 4

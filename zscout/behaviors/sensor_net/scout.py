@@ -25,8 +25,7 @@ SUSPECTS: Final = 2
 BAD_FOR: Final = 60.0
 """Seconds for which a channel that showed nothing is avoided."""
 NO_SIGNAL_TIMEOUT: Final = 4.0
-"""Seconds without any picture at the end of a hold that prove a receiver dead: framegrabbers give up after
-five."""
+"""Seconds without any picture at the end of a hold that prove a receiver dead: framegrabbers give up after five."""
 REMIND: Final = 4.0
 """Seconds without a good picture, above any warm-up, after which a robot may not have received the command to
 transmit."""

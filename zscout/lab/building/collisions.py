@@ -57,9 +57,8 @@ class Obstacles:
     def push_out(
         self, x: float, y: float, radius: float, others: list[tuple[float, float, float]]
     ) -> tuple[float, float]:
-        """A place nearby for a circle that overlaps nothing, found by pushing it out of one thing after the
-        other. `others` are circles (x, y, radius). In a corner too narrow the place may still overlap: ask
-        `gap`."""
+        """A place nearby for a circle that overlaps nothing, found by pushing it out of one thing after the other.
+        `others` are circles (x, y, radius). In a corner too narrow the place may still overlap: ask `gap`."""
         for _ in range(_ROUNDS):
             before = (x, y)
             x, y = self._into_room(x, y, radius)

@@ -141,8 +141,7 @@ def _check_light(light: Light, plan: Plan, where: Where) -> None:
 
 
 def check_starts(plan: Plan, top: Where) -> None:
-    """Refuses robots that start within a wall, furniture or each other: they would never move. Raises
-    BadInput."""
+    """Refuses robots that start within a wall, furniture or each other: they would never move. Raises BadInput."""
     # numpy is loaded by them: most commands need no building.
     from zscout.lab.building.bodies import RADIUS
     from zscout.lab.building.collisions import Obstacles

@@ -1,10 +1,9 @@
 """The radio's end of a serial line: a pty that carries no more than the line it stands for.
 
-A pty hands over as fast as one can copy. So bytes are taken out of it only as the line would have carried
-them, at a tenth of its baud rate a second (a byte has ten bits there); the rest stays in the kernel, and a
-writer that is too quick finds it full. The kernel would keep some 20 kB; once more than a UART's 4 kB wait,
-the line's output is stopped until there is room again. What comes out is decoded, some packets are lost, and
-the others are received.
+A pty hands over as fast as one can copy. So bytes are taken out of it only as the line would have carried them, at a
+tenth of its baud rate a second (a byte has ten bits there); the rest stays in the kernel, and a writer that is too
+quick finds it full. The kernel would keep some 20 kB; once more than a UART's 4 kB wait, the line's output is stopped
+until there is room again. What comes out is decoded, some packets are lost, and the others are received.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A building served in real time: its radio on a serial line, its cameras over HTTP, its clock with ours.
 
-One thread has the world: it steps it, draws what somebody watches, and lists who is where, one after the
-other. The event loop carries the radio's bytes and the pictures, so that these are quick while a picture is
-drawn.
+One thread has the world: it steps it, draws what somebody watches, and lists who is where, one after the other. The
+event loop carries the radio's bytes and the pictures, so that these are quick while a picture is drawn.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""What stands in a room as upright boxes: walls and furniture taken apart into what light, robots and cameras
-meet."""
+"""What stands in a room as upright boxes: walls and furniture taken apart into what light, robots and cameras meet."""
 
 from __future__ import annotations
 

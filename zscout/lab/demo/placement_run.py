@@ -165,8 +165,7 @@ class PlacementDemo(DemoRunner):
 
 
 async def play(chosen: Sequence[tuple[str, Policy]], out: Path | None, *, as_json: bool) -> int:
-    """One trial for each scenario and policy, on fresh nodes; returns the exit code. Raises LabError,
-    MeshError."""
+    """One trial for each scenario and policy, on fresh nodes; returns the exit code. Raises LabError, MeshError."""
     began, done = time.monotonic(), []
 
     def show(at: float, text: str) -> None:

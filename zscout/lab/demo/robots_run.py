@@ -39,8 +39,7 @@ TAKEOVER: Final = 37.5
 DRIVES: Final = 9.0
 """Seconds of the building that the operator drives."""
 GUARDS: Final = (15.0, 60.0)
-"""Seconds of the building that the net is watched once all are hidden: at least, and at most if nobody
-walks by."""
+"""Seconds of the building that the net is watched once all are hidden: at least, and at most if nobody walks by."""
 WORST: Final = 150.0
 """Seconds of ours after which the demo ends, placed or not."""
 PATROL: Final[tuple[tuple[Way, float], ...]] = (("forward", 2.25), ("left", 1.5), ("forward", 2.25), ("right", 1.5))

@@ -1,5 +1,4 @@
-"""What all demos share: nodes in a fleet of their own, watched, recorded, and ended with whoever started
-them."""
+"""What all demos share: nodes in a fleet of their own, watched, recorded, and ended with whoever started them."""
 
 from __future__ import annotations
 
@@ -66,8 +65,7 @@ class DemoRunner(ABC):
         """Leaves the mesh, before the processes end."""
 
     async def run(self) -> None:
-        """Plays the demo. Raises what `play` raises, and LabError as soon as a process ends that should
-        not."""
+        """Plays the demo. Raises what `play` raises, and LabError as soon as a process ends that should not."""
         task = asyncio.ensure_future(self.play())
         try:
             await asyncio.wait({task, self._failed}, return_when=asyncio.FIRST_COMPLETED)

@@ -47,8 +47,7 @@ def _node(mesh: Mesh) -> MemoryTransport:
 class MemoryNetwork:
     """The processes of a fleet, and the links between them.
 
-    All times are seconds. `delay` is that of every link, and `lease` how long a process waits for a silent
-    peer."""
+    All times are seconds. `delay` is that of every link, and `lease` how long a process waits for a silent peer."""
 
     def __init__(self, *, delay: float = 0.0002, lease: float = 1.0, seed: int = 0) -> None:
         self.delay, self.lease = delay, lease

@@ -54,8 +54,7 @@ class HideOutcome:
     building: str
     seed: int
     hidden_at: float | None
-    """Seconds from the first picture until the controller reports that it is hidden; None if it never
-    does."""
+    """Seconds from the first picture until the controller reports that it is hidden; None if it never does."""
     dark: bool
     """The floor at the robot has less than a quarter of the median light."""
     faces_light: bool

@@ -1,8 +1,7 @@
 """The component placer on the mesh, beside the leading RCM: a pure core, its requests and its commands.
 
-What is requested and observed becomes an event of the core; its effects become queries to nodes, whose
-answers are events again. Each change is published, for the candidates that may have to go on and for all who
-watch.
+What is requested and observed becomes an event of the core; its effects become queries to nodes, whose answers are
+events again. Each change is published, for the candidates that may have to go on and for all who watch.
 """
 
 from __future__ import annotations

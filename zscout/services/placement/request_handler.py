@@ -55,8 +55,7 @@ class _Waiting:
 
 
 class PlacerRequestHandler:
-    """`receive` gives the event of a request, which the caller feeds to the core between `begin` and
-    `finish`."""
+    """`receive` gives the event of a request, which the caller feeds to the core between `begin` and `finish`."""
 
     def __init__(self, placer: Placer, term: Term, supervisor: Supervisor) -> None:
         self._placer, self.term, self._supervisor = placer, term, supervisor

@@ -1,7 +1,6 @@
 """Which clients and RCs are there: liveliness tokens and what RCs report, as events.
 
-An RC may be granted once it has promised to obey this term; a client with requests must have a token within
-a lease.
+An RC may be granted once it has promised to obey this term; a client with requests must have a token within a lease.
 """
 
 from __future__ import annotations

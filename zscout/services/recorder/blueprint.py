@@ -109,8 +109,7 @@ def page(
 
 
 def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout) -> rrb.View | rrb.Container:
-    """The panes at the right, from the top: the floor, the cameras, events and curves; as tabs if there are
-    robots."""
+    """The panes at the right, from the top: the floor, the cameras, events and curves; as tabs if there are robots."""
 
     def curves(origin: str, name: str) -> rrb.View:
         # A legend of many would cover the curves.

@@ -90,8 +90,7 @@ class Drawing:
             self.event(at, f"timeline: {text}", "WARN")
 
     def room(self, at: float, known: Sized, limit: int, others: str) -> bool:
-        """Whether there may be one more; if not, that is noted: more than so many of what, and what of the
-        others."""
+        """Whether there may be one more; if not, that is noted: more than so many of what, and what of the others."""
         if len(known) < limit:
             return True
         self.note(at, f"more than {limit} {others}")

@@ -40,8 +40,7 @@ MAX_OTHERS: Final = 2_000
 POSE_SPACING: Final = 0.09
 """Seconds between two records of where all are."""
 SILENCE: Final = 10.0
-"""Seconds without a message from a building after which it is not known who is where, and another may be
-shown."""
+"""Seconds without a message from a building after which it is not known who is where, and another may be shown."""
 PLAN_AGAIN: Final = 5.0
 """Seconds until a plan that did not come is asked for again."""
 MAX_TRAILS: Final = 256

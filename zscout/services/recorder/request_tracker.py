@@ -1,5 +1,4 @@
-"""Requests and holders of RCs as an RCM publishes them, put together for the timeline: pure; times are passed
-in."""
+"""Requests and holders of RCs as an RCM publishes them, put together for the timeline: pure; times are passed in."""
 
 from __future__ import annotations
 

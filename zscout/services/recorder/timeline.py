@@ -40,10 +40,9 @@ class TimelineError(BadInput):
 class Timeline(Drawing):
     """The Rerun side of a recorder. After `close` every call does nothing.
 
-    `fleet` names the recording, together with the time of the start. `path`: the `.rrd` file, replaced if it
-    is there, or None. `port`: the live server's TCP port on the IP address `bind`, 0 for a free one, or None
-    for no server; one of file and server there must be. Raises TimelineError if the port is taken or the file
-    can't be written.
+    `fleet` names the recording, together with the time of the start. `path`: the `.rrd` file, replaced if it is there,
+    or None. `port`: the live server's TCP port on the IP address `bind`, 0 for a free one, or None for no server; one
+    of file and server there must be. Raises TimelineError if the port is taken or the file can't be written.
     """
 
     def __init__(self, fleet: str, *, path: Path | None, bind: str = "127.0.0.1", port: int | None = None) -> None:

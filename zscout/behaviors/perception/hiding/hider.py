@@ -3,10 +3,9 @@
     hider = Hider(seed=33)
     command = hider.see(now, picture)      # at every picture, or None when there is no new one
 
-The paper's Place Sensor Net, per robot: locate the dark place, servo to it, handle collisions, turn to the
-light. There is no odometry and no answer from the robot: turns are measured in the pictures (`compass`),
-drives are dead-reckoned and corrected by what comes into view. The phases stand in `PHASES`; everything they
-remember is one `HidingState`.
+The paper's Place Sensor Net, per robot: locate the dark place, servo to it, handle collisions, turn to the light. There
+is no odometry and no answer from the robot: turns are measured in the pictures (`compass`), drives are dead-reckoned
+and corrected by what comes into view. The phases stand in `PHASES`; everything they remember is one `HidingState`.
 """
 
 from __future__ import annotations
@@ -55,8 +54,7 @@ PHASES: Final[dict[Phase, PhaseCode]] = {
 RESUMES: Final[dict[Phase, Phase]] = {"hidden": "check", "check": "check", "face": "face", "settle": "face"}
 """Where a phase goes on that was in the dark when the hold was lost; all others search anew."""
 LONGEST_GAP: Final = 5.0
-"""Seconds that count between two pictures at most: longer ones, and clocks that go back, are another
-host's."""
+"""Seconds that count between two pictures at most: longer ones, and clocks that go back, are another host's."""
 BLIND: Final = 0.8
 """Seconds without a good picture after which the robot stands."""
 REPORTS: Final = 2.0

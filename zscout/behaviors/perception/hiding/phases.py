@@ -59,8 +59,7 @@ DARK_ENOUGH: Final = 0.19
 DARKISH: Final = 0.4
 """Share up to which it may be darker further in."""
 ROOFED: Final = 0.28
-"""Share up to which what is above counts as dark: 0.03 to 0.2 beneath furniture, 0.45 and more on a dark
-rug."""
+"""Share up to which what is above counts as dark: 0.03 to 0.2 beneath furniture, 0.45 and more on a dark rug."""
 DEEPER: Final = 0.18
 """Metres to back further in at once."""
 NEARER: Final = 0.1

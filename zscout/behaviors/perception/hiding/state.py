@@ -1,13 +1,12 @@
-"""All that a hider remembers, in one structure: a checkpoint is this, as MessagePack. And the moves that all
-phases share: turns that are measured, drives that are watched, what was seen where. Pure.
+"""All that a hider remembers, in one structure: a checkpoint is this, as MessagePack. And the moves that all phases
+share: turns that are measured, drives that are watched, what was seen where. Pure.
 
 Times are seconds of the hider's own clock, which begins at 0 and counts only what passed between pictures:
 after a move to another host, whose clock reads otherwise, it goes on. Places are dead-reckoned from where
 the hider began: metres, x along its first heading.
 
-A *hop* is a short turn on the spot, after which the robot waits until the picture stands still and measures
-how far it truly turned. A *cruise* is a drive with short commands, each with a time to live, one at every
-picture.
+A *hop* is a short turn on the spot, after which the robot waits until the picture stands still and measures how far it
+truly turned. A *cruise* is a drive with short commands, each with a time to live, one at every picture.
 """
 
 from __future__ import annotations
@@ -54,8 +53,7 @@ SURE: Final = 0.35
 WATCHED: Final = 0.5
 """Seconds of driving after which the near floor is another one."""
 SAME_FLOOR: Final = 0.5
-"""Likeness of the floor now and then from which on it is the same: 0.6 to 0.95 when stuck, below 0.35
-else."""
+"""Likeness of the floor now and then from which on it is the same: 0.6 to 0.95 when stuck, below 0.35 else."""
 BRIGHTER: Final = 4.0
 """How many times brighter than here the floor of a column that sees out is."""
 
@@ -127,8 +125,7 @@ class Opening(msgspec.Struct, frozen=True):
     outside: float
     """The lit floor."""
     above: float
-    """What is at the top of the picture: a wall or ceiling in the light is bright, the underside of a sofa
-    dark."""
+    """What is at the top of the picture: a wall or ceiling in the light is bright, the underside of a sofa dark."""
     sees_out: float
     """Share of columns that show lit floor."""
 
@@ -331,8 +328,7 @@ class HidingState(msgspec.Struct):
     # Cruises
 
     def cruise(self, speed: float, spin: float, why: str) -> WheelCommand:
-        """Drives on at `speed` (m/s, ahead positive) and `spin` (rad/s, left positive) until the next
-        picture."""
+        """Drives on at `speed` (m/s, ahead positive) and `spin` (rad/s, left positive) until the next picture."""
         half = spin * WHEEL_BASE / 2
         left, right = (speed - half) / TOP_SPEED, (speed + half) / TOP_SPEED
         most = max(1.0, abs(left), abs(right))

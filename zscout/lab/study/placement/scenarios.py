@@ -71,10 +71,9 @@ FLEETS: Final = ("processor_speed", "load_average", "available_memory")
 def deciding_fleet(decides: str, seed: int) -> tuple[list[Machine], list[SimulatedJob]]:
     """Eight machines that differ in load and memory, and 60 jobs that come and go within ten minutes.
 
-    `decides`: one of `FLEETS`. Speed decides where speeds differ, processors and memory are plenty, and the
-    load average misleads: it is of processes that wait for a disk. Load decides where speeds are equal and
-    processors few. Memory decides where jobs live by files in the cache, which no profile shows, and all else
-    is plenty."""
+    `decides`: one of `FLEETS`. Speed decides where speeds differ, processors and memory are plenty, and the load
+    average misleads: it is of processes that wait for a disk. Load decides where speeds are equal and processors few.
+    Memory decides where jobs live by files in the cache, which no profile shows, and all else is plenty."""
     rng = Random(seed)  # noqa: S311 - a simulation
     speed, load, memory = (decides == one for one in FLEETS)
     machines = [
