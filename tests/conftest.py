@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import tempfile
 
@@ -12,8 +13,14 @@ BYTECODE = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Tests start hundreds of Python processes. Where the environment forbids bytecode beside the sources,
-    each would compile all it imports anew: they keep it in a folder of this run instead."""
+    """Tests end processes by signals that nohup, or a shell in the background, made this one ignore, and its children
+    would too.
+
+    Tests start hundreds of Python processes. Where the environment forbids bytecode beside the sources, each would
+    compile all it imports anew: they keep it in a folder of this run instead."""
+    for number, action in ((signal.SIGHUP, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler)):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, action)
     if sys.dont_write_bytecode and "PYTHONDONTWRITEBYTECODE" in os.environ:
         del os.environ["PYTHONDONTWRITEBYTECODE"]
         folder = config.stash[BYTECODE] = tempfile.TemporaryDirectory(prefix="zscout-bytecode-")
