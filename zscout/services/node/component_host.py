@@ -15,7 +15,7 @@ from zscout.behaviors.components.component import installed_kinds
 from zscout.config.fleet import Fleet
 from zscout.config.node import MAX_KINDS, ComponentsConfig
 from zscout.keyexpr import BadName, check_name
-from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Supervisor
+from zscout.mesh import IncomingQuery, Mesh, Refused, Supervisor
 from zscout.messages import (
     MAX_ERROR,
     MAX_MOVE,
@@ -70,7 +70,6 @@ class ComponentHost:
         self._ended: OrderedDict[str, ComponentProcess] = OrderedDict()
         self._known: OrderedDict[str, int] = OrderedDict()
         """The highest incarnation of each component that was started here."""
-        self._served: Declaration | None = None
         self.supervisor = Supervisor("the component host", on_failure)
         self._underway = 0
         self._stopping = False
@@ -84,18 +83,16 @@ class ComponentHost:
         """Ends all components, side by side, each within GRACE seconds."""
         self._stopping = True
         await asyncio.gather(*(process.stop(GRACE) for process in list(self._living.values())))
-        if self._served is not None:
-            self._served.close()
+        self._served.close()
         await self.supervisor.close()
 
     def running(self) -> list[RunningComponent]:
         """For the load report; may be called from any thread."""
-        found = []
-        for process in list(self._living.values()):
-            pid, start = process.pid, process.start
-            if pid is not None:
-                found.append(RunningComponent(start.component, start.spec.kind, start.incarnation, pid))
-        return found
+        return [
+            RunningComponent(process.start.component, process.start.spec.kind, process.start.incarnation, pid)
+            for process in list(self._living.values())
+            if (pid := process.pid) is not None
+        ]
 
     # What is asked
 
@@ -135,8 +132,7 @@ class ComponentHost:
             case ReadOutput():
                 process = self._find(operation.component)
                 start, end, text = process.output.read(operation.start)
-                over = process.output.over
-                return Output(operation.component, process.start.incarnation, start, end, text, over)
+                return Output(operation.component, process.start.incarnation, start, end, text, process.output.over)
             case MoveComponent():
                 check_name(operation.to, "host")
                 if operation.to == self.mesh.me.host or operation.to_incarnation <= operation.incarnation:
@@ -166,14 +162,14 @@ class ComponentHost:
         self._check(start)
         kinds = await asyncio.to_thread(installed_kinds)
         # Another one may have asked meanwhile.
-        process = self._same(start)
-        if process is not None:
+        if process := self._same(start):
             return process
         where = kinds.get(start.spec.kind)
         if where is None:
             there = ", ".join(self._startable(kinds)) or "none"
-            message = f"no kind {start.spec.kind!r} is installed here; there are {there}"
-            raise Refused("unknown_kind", message[:MAX_ERROR])
+            raise Refused(
+                "unknown_kind", f"no kind {start.spec.kind!r} is installed here; there are {there}"[:MAX_ERROR]
+            )
         if len(self._living) >= self._rules.max:
             raise Refused("too_many", f"{len(self._living)} components run here; [components] max allows no more")
         if self._stopping:

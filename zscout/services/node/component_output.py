@@ -18,9 +18,6 @@ LAST_READS: Final = 32
 """Chunks that are read of what is left when a component has ended."""
 
 
-_UTF8: Final = codecs.getincrementaldecoder("utf-8")
-
-
 class OutputRing:
     """The last `size` bytes of a stream. Places are counted in bytes from its beginning."""
 
@@ -47,7 +44,7 @@ class OutputRing:
         """What there is from byte `start` on: where it begins and ends, and the text, with U+FFFD for what is
         no UTF-8. A character that is not whole yet is left for the next time."""
         first = min(max(start, self.start), self.end)
-        decoder = _UTF8("replace")
+        decoder = codecs.getincrementaldecoder("utf-8")("replace")
         text = decoder.decode(self._bytes[first - self.start :], final=self.over)
         unfinished, _ = decoder.getstate()
         return first, self.end - len(unfinished), text
@@ -80,11 +77,7 @@ class OutputReader:
         if not count or self._credit < 0:
             self._loop.remove_reader(self._fd)
         if count and self._credit < 0:
-            self._again = self._loop.call_later(-self._credit / RATE, self._resume)
-
-    def _resume(self) -> None:
-        self._again = None
-        self._loop.add_reader(self._fd, self._readable)
+            self._again = self._loop.call_later(-self._credit / RATE, self._loop.add_reader, self._fd, self._readable)
 
     def _read(self) -> int | None:
         """How many bytes were read; None: nothing is there now, 0: nobody holds the other end any more."""
@@ -99,8 +92,7 @@ class OutputReader:
         """Reads what is there still, and closes the pipe, whoever writes to it."""
         if self._again is not None:
             self._again.cancel()
-        else:
-            self._loop.remove_reader(self._fd)
+        self._loop.remove_reader(self._fd)
         for _ in range(LAST_READS):
             if not self._read():
                 break

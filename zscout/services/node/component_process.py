@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import os
 import signal
@@ -83,7 +84,7 @@ class ComponentProcess:
         self._gone = False
         """Its process is no more, but not everything of it is cleared up."""
         self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
-        self._number = 0
+        self._numbers = itertools.count(1)
         self._moving: tuple[MoveComponent, asyncio.Task[Moved]] | None = None
 
     @property
@@ -103,7 +104,6 @@ class ComponentProcess:
 
     def view(self) -> ComponentView:
         lasted = self._lasted if self._lasted is not None else clock.now() - self._began
-        failed = self.ended == "failed"
         return ComponentView(
             component=self.start.component,
             incarnation=self.start.incarnation,
@@ -115,7 +115,7 @@ class ComponentProcess:
             pid=self.pid,
             ended=self.ended,
             reason=self.reason if self.ended is not None else self._group.missing,
-            tail=self.output.tail() if failed else "",
+            tail=self.output.tail() if self.ended == "failed" else "",
         )
 
     # Orders. Each raises Refused.
@@ -124,7 +124,7 @@ class ComponentProcess:
         """Returns when it has ended: by itself within `grace` seconds, or killed."""
         if self.phase != "ended":
             self.phase = "stopping"
-            self._order(messages.StopComponent(self.start.component))
+            self._send(Order(0, messages.StopComponent(self.start.component)))
         try:
             async with asyncio.timeout(grace):
                 await self.over.wait()
@@ -134,8 +134,7 @@ class ComponentProcess:
 
     async def checkpoint(self) -> bytes:
         self._check_runs()
-        answer = await self._ask(messages.CheckpointComponent(self.start.component), PATIENCE + SLACK)
-        return answer.state
+        return (await self._ask(messages.CheckpointComponent(self.start.component), PATIENCE + SLACK)).state
 
     async def move(self, order: MoveComponent) -> Moved:
         """Asked again for the same move it answers with the outcome of that one."""
@@ -164,7 +163,7 @@ class ComponentProcess:
 
     async def activate(self, order: messages.ActivateComponent) -> None:
         """Returns when it runs, or has ended."""
-        self._order(order)
+        self._send(Order(0, order))
         await self.running.wait()
 
     def _check_runs(self) -> None:
@@ -172,12 +171,11 @@ class ComponentProcess:
             raise Refused("bad_request", f"{self.start.component} is {self.phase} here; it must run for that")
 
     async def _ask(self, operation: Operation, timeout: float | None) -> OrderAnswer:
-        self._number += 1
-        number = self._number
+        number = next(self._numbers)
         answered: asyncio.Future[OrderAnswer] = asyncio.get_running_loop().create_future()
         self._waiting[number] = answered
         try:
-            self._order(operation, number)
+            self._send(Order(number, operation))
             async with asyncio.timeout(timeout):
                 answer = await answered
         except TimeoutError:
@@ -188,9 +186,6 @@ class ComponentProcess:
             raise Refused(answer.problem.code, answer.problem.message)
         return answer
 
-    def _order(self, operation: Operation, number: int = 0) -> None:
-        self._send(Order(number, operation))
-
     def _send(self, message: msgspec.Struct) -> None:
         if self._writer is not None and not self._writer.is_closing():
             self._writer.write(channel.pack(message))
@@ -198,7 +193,8 @@ class ComponentProcess:
     # Its life
 
     async def _live(self) -> None:
-        late = self._supervisor.call_later(self._fleet.placement.start_timeout / SECOND, self._late)
+        timeout = self._fleet.placement.start_timeout / SECOND
+        late = self._supervisor.call_later(timeout, self._late, timeout)
         try:
             await self._run_child()
         except OSError as error:
@@ -220,14 +216,13 @@ class ComponentProcess:
         output = OutputReader(reading, self.output)
         try:
             with theirs:
-                self._child = await asyncio.to_thread(self._spawn, theirs.fileno(), writing)
+                self._child = child = await asyncio.to_thread(self._spawn, theirs.fileno(), writing)
         except OSError:
             ours.close()
             output.finish()
             raise
         finally:
             os.close(writing)
-        child = self._child
         try:
             # It waits for its job: what it uses from now on counts.
             await asyncio.to_thread(self._group.enter, child.pid)
@@ -246,10 +241,9 @@ class ComponentProcess:
         loop = asyncio.get_running_loop()
         stream, writer = await asyncio.open_unix_connection(sock=connection, limit=channel.MAX_FRAME)
         self._writer = writer
-        each = self._group.each
-        self._send(ComponentJob(self.start, self._where, self._host, self._fleet, self._tag, each))
+        self._send(ComponentJob(self.start, self._where, self._host, self._fleet, self._tag, self._group.each))
         if self.phase == "stopping":
-            self._order(messages.StopComponent(self.start.component))
+            self._send(Order(0, messages.StopComponent(self.start.component)))
         if self._verdict is not None:
             self._kill(self._verdict)
         gone = asyncio.Event()
@@ -281,11 +275,9 @@ class ComponentProcess:
         )
 
     async def _receive(self, stream: asyncio.StreamReader) -> None:
+        report: ComponentReport | None
         try:
-            while True:
-                report: ComponentReport | None = await channel.read(stream, ComponentReport)
-                if report is None:
-                    return
+            while (report := await channel.read(stream, ComponentReport)) is not None:
                 self._on_message(report)
         except BadFrame as error:
             self._kill(EndReport("failed", f"it was killed: what it sent to its node is no message: {error}"))
@@ -309,9 +301,8 @@ class ComponentProcess:
                 if waiting is not None and not waiting.done():
                     waiting.set_result(report)
 
-    def _late(self) -> None:
+    def _late(self, timeout: float) -> None:
         if not self.settled.is_set():
-            timeout = self._fleet.placement.start_timeout / SECOND
             self._kill(EndReport("failed", f"it was killed: it did not get ready within {timeout:g} s"))
 
     def _kill(self, verdict: EndReport) -> None:
@@ -348,9 +339,6 @@ class ComponentProcess:
         if code == -signal.SIGKILL and self._group.overdrawn():
             return EndReport("failed", f"killed: used more memory than its limit of {self._group.memory} bytes")
         if code is not None and code < 0:
-            try:
-                name = signal.Signals(-code).name
-            except ValueError:
-                name = f"signal {-code}"
-            return EndReport("failed", f"killed by {name}")
+            known = {number.value: number.name for number in signal.Signals}
+            return EndReport("failed", f"killed by {known.get(-code, f'signal {-code}')}")
         return EndReport("failed", f"its process left with code {code} and without a word")

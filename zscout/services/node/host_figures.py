@@ -1,8 +1,7 @@
 """What a host is and has: processors, their speed and use, memory, temperature. Read from the system.
 
-The limits of a container, by its control groups (cgroup v2, v1, or both at once), count where they are
-smaller than the host. A file that is missing or makes no sense is no limit.
-"""
+The limits of a container, by its control groups (cgroup v2, v1, or both at once), count where they are smaller than the
+host. A file that is missing or makes no sense is no limit."""
 
 from __future__ import annotations
 
@@ -10,11 +9,12 @@ import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, NamedTuple, TypeVar
 
 import psutil
+
+from zscout.types import SECOND
 
 WORK: Final = 12_000
 """Rounds of the piece of work that speed is measured by: about a millisecond on a plain machine of 2024."""
@@ -29,14 +29,11 @@ MAX_DEPTH: Final = 64
 """Groups within groups that are looked at."""
 MAX_BYTES: Final = 65_536
 """Of one file that is read."""
-MICROSECOND: Final = 1e-6
-NANOSECOND: Final = 1e-9
 
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
-class HostMemory:
+class HostMemory(NamedTuple):
     """In bytes."""
 
     available: int
@@ -69,15 +66,13 @@ class Cgroup:
         if limit is None:
             return None
         folder = limit[1]
-        spent = read_field(folder / "cpu.stat", "usage_usec")
-        if spent is not None:
-            return spent * MICROSECOND
+        if (spent := read_field(folder / "cpu.stat", "usage_usec")) is not None:
+            return spent / 1e6
         if folder in self._cpu:
             nested = folder.relative_to(self._cpu[0])
             for place in (folder, self._cpuacct / nested):
-                spent = _number(place / "cpuacct.usage")
-                if spent is not None:
-                    return spent * NANOSECOND
+                if (spent := _number(place / "cpuacct.usage")) is not None:
+                    return spent / SECOND
         return None
 
     def memory(self) -> HostMemory | None:

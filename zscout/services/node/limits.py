@@ -1,8 +1,7 @@
 """Limits of memory and processor time for components, by control groups (v1, or v2 where the node may).
 
-A component that has a limit gets a group of its own below the node's. Where that can't be had, memory is
-limited for each of its processes by itself (RLIMIT_DATA), and processor time is not.
-"""
+A component that has a limit gets a group of its own below the node's. Where that can't be had, memory is limited for
+each of its processes by itself (RLIMIT_DATA), and processor time is not."""
 
 from __future__ import annotations
 
@@ -69,9 +68,8 @@ class ComponentGroup:
         """The component is ready: from now on its limit of processor time holds. Before, START_CORES do, so
         that one that may use little later is ready in time."""
         if self.throttle is not None:
-            file, text = self.throttle
             with suppress(OSError):  # it has ended meanwhile
-                _write(file, text)
+                _write(*self.throttle)
 
     def overdrawn(self) -> bool:
         """Whether the kernel killed something of it because it used more memory than its limit."""
@@ -88,15 +86,13 @@ class ComponentGroup:
                     with suppress(OSError):
                         os.kill(pid, signal.SIGKILL)
                 try:
-                    folder.rmdir()
-                except FileNotFoundError:
+                    with suppress(FileNotFoundError):
+                        folder.rmdir()
                     break
                 except OSError as error:
                     if last == CLOSE_TRIES - 1:
                         log.warning("the control group %s can't be removed: %s", folder, error)
                     time.sleep(CLOSE_PAUSE)
-                else:
-                    break
         self.folders = []
 
 
@@ -220,11 +216,8 @@ def _quota(cores: float) -> int:
 
 def _write(file: Path, text: str) -> None:
     # Without O_CREAT: in a folder that is no control group nothing is to appear.
-    handle = os.open(file, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC)
-    try:
-        os.write(handle, text.encode())
-    finally:
-        os.close(handle)
+    with os.fdopen(os.open(file, os.O_WRONLY | os.O_TRUNC), "w") as opened:
+        opened.write(text)
 
 
 def _numbers(file: Path) -> list[int]:

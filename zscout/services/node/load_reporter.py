@@ -129,7 +129,7 @@ class TreeLoad:
 
 
 class Gauge:
-    """Measures one host again and again. Takes 30 ms to make; use it from one thread at a time."""
+    """Measures one host again and again, the first time for 30 ms; use it from one thread at a time."""
 
     def __init__(
         self, host: str, labels: tuple[str, ...] = (), running: Running = tuple, *, load: TreeLoad | None = None
@@ -139,8 +139,7 @@ class Gauge:
         self._cpu = CpuMeter(self._cgroup)
         self._load = load or self._host_load
         self._number = 0
-        self._speed = speed()
-        self._fresh = True
+        self._speed = 0.0
         self._speeds = Paced(self._measure_speed, least=SPEED_EVERY, share=1.0)
         self._clocks = Paced(clock, least=SENSORS_EVERY, share=SENSORS_SHARE)
         self._temperatures = Paced(temperature, least=SENSORS_EVERY, share=SENSORS_SHARE)
@@ -174,10 +173,7 @@ class Gauge:
         return os.getloadavg(), self._cpu.percent(size), ram.available
 
     def _measure_speed(self) -> float:
-        if self._fresh:
-            self._fresh = False
-            return self._speed
-        found = speed(SPEED_TRIES)
+        found = speed(SPEED_TRIES) if self._speed else speed()
         # A few tries may find a processor that was only asleep: believed at once if faster, else by halves.
         self._speed = found if found > self._speed else (self._speed + found) / 2
         return self._speed

@@ -252,11 +252,9 @@ def _read(path: str) -> bytes:
     """A small file of /proc; nothing if it has gone."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            return os.read(fd, 4_096)
+        finally:
+            os.close(fd)
     except OSError:
         return b""
-    try:
-        return os.read(fd, 4_096)
-    except OSError:
-        return b""
-    finally:
-        os.close(fd)

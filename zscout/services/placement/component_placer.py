@@ -1,8 +1,7 @@
 """The component placer on the mesh, beside the leading RCM: a pure core, its requests and its commands.
 
 What is requested and observed becomes an event of the core; its effects become queries to nodes, whose answers are
-events again. Each change is published, for the candidates that may have to go on and for all who watch.
-"""
+events again. Each change is published, for the candidates that may have to go on and for all who watch."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ from zscout.placement.events import (
 from zscout.placement.placer import Placer
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.placement.node_client import NodeClient
-from zscout.services.placement.request_handler import PlacerQuery, PlacerRequestHandler
+from zscout.services.placement.request_handler import PlacerRequestHandler
 from zscout.types import SECOND, HostName, Ns, Term
 
 log = logging.getLogger("zscout.placer")
@@ -62,7 +61,7 @@ class ComponentPlacer:
         self.mesh, self.term = mesh, term
         self._core = Placer(balancer.core, term.counter, fleet.placement)
         self._supervisor = Supervisor("the component placer", on_failure)
-        self._requests = PlacerRequestHandler(self._core, term, self._supervisor)
+        self._requests = PlacerRequestHandler(self._core, term, self._supervisor, self._feed)
         self._nodes = NodeClient(mesh, fleet.placement.start_timeout)
         self._inherited = inherited
         self._instances: dict[HostName, set[str]] = {}
@@ -83,7 +82,7 @@ class ComponentPlacer:
         for declared in (
             mesh.watch(keys.alive_any(Role.NODE), guard(self._on_node)),
             mesh.watch(keys.alive_any(Role.COMPONENT), guard(self._on_component)),
-            mesh.serve(keys.placer, PlacerOperation, guard(self._on_request)),
+            mesh.serve(keys.placer, PlacerOperation, guard(self._requests.receive)),
         ):
             self._declarations.callback(declared.close)
         self._begin_by = self._supervisor.call_later(BEGIN, self._begin)
@@ -119,9 +118,7 @@ class ComponentPlacer:
         for _ in range(LIST_TRIES):
             if node.instance not in self._instances.get(node.host, ()):
                 break
-            listing = await self._nodes.list_components(node.host, ListComponents())
-            if listing is not None:
-                self._feed(listing)
+            if await self._command(HostCommand(node.host, ListComponents())):
                 break
             await sleep(LIST_AGAIN)
         self._listed(node.host)
@@ -135,24 +132,12 @@ class ComponentPlacer:
         event = TokenAppeared if alive else TokenVanished
         self._feed(event(token.name, incarnation_of(token.instance), token.host))
 
-    # Requests
-
     def _begin(self) -> None:
         """Carries out requests from now on: all hosts have listed what runs there, or had their time."""
         if self._begin_by is not None:
             self._begin_by.cancel()
             self._begin_by = None
-            for query, event in self._requests.open():
-                self._carry_out_request(query, event)
-
-    def _on_request(self, query: PlacerQuery) -> None:
-        event = self._requests.receive(query)
-        if event is not None:
-            self._carry_out_request(query, event)
-
-    def _carry_out_request(self, query: PlacerQuery, event: PlacerEvent) -> None:
-        self._requests.begin(query)
-        self._requests.finish(query, self._feed(event))
+            self._requests.open()
 
     # Events into the core, effects out of it
 
@@ -175,15 +160,16 @@ class ComponentPlacer:
             self._publish(changed, cordoned)
         return refusals
 
-    async def _command(self, command: HostCommand) -> None:
+    async def _command(self, command: HostCommand) -> bool:
+        """Whether anything came of it."""
         event = await self._nodes.carry_out(command)
         if event is not None:
             self._feed(event)
+        return event is not None
 
     def _wake_at(self, at: Ns | None) -> None:
         if self._wake is not None:
             self._wake.cancel()
-        self._wake = None
         if at is not None:
             delay = max(0.0, (at - self.mesh.now()) / SECOND)
             self._wake = self._supervisor.call_later(delay, self._woken, at)

@@ -1,7 +1,5 @@
-"""What every candidate keeps of the placer's publications, so that it can go on when it leads.
-
-What runs, the nodes list; what ran on a host that died together with the leader, nobody else would know.
-"""
+"""What every candidate keeps of the placer's publications, so that it can go on when it leads: what runs, the nodes
+list; what ran on a host that died together with the leader, nobody else would know."""
 
 from __future__ import annotations
 

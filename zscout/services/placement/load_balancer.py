@@ -86,5 +86,4 @@ class LoadBalancer:
             check_name(host, "host")
         ranking = self.core.rank(self.mesh.now(), RankQuery.of(ask), ask.at_most)
         left_out = dict(itertools.islice(ranking.left_out.items(), ask.at_most))
-        hosts = list(ranking.hosts)
-        query.answer(HostRanking(hosts, ranking.metric, ranking.why, left_out, ranking.more))
+        query.answer(HostRanking(list(ranking.hosts), ranking.metric, ranking.why, left_out, ranking.more))

@@ -51,14 +51,10 @@ class NodeClient:
             case MoveComponent() as move:
                 return await self._move(command.host, move)
             case ListComponents() as listing:
-                return await self.list_components(command.host, listing)
-
-    async def list_components(self, host: HostName, listing: ListComponents) -> ComponentsListed | None:
-        """None: no answer."""
-        reply = await self._ask(host, listing, ComponentList, LIST_TIMEOUT)
-        if reply is None or reply.message is None:
-            return None
-        return ComponentsListed(host, reply.message.components, listing.component)
+                reply = await self._ask(command.host, listing, ComponentList, LIST_TIMEOUT)
+                if reply is None or reply.message is None:
+                    return None
+                return ComponentsListed(command.host, reply.message.components, listing.component)
 
     async def _start(self, host: HostName, start: StartComponent) -> StartAnswered:
         answered = partial(StartAnswered, start.component, start.incarnation, host)

@@ -1,13 +1,9 @@
-"""Requests of operators and programs to the placer: what each is for the core, and when it is answered.
-
-A request to place, end or move a component is answered once the component is in a state that ends it, or when
-its `wait` is over.
-"""
+"""Requests of operators and programs to the placer: what each is for the core, and when it is answered."""
 
 from __future__ import annotations
 
 from asyncio import TimerHandle
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -55,33 +51,37 @@ class _Waiting:
 
 
 class PlacerRequestHandler:
-    """`receive` gives the event of a request, which the caller feeds to the core between `begin` and `finish`."""
+    """Answers a request to place, end or move a component once it is in a state that ends that, or when its `wait` is
+    over. `feed` gives an event to the core, and returns what the core refused."""
 
-    def __init__(self, placer: Placer, term: Term, supervisor: Supervisor) -> None:
-        self._placer, self.term, self._supervisor = placer, term, supervisor
+    def __init__(
+        self, placer: Placer, term: Term, supervisor: Supervisor, feed: Callable[[PlacerEvent], list[PlacementRefused]]
+    ) -> None:
+        self._placer, self.term, self._supervisor, self._feed = placer, term, supervisor, feed
         self._early: list[tuple[PlacerQuery, PlacerEvent]] = []
         self._is_open = False
         self._waiting: dict[PlacerQuery, _Waiting] = {}
 
-    def receive(self, query: PlacerQuery) -> PlacerEvent | None:
-        """None: it is answered, or kept until `open`. Raises Refused and BadName."""
+    def receive(self, query: PlacerQuery) -> None:
+        """Answers it, carries it out or keeps it until `open`. Raises Refused and BadName."""
         operation = query.message
         if isinstance(operation, ListPlacements):
             query.answer(self.placements(operation.component))
-            return None
+            return
         if len(self._early) + len(self._waiting) >= MAX_WAITING:
             raise Refused("busy", "too many operations are waiting here; ask again")
         event = _event_of(operation)
         if self._is_open:
-            return event
-        self._early.append((query, event))
-        return None
+            self._carry_out(query, event)
+        else:
+            self._early.append((query, event))
 
-    def open(self) -> list[tuple[PlacerQuery, PlacerEvent]]:
-        """From now on requests are carried out. Returns those that came before."""
+    def open(self) -> None:
+        """From now on requests are carried out, first those that came before."""
         self._is_open = True
         early, self._early = self._early, []
-        return early
+        for query, event in early:
+            self._carry_out(query, event)
 
     def close(self) -> None:
         """Refuses what still waits: another placer has to be asked."""
@@ -90,20 +90,17 @@ class PlacerRequestHandler:
             query.refuse(problem)
         self._early, self._waiting = [], {}
 
-    def begin(self, query: PlacerQuery) -> None:
+    def _carry_out(self, query: PlacerQuery, event: PlacerEvent) -> None:
         operation = query.message
         if isinstance(operation, PlacementOperation):
             before = self._placer.components.get(operation.component)
             timer = self._supervisor.call_later(min(operation.wait, MAX_WAIT), self._timed_out, query)
             self._waiting[query] = _Waiting(operation, before, timer)
-
-    def finish(self, query: PlacerQuery, refusals: Sequence[PlacementRefused]) -> None:
-        """The core has handled it, or refused it."""
-        if refusals:
+        if refusals := self._feed(event):
             self._pop(query)
             query.refuse(Refused(refusals[0].code, refusals[0].message).problem)
-        elif isinstance(query.message, DrainHost | UncordonHost):
-            query.answer(self.placements(host=query.message.host))
+        elif isinstance(operation, DrainHost | UncordonHost):
+            query.answer(self.placements(host=operation.host))
 
     def changed(self, components: Collection[str]) -> None:
         """Answers requests about these components that have come to their end."""
@@ -126,15 +123,9 @@ class PlacerRequestHandler:
 
     def placements(self, component: str | None = None, *, host: str | None = None) -> Placements:
         """All components, or that one, or those of a host."""
-        return Placements(
-            self.term,
-            [
-                one
-                for name, one in sorted(self._placer.components.items())
-                if component in (None, name) and host in (None, one.host)
-            ],
-            sorted(self._placer.cordoned),
-        )
+        components = sorted(self._placer.components.items())
+        found = [one for name, one in components if component in (None, name) and host in (None, one.host)]
+        return Placements(self.term, found, sorted(self._placer.cordoned))
 
     def _timed_out(self, query: PlacerQuery) -> None:
         waiting = self._pop(query)

@@ -1,18 +1,15 @@
 """A node's candidacy for the RCM: sees whether an RCM leads, and takes over when none does.
 
-Taking over: ask the RCs whether they still see a leader; take a term above all that is known; ask all RCs
-and clients for their holds and requests, which binds the RCs to the new term; lead over that.
-
-When anything of it fails, a candidate steps down: its tokens go, so that others take over, and after a while
-it becomes a candidate again.
-"""
+Taking over: ask the RCs whether they still see a leader; take a term above all that is known; ask all RCs and clients
+for their holds and requests, which binds the RCs to the new term; lead over that. When anything of it fails, a
+candidate steps down: its tokens go, so that others take over, and after a while it becomes a candidate again."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TypeVar
 
 from zscout.config.fleet import Fleet
@@ -56,17 +53,14 @@ class Candidate:
         self._failures = 0
         self._again: asyncio.TimerHandle | None = None
 
-    def start(self) -> None:
-        self._become_candidate()
-
     async def stop(self) -> None:
         if self._again is not None:
             self._again.cancel()
         self._withdraw()
         await self._supervisor.close()
 
-    def _become_candidate(self) -> None:
-        """Becomes a candidate: others see its token from now on."""
+    def start(self) -> None:
+        """Becomes a candidate, the first time or again: others see its token from now on."""
         keys, mesh = self.mesh.keys, self.mesh
         self._again, self._since = None, mesh.now()
         # A leader is silent for as long as this when its program hangs but its session lives.
@@ -97,7 +91,7 @@ class Candidate:
         delay = min(BACKOFF * 2**self._failures, MAX_BACKOFF)
         self._failures += 1
         log.error("this candidate withdraws, and becomes one again in %g s", delay)
-        self._again = asyncio.get_running_loop().call_later(delay, self._become_candidate)
+        self._again = asyncio.get_running_loop().call_later(delay, self.start)
         self._withdraw()
 
     def _withdraw(self) -> None:
@@ -116,8 +110,7 @@ class Candidate:
         self._see(grants.term)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
-        mine = self.rcm is not None and token.instance == self.rcm.term.rcm
-        if not mine:
+        if self.rcm is None or token.instance != self.rcm.term.rcm:
             log.info("%s %s", token.host, "leads" if alive else "does not lead any more")
         self.election.leader(token.instance, alive=alive, now=self.mesh.now())
         self._changed.set()
@@ -145,17 +138,12 @@ class Candidate:
             now = self.mesh.now()
             at = self.election.next_try(now) if self.rcm is None else None
             if at is not None and at <= now:
-                await self._try()
+                if await self._leader_elsewhere() or not await self._take_over():
+                    self.election.failed(self.mesh.now())
                 continue
-            try:
+            with suppress(TimeoutError):
                 async with asyncio.timeout(None if at is None else (at - now) / SECOND):
                     await self._changed.wait()
-            except TimeoutError:
-                pass
-
-    async def _try(self) -> None:
-        if await self._leader_elsewhere() or not await self._take_over():
-            self.election.failed(self.mesh.now())
 
     async def _leader_elsewhere(self) -> bool:
         """Whether most RCs still see a leader: then it is this candidate that is cut off."""
@@ -164,7 +152,7 @@ class Candidate:
         states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
         for state in states:
             self._see(state.term)
-        seeing = sum(1 for state in states if state.leader)
+        seeing = sum(bool(state.leader) for state in states)
         if seeing * 2 > len(states):
             log.info("%d of %d RCs still see a leader: waiting", seeing, len(states))
             return True
@@ -182,8 +170,7 @@ class Candidate:
                 self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=timeout),
                 self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=timeout),
             )
-            problems = [*(reply.problem for reply in rcs), *(reply.problem for reply in clients)]
-            for problem in problems:
+            for problem in [reply.problem for reply in (*rcs, *clients)]:
                 if problem is not None and problem.term is not None:
                     self._see(problem.term)
             if self.known > term:
@@ -207,20 +194,14 @@ class Candidate:
     def _lead(self, term: Term, states: list[RcState], open_requests: list[ClientRequests]) -> None:
         recovered = recover(states, open_requests, self.mesh.now())
         self.known = term
-        log.info(
-            "leading in term %d: %d RCs, %d holds, %d waiting",
-            term.counter,
-            len(recovered.rcs),
-            len(recovered.holds),
-            len(recovered.waiting),
-        )
+        counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
+        log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
         rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed)
         self._leading.callback(rcm.stop)
         rcm.start(recovered)
         balancer = LoadBalancer(self.mesh, self._failed)
         self._leading.callback(balancer.stop)
         balancer.start()
-        inherited = self.ledger.inherited()
-        placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, inherited, self._failed)
+        placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, self.ledger.inherited(), self._failed)
         self._leading.callback(placer.stop)
         placer.start()

@@ -1,11 +1,11 @@
 """When a candidate may try to lead. Pure: what is seen goes in, with the time; the next step comes out.
 
-There is no vote among candidates. A leader leads until it dies or a higher term is seen; only while no
-leader is seen does rank matter: the better candidate tries first, the next waits its turn.
-"""
+There is no vote among candidates. A leader leads until it dies or a higher term is seen; only while no leader is seen
+does rank matter: the better candidate tries first, the next waits its turn."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from zscout.types import SECOND, Ns, Term
@@ -26,23 +26,16 @@ class Election:
         self.host = host
         self.ranking = {name: rank for rank, name in enumerate(ranking)}
         self.silence = silence
-        self._candidates: dict[str, int] = {}
+        self._candidates = Counter[str]()
         self._leaders: dict[str, Ns] = {}
         """When each leader that has a token last published (or its token was seen first)."""
         self._since = now + SETTLE
         self._not_before: Ns = 0
 
-    @property
-    def eligible(self) -> bool:
-        return not self.ranking or self.host in self.ranking
-
     def candidate(self, host: str, *, alive: bool) -> None:
         """A candidate's token came or went."""
-        count = self._candidates.get(host, 0) + (1 if alive else -1)
-        if count > 0:
-            self._candidates[host] = count
-        else:
-            self._candidates.pop(host, None)
+        self._candidates[host] += 1 if alive else -1
+        self._candidates = +self._candidates
 
     def leader(self, instance: str, *, alive: bool, now: Ns) -> None:
         """A leader's token came or went."""
@@ -67,15 +60,12 @@ class Election:
 
     def next_try(self, now: Ns) -> Ns | None:
         """When to try to lead: now or earlier means at once, None not while things stay as they are."""
-        if not self.eligible:
+        if self.ranking and self.host not in self.ranking:
             return None
         if self.sees_leader(now):
             return max(self._not_before, *(at + self.silence for at in self._leaders.values()))
-        return max(self._since + self._turn() * TURN, self._not_before)
-
-    def _turn(self) -> int:
-        me = self._rank(self.host)
-        return sum(1 for host in self._candidates if host != self.host and self._rank(host) < me)
+        better = sum(self._rank(host) < self._rank(self.host) for host in self._candidates)
+        return max(self._since + better * TURN, self._not_before)
 
     def _rank(self, host: str) -> tuple[int, str]:
         return (self.ranking.get(host, len(self.ranking)), host)
