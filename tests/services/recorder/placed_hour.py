@@ -78,14 +78,14 @@ def story() -> list[tuple[float, Placements]]:
 def play(timeline: Timeline) -> None:
     """The hour, as the recorder would write it."""
     written = timeline.hosts
-    written.listed(0, Placements(TERM), set())
+    written.placements(0, Placements(TERM), set())
     says = story()
     runs: dict[str, str] = {}
     loads = dict.fromkeys(HOSTS, 0.2)
     for at in range(0, HOUR + 1, REPORT_EVERY):
         while says and says[0][0] <= at:
             moment, told = says.pop(0)
-            written.published(moment, told)
+            written.placements(moment, told)
             for one in told.components:
                 runs.pop(one.component, None)
                 if one.state in ("running", "moving") and one.host is not None:

@@ -48,8 +48,7 @@ def test_the_rate_limiter_keeps_its_rate_and_the_newest() -> None:
             at += draw.choice((0.0, 0.001, 0.02, 0.3 * draw.random()))
             said = BehaviorSaid(f"net/{draw.randrange(30)}", f"{at}")
             last[said.path] = said
-            kept = limiter.offer(at, NET, said)
-            taken += [(at, kept)] if kept is not None else []
+            taken += [(at, said)] if limiter.offer(at, NET, said) else []
             if draw.random() < 0.2:
                 taken += [(at, waited) for _, waited in limiter.due(at)]
         for _ in range(20):

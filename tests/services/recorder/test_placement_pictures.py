@@ -64,7 +64,7 @@ def test_words_that_the_viewer_can_t_draw_do_not_end_it(tmp_path: Path) -> None:
         timeline.event(0, f"{words}: Grüße, Ελλάδα, Москва, Łódź → “…”")
         timeline.hosts.load(0, words, 1.0)
         tracker = timeline.hosts
-        tracker.published(0, Placements(Term(1, words)))
+        tracker.placements(0, Placements(Term(1, words)))
     with viewer(path, tmp_path) as client:
         settled_picture(client, tmp_path / "picture.png")
         assert [report for view in client.get_state().views for report in view.reports] == []

@@ -115,7 +115,7 @@ def test_a_move_that_failed_is_told_and_leaves_no_mark(tmp_path: Path) -> None:
 
 
 def say(tracker: HostTracker, at: float, *told: Placement, term: Term = TERM) -> None:
-    tracker.published(at, Placements(term, list(told)))
+    tracker.placements(at, Placements(term, list(told)))
 
 
 def test_what_a_late_recorder_reads_did_not_happen_now(tmp_path: Path) -> None:
@@ -124,12 +124,12 @@ def test_what_a_late_recorder_reads_did_not_happen_now(tmp_path: Path) -> None:
         tracker = timeline.hosts
         say(tracker, 1, placement("newer", "running", "anvil", 2))
         older = [placement("newer", "starting", "anvil", 1), placement("counter", "running", "basil", 7)]
-        tracker.listed(2, Placements(TERM, older, ["crucible"]), {"newer"})
+        tracker.placements(2, Placements(TERM, older, ["crucible"]), {"newer"})
         say(tracker, 3, placement("counter", "running", "basil", 8))
         # An answer of an RCM that was overthrown meanwhile, and one that has not heard of `newer`.
         say(tracker, 4, term=Term(2, "next"))
-        tracker.listed(5, Placements(TERM), set())
-        tracker.listed(6, Placements(Term(2, "next"), [placement("counter", "running", "basil", 8)]), set())
+        tracker.placements(5, Placements(TERM), set())
+        tracker.placements(6, Placements(Term(2, "next"), [placement("counter", "running", "basil", 8)]), set())
     assert [(at, mark, name) for at, mark, name, _ in marks(path)] == [
         (1, "placed", "newer"),
         (3, "restarted", "counter"),

@@ -170,7 +170,7 @@ class Candidate:
                 self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=timeout),
                 self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=timeout),
             )
-            for problem in [reply.problem for reply in (*rcs, *clients)]:
+            for problem in (*(reply.problem for reply in rcs), *(reply.problem for reply in clients)):
                 if problem is not None and problem.term is not None:
                     self._see(problem.term)
             if self.known > term:

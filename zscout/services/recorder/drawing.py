@@ -1,8 +1,7 @@
 """What a recording is drawn with: lanes of bars, curves, shapes that stay until they change, and events.
 
-Names and texts come from the mesh: their number and length are bounded here, and what the viewer can't show
-is replaced.
-"""
+Names and texts come from the mesh: their number and length are bounded here, and what the viewer can't show is
+replaced."""
 
 from __future__ import annotations
 
@@ -80,14 +79,18 @@ class Drawing:
         self.log(None, entity, rr.SeriesLines(names=[clean_text(name)], colors=[colour], widths=[width], **more))
 
     def event(self, at: float, text: str, level: str = "INFO") -> None:
-        """One line in words; `level` is one of Rerun's, WARN for what people should look at."""
+        """One line in words; `level` is one of Rerun's."""
         self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=level))
+
+    def warn(self, at: float, text: str) -> None:
+        """An event that people should look at."""
+        self.event(at, text, "WARN")
 
     def note(self, at: float, text: str) -> None:
         """Reports, once, that something is left out."""
         if text not in self._noted:
             self._noted.add(text)
-            self.event(at, f"timeline: {text}", "WARN")
+            self.warn(at, f"timeline: {text}")
 
     def room(self, at: float, known: Sized, limit: int, others: str) -> bool:
         """Whether there may be one more; if not, that is noted: more than so many of what, and what of the others."""

@@ -1,7 +1,5 @@
-"""The floor's part of the timeline: a building's plan, who is where in it, and where robots came from.
-
-Drawn in pixels of the plan's picture.
-"""
+"""The floor's part of the timeline: a building's plan, who is where in it, and where robots came from, drawn in pixels
+of the plan's picture."""
 
 from __future__ import annotations
 
@@ -127,7 +125,7 @@ class FloorPlan:
         if building is not None and building.sender != sender and at - building.seen_at <= SILENCE:
             if sender not in self._others and len(self._others) < MAX_OTHERS:
                 self._others.add(sender)
-                self._warn(at, f"a second building, of {sender}, is not shown: that of {building.sender} is")
+                self._drawing.warn(at, f"a second building, of {sender}, is not shown: that of {building.sender} is")
             return
         if building is None or building.sender != sender or poses.time < building.time - 1:
             # Its time goes back: it is another building that the same client simulates now.
@@ -146,7 +144,7 @@ class FloorPlan:
         if building is not None and building.planned and at - building.seen_at > SILENCE:
             building.planned = False
             self._clear(at)
-            self._warn(at, f"building {building.name} is silent: who is where is not known any more")
+            self._drawing.warn(at, f"building {building.name} is silent: who is where is not known any more")
 
     def wants_plan(self, at: float) -> Sender | None:
         """The client to ask for its building's plan now, if any."""
@@ -174,7 +172,7 @@ class FloorPlan:
             why = f"its plan is {size[0]} by {size[1]} pixels; {MAX_SIDE} a side are shown at most"
         if why or size is None:
             building.refused = True
-            self._warn(at, f"building {building.name} of {sender} can't be shown: {why}")
+            self._drawing.warn(at, f"building {building.name} of {sender} can't be shown: {why}")
             return
         building.planned = True
         self._clear(at)
@@ -183,9 +181,6 @@ class FloorPlan:
         image = rr.EncodedImage(contents=plan.picture, media_type="image/png", draw_order=-20.0)
         self._drawing.log(None, "/floor/plan", image)
         self._drawing.arrange()
-
-    def _warn(self, at: float, text: str) -> None:
-        self._drawing.event(at, text, "WARN")
 
     def _clear(self, at: float) -> None:
         """From `at` on, it is not known where anybody is; the plan stays."""

@@ -173,28 +173,20 @@ class HostTracker:
 
     # What runs where
 
-    def published(self, at: float, news: Placements) -> None:
-        """What has changed."""
-        self._take_in(at, news, forgotten=news.forgotten, fresher=(), seen=True)
-
-    def listed(self, at: float, news: Placements, fresher: Collection[str]) -> None:
-        """All there is. `fresher` names what was published since the question, and is known better.
-
-        What was not known before is shown, but did not happen now."""
-        there = {placement.component for placement in news.components}
-        self._take_in(at, news, forgotten=self._components.keys() - there - set(fresher), fresher=fresher, seen=False)
-
-    def _take_in(
-        self, at: float, news: Placements, *, forgotten: Collection[str], fresher: Collection[str], seen: bool
-    ) -> None:
-        """`seen`: whether a component that is new here was placed just now."""
+    def placements(self, at: float, news: Placements, fresher: set[str] | None = None) -> None:
+        """What has changed; with `fresher`, which names what was published since the question and is known better, all
+        there is: what was not known before is shown then, but did not happen now."""
         if news.term < self._term or absurd(news.term, self._term):
             return
         self._term = news.term
+        forgotten: Collection[str] = news.forgotten
+        if fresher is not None:
+            forgotten = self._components.keys() - {placement.component for placement in news.components} - fresher
         touched: set[str] = set()
         for placement in news.components:
-            if placement.component not in fresher:
-                touched |= self._take(at, placement, news=seen or placement.component in self._components)
+            if placement.component not in (fresher or ()):
+                happened = fresher is None or placement.component in self._components
+                touched |= self._take(at, placement, news=happened)
         for name in forgotten:
             known = self._components.pop(name, None)
             touched |= _seats(known.placement).keys() if known is not None else set()
@@ -203,7 +195,7 @@ class HostTracker:
         cordoned, before = frozenset(news.cordoned), self._cordoned
         self._cordoned = cordoned
         for host in sorted(cordoned - before):
-            self._drawing.event(at, f"{host} is being emptied: nothing is placed there any more", "WARN")
+            self._drawing.warn(at, f"{host} is being emptied: nothing is placed there any more")
         for host in sorted(before - cordoned):
             self._drawing.event(at, f"{host} is used again")
 
@@ -240,7 +232,7 @@ class HostTracker:
     def _log_change(self, at: float, known: _Component, before: Placement | None, *, news: bool) -> None:
         """The event, and the marks, if any."""
         now, name = known.placement, known.placement.component
-        event, mark = self._drawing.event, self.mark
+        event, warn, mark = self._drawing.event, self._drawing.warn, self.mark
         why = f": {now.reason}" if now.reason else ""
         if now.state == "running" and now.host is not None and now.incarnation > known.ran:
             if not news:
@@ -256,20 +248,20 @@ class HostTracker:
             else:
                 was = "" if now.host == known.where else f", it was on {known.where}"
                 mark(at, now.host, "restarted", name)
-                event(at, f"{name} is restarted on {now.host}{was}{why}", "WARN")
+                warn(at, f"{name} is restarted on {now.host}{was}{why}")
             return
         if before is not None and (before.state, before.reason) == (now.state, now.reason):
             return
         match now.state:
             case "waiting":
-                event(at, f"{name} waits for a host{why}", "WARN")
+                warn(at, f"{name} waits for a host{why}")
             case "moving":
                 event(at, f"{name} moves from {now.host} to {now.to}{why}")
             case "running" if before is not None and before.state == "moving":
-                event(at, f"{name} stays on {now.host}{why}", "WARN")
+                warn(at, f"{name} stays on {now.host}{why}")
             case "backing_off":
                 where = f" on {known.where}" if known.where else ""
-                event(at, f"{name} failed{where}, and is tried again{why}", "WARN")
+                warn(at, f"{name} failed{where}, and is tried again{why}")
             case "ended":
                 event(at, f"{name} ended{why}")
             case "given_up":

@@ -1,12 +1,9 @@
 """The recorder: what the mesh shows, written to the timeline.
 
-It only subscribes. The holders of each RC come from what the RCM publishes; why an ARC waits, from the
-notices to its client; hosts and RCs that come and go, from liveliness; what runs on which host, from the
-component placer; what robots do and see, from behaviors, framegrabbers and buildings. `rcm/state` is read at
-the start and where something was missed, so that a recorder may begin in the middle of things.
-
-As a program, `python -m zscout.services.recorder`, it gets its job as `process.RecorderJob` says.
-"""
+It only subscribes. The holders of each RC come from what the RCM publishes; why an ARC waits, from the notices to its
+client; hosts and RCs that come and go, from liveliness; what runs on which host, from the component placer; what robots
+do and see, from behaviors, framegrabbers and buildings. `rcm/state` is read at the start and where something was
+missed, so that a recorder may begin in the middle of things."""
 
 from __future__ import annotations
 
@@ -86,8 +83,6 @@ class Recorder:
     def __init__(self, mesh: Mesh, fleet: Fleet, timeline: Timeline, frames: float = 2.0) -> None:
         self.mesh, self.timeline, self.frames = mesh, timeline, frames
         self._zero = mesh.now()
-        self._over = asyncio.Event()
-        self._supervisor = Supervisor("the recorder", lambda _: self._over.set())
         self._hosts, self._robots = timeline.hosts, timeline.robots
         self._requests = RequestTracker(timeline, fleet.operator_priority)
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
@@ -96,14 +91,14 @@ class Recorder:
         self._wanted, self._placer_wanted = asyncio.Event(), asyncio.Event()
         self._fresher: set[str] | None = None
         """Components published since the placer was asked for all, until it has answered."""
-        self._missed = 0
         self._caught_up = False
         self._cameras: dict[str, asyncio.Task[None]] = {}
         self._asking: asyncio.Task[None] | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Records until `stop`. Its liveliness token appears once it has read an RCM's whole state. Raises
-        RecorderFailed."""
+        """Records until `stop`, which it sets itself when it fails. Its liveliness token appears once it has read an
+        RCM's whole state. Raises RecorderFailed."""
+        self._supervisor = Supervisor("the recorder", lambda _: stop.set())
         keys, subscribe, guard = self.mesh.keys, self.mesh.subscribe, self._supervisor.guard
         self._declared = [
             subscribe(keys.grants, Grants, guard(self._on_grants), depth=DEPTH),
@@ -121,10 +116,10 @@ class Recorder:
         ]
         self._wanted.set()
         self._placer_wanted.set()
-        for work in (self._keep_reading(), self._keep_asking_placer(), self._tick(), self._end_at(stop)):
+        for work in (self._keep_reading(), self._keep_asking_placer(), self._tick()):
             self._supervisor.spawn(work)
         try:
-            await self._over.wait()
+            await stop.wait()
             if self._supervisor.error is not None:
                 raise RecorderFailed from self._supervisor.error
             # `stop` may be quicker than what was published before. An answer of the RCM comes behind all that
@@ -134,10 +129,6 @@ class Recorder:
             await self._supervisor.close()
             for declared in [*robots, *reversed(self._declared)]:
                 declared.close()
-
-    async def _end_at(self, stop: asyncio.Event) -> None:
-        await stop.wait()
-        self._over.set()
 
     def _now(self) -> float:
         return (self.mesh.now() - self._zero) / SECOND
@@ -193,16 +184,17 @@ class Recorder:
     # The whole state, where something was missed
 
     async def _keep_reading(self) -> None:
+        known = 0
         while True:
             try:
                 async with asyncio.timeout(CHECK_EVERY):
                     await self._wanted.wait()
             except TimeoutError:
                 missed = sum(declared.missed for declared in self._declared)
-                if missed == self._missed:
+                if missed == known:
                     continue
-                log.warning("%d publications were missed; the state is read", missed - self._missed)
-                self._missed = missed
+                log.warning("%d publications were missed; the state is read", missed - known)
+                known = missed
                 self._placer_wanted.set()
             self._wanted.clear()
             if not await self._read() and self._leaders:
@@ -211,14 +203,14 @@ class Recorder:
 
     async def _read(self) -> bool:
         """Whether the state is known now. Without a leader, the token of the next wakes `_keep_reading`."""
-        key, me = self.mesh.keys.rcm_state, self.mesh.me
-        replies = await self.mesh.ask(key, StateAsk(), RcmState, timeout=READ_TIMEOUT)
+        replies = await self.mesh.ask(self.mesh.keys.rcm_state, StateAsk(), RcmState, timeout=READ_TIMEOUT)
         states = [reply.message for reply in replies if reply.message is not None]
         newest = max(states, key=lambda state: (state.term, state.seq), default=None)
         if newest is None or not self._requests.state(self._now(), newest):
             return False
         if not self._caught_up:
             self._caught_up = True
+            me = self.mesh.me
             self._declared.append(self.mesh.alive(Token(me.host, Role.RECORDER, me.client, new_instance())))
         return True
 
@@ -238,13 +230,13 @@ class Recorder:
                 failed += 1
             else:
                 failed = 0
-                self._hosts.listed(self._now(), reply.message, fresher)
+                self._hosts.placements(self._now(), reply.message, fresher)
 
     def _on_placements(self, _key: str, news: Placements) -> None:
         if self._fresher is not None and len(self._fresher) < MAX_FOLLOWED:
             self._fresher.update(one.component for one in news.components)
             self._fresher.update(news.forgotten)
-        self._hosts.published(self._now(), news)
+        self._hosts.placements(self._now(), news)
 
     # Robots
 

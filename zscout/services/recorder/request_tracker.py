@@ -114,8 +114,8 @@ class RequestTracker:
         """These holds of an RC are over, by the RCM's word or by the RC's own."""
         held = self._rcs.get(rc, {})
         if grants & held.keys():
-            self._rcs[rc] = {grant: holder for grant, holder in held.items() if grant not in grants}
-            self.timeline.holders(at, rc, list(self._rcs[rc].values()))
+            rows = self._rcs[rc] = {grant: holder for grant, holder in held.items() if grant not in grants}
+            self.timeline.holders(at, rc, list(rows.values()))
 
     def _revoked(self, at: float, revoked: Revocation, grants: Grants) -> None:
         for rc in revoked.rcs:
@@ -130,10 +130,10 @@ class RequestTracker:
                 party = revoked.why.by[0] if revoked.why is not None and revoked.why.by else None
                 by = f"by {party.arc}, priority {party.priority}" if party is not None else f"by {revoked.by}"
                 self._set(at, request, "preempted", by)
-                self.timeline.event(at, f"{request.label} is preempted {by}, and waits again", "WARN")
+                self.timeline.warn(at, f"{request.label} is preempted {by}, and waits again")
             case "lost":
                 self._set(at, request, "waiting", revoked.reason)
-                self.timeline.event(at, f"{request.label} lost its hold: {revoked.reason}", "WARN")
+                self.timeline.warn(at, f"{request.label} lost its hold: {revoked.reason}")
             case "handed_over":
                 self._move(at, revoked, grants)
             case outcome:
@@ -197,7 +197,7 @@ class RequestTracker:
             robots = tuple(sorted(name for name in _rcs_of(hold) if name.startswith("robot/")))
             rows[hold.grant] = HolderRow(label, hold.priority >= self.operator_priority, robots)
         self._rcs[rc] = rows
-        self.timeline.holders(at, rc, list(self._rcs[rc].values()))
+        self.timeline.holders(at, rc, list(rows.values()))
 
 
 def _rcs_of(hold: Holder | HoldView) -> Iterable[str]:

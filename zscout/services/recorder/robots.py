@@ -73,8 +73,8 @@ class RateLimiter:
     def __init__(self) -> None:
         self._senders: dict[Sender, _Sender] = {}
 
-    def offer(self, at: float, sender: Sender, report: BehaviorSaid) -> BehaviorSaid | None:
-        """The report itself if it is to be recorded now."""
+    def offer(self, at: float, sender: Sender, report: BehaviorSaid) -> bool:
+        """Whether it is to be recorded now."""
         state = self._senders.pop(sender, None)
         if state is None:
             if len(self._senders) >= MAX_SENDERS:
@@ -82,13 +82,13 @@ class RateLimiter:
             state = _Sender(Bucket(Fraction(RATE), Fraction(RATE), round(at * SECOND)))
         self._senders[sender] = state
         if not state.waiting and state.bucket.admits(1, round(at * SECOND)):
-            return report
+            return True
         state.dropped += state.waiting.pop(report.path, None) is not None
         if len(state.waiting) < MAX_WAITING:
             state.waiting[report.path] = report
         else:
             state.dropped += 1
-        return None
+        return False
 
     def due(self, at: float) -> Iterator[tuple[Sender, BehaviorSaid]]:
         """What has waited and is to be recorded now."""
@@ -159,21 +159,17 @@ class RobotTracker:
         for sender, report in list(self._limiter.due(at)):
             self._take(at, sender, report)
         for sender, count in self._limiter.dropped(at):
-            self._warn(at, f"behaviors of {sender} say too much: {count} sayings were left out")
+            self._drawing.warn(at, f"behaviors of {sender} say too much: {count} sayings were left out")
         for rc, health in self._health.items():
             self._show_health(at, rc, health)
         self.floor.tick(at)
-
-    def _warn(self, at: float, text: str) -> None:
-        self._drawing.event(at, text, "WARN")
 
     # Behaviors
 
     def behavior(self, at: float, sender: Sender, report: BehaviorSaid) -> None:
         """What a behavior reports, as it comes."""
-        kept = self._limiter.offer(at, sender, report)
-        if kept is not None:
-            self._take(at, sender, kept)
+        if self._limiter.offer(at, sender, report):
+            self._take(at, sender, report)
 
     def left(self, at: float, sender: Sender) -> None:
         """A client is gone, and its behaviors with it."""
@@ -190,7 +186,7 @@ class RobotTracker:
         if report.doing or all(path != report.path for _, path in self._reports):
             self._show_behavior(at, report)
         if report.alert:
-            self._warn(at, _alert(report))
+            self._drawing.warn(at, _alert(report))
         for camera in {report.camera, before.camera if before is not None else ""} & self._cameras.keys():
             seen = self._cameras[camera]
             if camera == report.camera and report.doing and report.boxes:
@@ -221,9 +217,7 @@ class RobotTracker:
         if any(hold.operator for hold in self.holds.get(f"robot/{robot}", {}).values()):
             return Look("operator", OPERATOR)
         report = self._doing(robot)
-        if report is None:
-            return Look()
-        return Look(report.doing, alert=report.alert or report.doing == "alert")
+        return Look(report.doing, alert=report.alert or report.doing == "alert") if report is not None else Look()
 
     # Cameras
 
@@ -235,23 +229,20 @@ class RobotTracker:
                 return
             name = camera.partition("/")[2] or camera
             seen = self._cameras[camera] = _Camera(name, clean_path("camera", name.replace("/", "_")))
-        holds = self.holds.get(camera, {})
-        hold = holds.get(head.grant, NO_HOLD) if head.grant is not None else NO_HOLD
+        hold = self.holds.get(camera, {}).get(head.grant, NO_HOLD) if head.grant is not None else NO_HOLD
         if hold.robots != seen.hold.robots:
             seen.boxes.clear()
             self._draw_boxes(at, seen)
         seen.hold = hold
         size = jpeg_size(jpeg)
         if size is None or max(size) > MAX_SIDE:
-            what = f"no JPEG of at most {MAX_SIDE} pixels a side"
-            self._drawing.note(at, f"{seen.name} sends what is {what}: left out")
+            self._drawing.note(at, f"{seen.name} sends what is no JPEG of at most {MAX_SIDE} pixels a side: left out")
             return
         others = "cameras: the pictures of the others are not shown"
         if seen.size is None and not self._drawing.room(at, self._with_pane(), MAX_CAMERAS, others):
             return
         seen.size, seen.old = size, False
-        image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg", opacity=1.0)
-        self._drawing.log(at, seen.entity, image)
+        self._drawing.log(at, seen.entity, rr.EncodedImage(contents=jpeg, media_type="image/jpeg", opacity=1.0))
         self._write(at, seen, *self._caption(seen))
         self._drawing.arrange()
 
@@ -265,9 +256,7 @@ class RobotTracker:
         if not seen.old and seen.size is not None:
             seen.old = True
             self._drawing.log(at, seen.entity, rr.EncodedImage.from_fields(opacity=DIM))
-        words = "not held"
-        if self.holds.get(camera):
-            words = " · ".join(filter(None, (seen.robots, "no picture")))
+        words = " · ".join(filter(None, (seen.robots, "no picture"))) if self.holds.get(camera) else "not held"
         self._write(at, seen, words, PALE)
 
     def _with_pane(self) -> list[_Camera]:
@@ -316,13 +305,10 @@ class RobotTracker:
         """What an RC publishes of itself: its device's figures, and its health."""
         if state.figures:
             self._draw_figures(at, state.rc, state.figures)
-        health = self._health.get(state.rc)
-        if health is None:
-            if state.health == "ok" or len(self._health) >= MAX_FOLLOWED:
-                return
-            health = self._health[state.rc] = _Health()
-        health.words = state.health
-        self._show_health(at, state.rc, health)
+        if state.rc in self._health or (state.health != "ok" and len(self._health) < MAX_FOLLOWED):
+            health = self._health.setdefault(state.rc, _Health())
+            health.words = state.health
+            self._show_health(at, state.rc, health)
 
     def _show_health(self, at: float, rc: str, health: _Health) -> None:
         if health.words == health.shown or at - health.at < HEALTH_SPACING:
@@ -331,7 +317,7 @@ class RobotTracker:
         if health.words == "ok":
             self._drawing.event(at, f"{rc} is well again")
         else:
-            self._warn(at, f"{rc} fails: {health.words}")
+            self._drawing.warn(at, f"{rc} fails: {health.words}")
 
     def _draw_figures(self, at: float, rc: str, figures: Mapping[str, float]) -> None:
         """What is not a finite number is left out."""

@@ -73,7 +73,13 @@ class Timeline(Drawing):
             self.url = f"rerun+http://{host}:{port}/proxy"
             sinks.append(rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=SERVER_MEMORY))
         if path is not None:
-            _check_writable(path)
+            try:
+                path.open("ab").close()
+            except OSError as error:
+                raise TimelineError(
+                    f"timeline: can't write the recording {path} ({error.strerror}); "
+                    "give a file in a directory that is there and can be written"
+                ) from error
             sinks.append(rr.FileSink(path))
         try:
             self.recording.set_sinks(*sinks, default_blueprint=blueprint())
@@ -181,14 +187,4 @@ def _free_port(bind: str, port: int) -> int:
         raise TimelineError(
             f"timeline: can't listen on {bind}, port {port} ({os.strerror(error.errno or 0)}); "
             "choose another port, or end the program that has it"
-        ) from error
-
-
-def _check_writable(path: Path) -> None:
-    try:
-        path.open("ab").close()
-    except OSError as error:
-        raise TimelineError(
-            f"timeline: can't write the recording {path} ({error.strerror}); "
-            "give a file in a directory that is there and can be written"
         ) from error
