@@ -7,8 +7,8 @@ import asyncio
 import functools
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from contextlib import asynccontextmanager, suppress
 from typing import Any, Final, ParamSpec, Self, TypeVar
 from weakref import WeakSet
 
@@ -160,6 +160,15 @@ async def supervised(name: str) -> AsyncIterator[Supervisor]:
         raise
     finally:
         await supervisor.close()
+
+
+async def done_within(seconds: float | None, work: Awaitable[object]) -> bool:
+    """Waits for `work`, at most so long, and cancels it then; whether it was done."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await work
+            return True
+    return False
 
 
 def _current_task() -> asyncio.Task[Any] | None:

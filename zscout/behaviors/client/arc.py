@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Mapping
+from contextlib import suppress
 from decimal import Decimal
-from types import TracebackType
 from typing import Any
 
 from zscout.behaviors.client.client import Client
@@ -96,23 +96,19 @@ class Held:
 
     async def over(self) -> None:
         """Waits until the hold is over; for bodies that work elsewhere."""
-        while self.active:
-            if self.arc.keep:
-                await self._client.changed(self.arc)
-                continue
-            try:
-                async with asyncio.timeout(max(0.0, self.remaining)):
+        with suppress(TimeoutError):
+            while self.active:
+                async with asyncio.timeout(None if self.arc.keep else max(0.0, self.remaining)):
                     await self._client.changed(self.arc)
-            except TimeoutError:
-                return
 
 
 class Attempt:
-    """One entry into an ARC's body. `again` lets a hold that was taken away be waited for once more."""
+    """One entry into an ARC's body, or one after the other: `again` lets a hold that was taken away be waited for
+    once more."""
 
-    def __init__(self, client: Client, arc: OpenArc | None, ask: dict[str, Any], *, again: bool) -> None:
+    def __init__(self, client: Client, ask: dict[str, Any], *, again: bool) -> None:
         self._client, self._ask, self._again = client, ask, again
-        self.arc = arc
+        self.arc: OpenArc | None = None
         self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None]] | None = None
         """The hold, its body, and what cancels the body when the hold is over."""
         self._interrupted = False
@@ -133,6 +129,7 @@ class Attempt:
     async def __aenter__(self) -> Held:
         held, body = await self.granted(), asyncio.current_task()
         assert body is not None  # noqa: S101 - this is a coroutine
+        self._interrupted = False
         self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body))
         return held
 
@@ -142,9 +139,7 @@ class Attempt:
         self._interrupted = True
         body.cancel()
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool:
+    async def __aexit__(self, kind: type[BaseException] | None, *_error: object) -> bool:
         assert self._entered is not None  # noqa: S101 - entered before left
         held, body, watch = self._entered
         arc = held.arc
@@ -177,7 +172,7 @@ def hold(
 ) -> Attempt:
     """An ARC as an async context manager; see the module's text. `min_runtime` in seconds."""
     ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
-    return Attempt(client, None, ask, again=False)
+    return Attempt(client, ask, again=False)
 
 
 async def holds(
@@ -191,11 +186,8 @@ async def holds(
 ) -> AsyncIterator[Attempt]:
     """The same, entered again whenever it was taken away and is granted again, until a body ends by itself
     or has had its time."""
-    arc: OpenArc | None = None
     ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
-    while arc is None or arc.open:
-        attempt = Attempt(client, arc, ask, again=True)
+    attempt = Attempt(client, ask, again=True)
+    yield attempt
+    while attempt.arc is not None and attempt.arc.open:
         yield attempt
-        arc = attempt.arc
-        if arc is None:
-            return

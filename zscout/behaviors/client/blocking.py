@@ -21,6 +21,7 @@ from zscout.behaviors.client.arc import Held, Revoked, hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import Needs
 from zscout.config.fleet import Fleet
+from zscout.mesh.supervision import done_within
 
 T = TypeVar("T")
 
@@ -47,16 +48,7 @@ class BlockingHeld:
 
     def wait(self, timeout: float) -> bool:
         """Waits until the hold is over, at most `timeout` seconds. True: it is over."""
-
-        async def over() -> bool:
-            try:
-                async with asyncio.timeout(timeout):
-                    await self._held.over()
-            except TimeoutError:
-                return False
-            return True
-
-        return self._lab.run(over())
+        return self._lab.run(done_within(timeout, self._held.over()))
 
     @property
     def rcs(self) -> list[str]:

@@ -6,31 +6,19 @@ import asyncio
 import logging
 import os
 import socket
-from collections.abc import Callable, Coroutine, Generator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Generator, Mapping
 from decimal import Decimal
 from typing import Any, Generic, Self, TypeVar
 
-from zscout.behaviors.client.handover import Handover
-from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN, RcmLink
-from zscout.behaviors.client.request import CommandRefused, Needs, OpenArc, RequestRefused, RequestStore, amounts
+from zscout import messages
+from zscout.behaviors.client.handover import MovableClient
+from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN
+from zscout.behaviors.client.request import CommandRefused, Needs, OpenArc, RequestRefused, amounts
 from zscout.config.fleet import Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import (
-    Cancel,
-    Command,
-    Done,
-    Foresee,
-    Foresight,
-    HandOver,
-    Notice,
-    OpenRequest,
-    Problem,
-    RcmState,
-    Release,
-    StateAsk,
-)
+from zscout.messages import Done, Foresight, Notice, Problem, RcmState
 from zscout.types import SECOND, Grant, Term
 
 __all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "RequestRefused"]
@@ -43,19 +31,12 @@ CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
 """Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
 
 
-class Client:
+class Client(MovableClient):
     """One program on the mesh. Open with `async with Client.connect(...) as client`, or `await
     Client.connect(...)` and `close` it."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
-        self.mesh, self.fleet = mesh, fleet
-        self._supervisor = Supervisor(f"client {mesh.me}", self._failed)
-        self._store = RequestStore(mesh.now)
-        self._rcm = RcmLink(mesh, fleet, self._store)
-        self._handover = Handover(mesh, self._store, self._rcm, self._supervisor)
-        self._may_end = asyncio.Event()
-        """Set unless the client is paused, and once it has left."""
-        self._may_end.set()
+        super().__init__(mesh, fleet, Supervisor(f"client {mesh.me}", self._failed))
         self._leaving: asyncio.Task[None] | None = None
         self._declared: list[Declaration] = []
 
@@ -159,8 +140,7 @@ class Client:
 
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)
-        expected = await self._handover.claim(check_name(name, "arc"), wanted)
-        if expected is not None:
+        if (expected := await self._claim(check_name(name, "arc"), wanted)) is not None:
             return expected
         arc = OpenArc(
             id=new_instance(),
@@ -179,7 +159,7 @@ class Client:
             self._store.forget(arc)
             if not isinstance(error, RequestRefused):
                 # The RCM may have it.
-                self._supervisor.spawn(self._rcm.give_back(Cancel(id=arc.id)))
+                self._supervisor.spawn(self._rcm.give_back(messages.Cancel(id=arc.id)))
             raise
         return arc
 
@@ -247,8 +227,7 @@ class Client:
 
     async def hand_over(self, arc: OpenArc, to: Sender) -> None:
         """Lets one ARC, queued or running, go on in another client. Raises RequestRefused."""
-        operation = HandOver(id=arc.id, to=str(to))
-        reply = await self._rcm.query(operation)
+        reply = await self._rcm.query(messages.HandOver(id=arc.id, to=str(to)))
         if reply is None or reply.message is None:
             unknown = Problem("unknown", "the RCM did not answer; ask how the ARC stands")
             raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
@@ -257,61 +236,6 @@ class Client:
         """Calls `watcher(arc)` whenever there is news of any of this client's requests."""
         self._store.watch(watcher)
 
-    # Moving: all that this client has goes on in another one
-
-    def pause(self) -> None:
-        """From now on nothing is asked again or ended and no body is entered or interrupted, until `resume`,
-        `take_back`, `close` or `leave`. Notices are taken as before."""
-        self._handover.pause()
-        self._may_end.clear()
-
-    @property
-    def paused(self) -> bool:
-        return not self._store.resumed.is_set()
-
-    async def resumed(self) -> None:
-        """Waits while the client is paused; without end where it leaves like that."""
-        await self._store.resumed.wait()
-
-    def resume(self) -> None:
-        """Goes on. All that is open is asked again, and what was withheld happens now."""
-        self._may_end.set()
-        self._handover.resume()
-
-    def open_requests(self) -> list[OpenRequest]:
-        """What is queued or running: what `hand_over_all` would hand over now."""
-        now = self.mesh.now()
-        return [arc.open_request(now) for arc in self._store.acknowledged]
-
-    def expect(self, requests: Sequence[OpenRequest]) -> None:
-        """These will be handed to this client: `request` then returns them, by name and needs. They replace
-        what was expected before and has not come.
-
-        What has come and was not asked for within 10 s is given back. Raises BadName, and ValueError for more
-        than 256 of them, or for one that is open here."""
-        self._handover.expect(requests)
-
-    @property
-    def expected_came(self) -> asyncio.Event:
-        """Set at the first notice of an ARC that is expected: from then on it is this client's."""
-        return self._handover.came
-
-    async def hand_over_all(self, to: Sender) -> None:
-        """Hands all `open_requests` of this paused client to another one, which expects them, in one step. On
-        return that is done, and they go on there.
-
-        Raises RequestRefused where nothing was handed over; with code `unknown` where no RCM could tell
-        within 10 s: call it again; or see to it that the other client is gone, and `take_back`."""
-        await self._handover.hand_over_all(to)
-
-    def take_back(self) -> None:
-        """The client to which all was handed is gone: this one goes on, and asks anew for each, at its place.
-
-        Bodies are interrupted as by any other lost hold. What was not handed over after all, where that was
-        unknown, simply stays."""
-        self._may_end.set()
-        self._handover.take_back()
-
     # Operators' questions
 
     async def state(
@@ -319,7 +243,7 @@ class Client:
     ) -> RcmState | None:
         """The RCM's state, with the history of `arc` if one is named, and with a `forecast` of when those who
         wait will start; None if no RCM answered."""
-        asked = StateAsk(arc=arc, forecast=forecast)
+        asked = messages.StateAsk(arc=arc, forecast=forecast)
         reply = await self.mesh.ask_one(self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout)
         return reply.message if reply is not None else None
 
@@ -327,7 +251,7 @@ class Client:
         self, name: str, needs: Needs, *, priority: int, min_runtime: Decimal, keep: bool = False
     ) -> Foresight | None:
         """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
-        asked = Foresee(new_instance(), name, amounts(needs), priority, min_runtime, keep)
+        asked = messages.Foresee(new_instance(), name, amounts(needs), priority, min_runtime, keep)
         reply = await self.mesh.ask_one(self._rcm.key, asked, Foresight, timeout=QUERY_TIMEOUT)
         if reply is not None and reply.problem is not None:
             raise RequestRefused(reply.problem)
@@ -338,7 +262,7 @@ class Client:
     ) -> Done:
         """Has an RC do something under `grant`. Raises CommandRefused."""
         key = self.mesh.keys.command(rc, self.mesh.me)
-        command = Command(grant=grant, do=dict(do), ttl=ttl)
+        command = messages.Command(grant=grant, do=dict(do), ttl=ttl)
         reply = await self.mesh.ask_one(key, command, Done, timeout=timeout)
         if reply is None:
             raise CommandRefused(rc, Problem("unknown", "no answer; it may have been done or not"))
@@ -352,9 +276,9 @@ class Client:
         arc = self._store.arcs.get(notice.id)
         if arc is not None:
             self._store.take(arc, notice)
-        elif not self._handover.take(notice) and notice.state == "running":
+        elif not self._take_moving(notice) and notice.state == "running":
             # A grant that nobody here asked for, or gave up meanwhile, is given back.
-            self._supervisor.spawn(self._rcm.give_back(Release(id=notice.id)))
+            self._supervisor.spawn(self._rcm.give_back(messages.Release(id=notice.id)))
 
 
 C = TypeVar("C", bound=Client)

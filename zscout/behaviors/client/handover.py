@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from zscout.behaviors.client.rcm_link import BACKOFF, TRY_AGAIN, RcmLink
 from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStore
+from zscout.config.fleet import Fleet
 from zscout.keyexpr import Sender
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
@@ -31,59 +32,69 @@ CLAIM_TIMEOUT = 10.0
 """Seconds after which an ARC that came and that nobody asked for is given back."""
 
 
-class Handover:
-    """What one client hands over, and what it expects to be handed over to it."""
+class MovableClient:
+    """What a client hands over, and what it expects to be handed over to it."""
 
-    def __init__(self, mesh: Mesh, store: RequestStore, rcm: RcmLink, supervisor: Supervisor) -> None:
-        self.mesh, self.store, self.rcm, self._supervisor = mesh, store, rcm, supervisor
-        self.came = asyncio.Event()
+    def __init__(self, mesh: Mesh, fleet: Fleet, supervisor: Supervisor) -> None:
+        self.mesh, self.fleet, self._supervisor = mesh, fleet, supervisor
+        self._store = RequestStore(mesh.now)
+        self._rcm = RcmLink(mesh, fleet, self._store)
+        self.expected_came = asyncio.Event()
+        """Set at the first notice of an ARC that is expected: from then on it is this client's."""
         self._unclaimed: dict[str, OpenArc] = {}
         """What is expected, come or not, and was not asked for yet."""
+        self._may_end = asyncio.Event()
+        """Set unless the client is paused, and once it has left."""
+        self._may_end.set()
 
     # The new client
 
     def expect(self, requests: Sequence[OpenRequest]) -> None:
-        """As `Client.expect`."""
+        """These will be handed to this client: `request` then returns them, by name and needs. They replace
+        what was expected before and has not come.
+
+        What has come and was not asked for within 10 s is given back. Raises BadName, and ValueError for more
+        than 256 of them, or for one that is open here."""
         if len(requests) > MAX_OTHERS + 1:
             raise ValueError(f"{len(requests)} ARCs are too many to take over; at most {MAX_OTHERS + 1} are")
         now = self.mesh.now()
         arcs = {request.id: OpenArc.expected(request, now) for request in requests}
-        if here := arcs.keys() & self.store.arcs.keys():
+        if here := arcs.keys() & self._store.arcs.keys():
             raise ValueError(f"request {min(here)} is open here already; nobody else can hand it over")
-        for arc in list(self.store.expected.values()):
+        for arc in list(self._store.expected.values()):
             self._unclaimed.pop(arc.id, None)
-            self.store.forget(arc)
-        self.store.expected.update(arcs)
+            self._store.forget(arc)
+        self._store.expected.update(arcs)
         self._unclaimed |= arcs
-        self.came.clear()
+        self.expected_came.clear()
         for arc in arcs.values():
             # What comes back: notices from before it went are old.
-            if (before := self.store.moved.pop(arc.id, None)) is not None:
+            if (before := self._store.moved.pop(arc.id, None)) is not None:
                 arc.last = before.last
-            self.store.withdrawn.pop(arc.id, None)
-            self.store.listen(arc)
+            self._store.withdrawn.pop(arc.id, None)
+            self._store.listen(arc)
 
-    def take(self, notice: Notice) -> bool:
+    def _take_moving(self, notice: Notice) -> bool:
         """Applies a notice of what is expected, or was handed over. False if it is of neither."""
-        arc = self.store.expected.get(notice.id)
+        arc = self._store.expected.get(notice.id)
         if arc is not None:
             if arc.take_first(notice, self.mesh.now()):
-                del self.store.expected[arc.id]
-                self.store.add(arc)
-                self.store.notify(arc)
-                self.came.set()
+                del self._store.expected[arc.id]
+                self._store.add(arc)
+                self._store.notify(arc)
+                self.expected_came.set()
                 self._supervisor.spawn(self._give_back_unwanted(arc))
             return True
-        arc = self.store.moved.get(notice.id)
+        arc = self._store.moved.get(notice.id)
         if arc is not None and notice.state == "ended" and notice.outcome != "handed_over":
             # It was over before it could be handed over: there is nothing to take back.
             arc.finish(notice.outcome or "lost", notice.reason, self.mesh.now())
-            self.store.notify(arc)
-            self.store.forget(arc)
+            self._store.notify(arc)
+            self._store.forget(arc)
             return True
         return False
 
-    async def claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
+    async def _claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
         """The ARC of this name and these needs that is expected, once it has come; None if there is none."""
         unclaimed = self._unclaimed.values()
         arc = next((arc for arc in unclaimed if (arc.name, arc.needs) == (name, needs)), None)
@@ -92,13 +103,13 @@ class Handover:
         del self._unclaimed[arc.id]
         try:
             async with asyncio.timeout(EXPECT_TIMEOUT):
-                while arc.id in self.store.expected:
-                    await self.store.changed(arc)
+                while arc.id in self._store.expected:
+                    await self._store.changed(arc)
         except TimeoutError:
             log.warning("%s was not handed over within %g s; it is asked for anew", name, EXPECT_TIMEOUT)
         finally:
-            if arc.id in self.store.expected:
-                self.store.forget(arc)
+            if arc.id in self._store.expected:
+                self._store.forget(arc)
         return arc if arc.open else None
 
     async def _give_back_unwanted(self, arc: OpenArc) -> None:
@@ -107,79 +118,103 @@ class Handover:
             del self._unclaimed[arc.id]
             if arc.open:
                 log.warning("%s was handed over and nobody asked for it: it is given back", arc.name)
-                await self.rcm.end(arc)
+                await self._rcm.end(arc)
 
     # The old client
 
     def pause(self) -> None:
-        self.store.resumed.clear()
-        self.store.undecided.clear()
-        self.store.reclaimed.clear()
+        """From now on nothing is asked again or ended and no body is entered or interrupted, until `resume`,
+        `take_back`, `close` or `leave`. Notices are taken as before."""
+        self._may_end.clear()
+        self._store.resumed.clear()
+        self._store.undecided.clear()
+        self._store.reclaimed.clear()
+
+    @property
+    def paused(self) -> bool:
+        return not self._store.resumed.is_set()
+
+    async def resumed(self) -> None:
+        """Waits while the client is paused; without end where it leaves like that."""
+        await self._store.resumed.wait()
 
     def resume(self) -> None:
-        self.store.resumed.set()
-        for arc in self.store.open:
+        """Goes on. All that is open is asked again, and what was withheld happens now."""
+        self._may_end.set()
+        self._store.resumed.set()
+        for arc in self._store.open:
             self._supervisor.spawn(self._ask_again(arc))
 
     async def _ask_again(self, arc: OpenArc) -> None:
         """An acknowledged request is asked once; what was lost or taken back until there is an answer."""
         try:
             if arc.state != "asking":
-                await self.rcm.ask(arc)
-            await self.rcm.submit(arc)
+                await self._rcm.ask(arc)
+            await self._rcm.submit(arc)
         except RequestRefused as refused:
             log.warning("%s is not taken back: %s", arc.name, refused)
-            self.store.notify(arc)
-            self.store.forget(arc)
+            self._store.notify(arc)
+            self._store.forget(arc)
+
+    def open_requests(self) -> list[OpenRequest]:
+        """What is queued or running: what `hand_over_all` would hand over now."""
+        now = self.mesh.now()
+        return [arc.open_request(now) for arc in self._store.acknowledged]
 
     async def hand_over_all(self, to: Sender) -> None:
-        """As `Client.hand_over_all`."""
-        if self.store.resumed.is_set():
+        """Hands all `open_requests` of this paused client to another one, which expects them, in one step. On
+        return that is done, and they go on there.
+
+        Raises RequestRefused where nothing was handed over; with code `unknown` where no RCM could tell
+        within 10 s: call it again; or see to it that the other client is gone, and `take_back`."""
+        if not self.paused:
             raise RuntimeError("pause() the client before it hands over all: it would ask for it again")
-        arcs = sorted(self.store.acknowledged, key=lambda arc: arc.grant is None)
+        arcs = sorted(self._store.acknowledged, key=lambda arc: arc.grant is None)
         if len(arcs) > MAX_OTHERS + 1:
-            raise RequestRefused(
-                Problem("too_many", f"{len(arcs)} ARCs can't be handed over at once; {MAX_OTHERS + 1} can")
-            )
+            words = f"{len(arcs)} ARCs can't be handed over at once; {MAX_OTHERS + 1} can"
+            raise RequestRefused(Problem("too_many", words))
         try:
             async with asyncio.timeout(HAND_OVER):
                 await self._hand_over(arcs, to)
         except TimeoutError:
-            self.store.undecided = {arc.id for arc in arcs if arc.open}
+            self._store.undecided = {arc.id for arc in arcs if arc.open}
             unknown = f"no RCM told within {HAND_OVER:g} s whether {to} has taken over; ask again"
             raise RequestRefused(Problem("unknown", unknown)) from None
 
     async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:
         """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
-        term = self.rcm.term
+        term = self._rcm.term
         pause, longest = BACKOFF
         known_by = self.mesh.now() + round(TOKEN_GRACE * SECOND)
         while arcs := [arc for arc in arcs if arc.open]:
             first, *others = arcs
             operation = HandOver(id=first.id, to=str(to), others=[arc.id for arc in others])
-            self.rcm.leader_came.clear()
-            reply = await self.rcm.query(operation)
+            self._rcm.leader_came.clear()
+            reply = await self._rcm.query(operation)
             notice = reply.message if reply is not None else None
-            if notice is not None and self.rcm.accept(notice.term):
+            if notice is not None and self._rcm.accept(notice.term):
                 # An RCM that came in between answers for the first alone: it may not know of the others.
                 for arc in arcs if notice.term == term else [first]:
-                    self.store.move(arc, notice)
+                    self._store.move(arc, notice)
                 continue
             problem = reply.problem if reply is not None else None
             if problem is not None and problem.code == "not_running":
                 # It is over, or an RCM that has just taken the lead does not know it: this settles which.
-                await self.rcm.ask(first)
+                await self._rcm.ask(first)
             elif problem is not None and problem.code == "unknown_client" and self.mesh.now() < known_by:
                 # It sees the RCM; the RCM may not have seen its token yet.
                 pause = BACKOFF[0]
             elif problem is not None and problem.code not in TRY_AGAIN:
                 raise RequestRefused(problem)
-            if not await self.rcm.leader_within(pause):
+            if not await self._rcm.leader_within(pause):
                 pause = min(longest, pause * 2)
 
     def take_back(self) -> None:
-        """As `Client.take_back`."""
-        for arc in list(self.store.moved.values()):
-            self.store.reclaim(arc)
-        self.store.reclaimed, self.store.undecided = self.store.undecided, set()
+        """The client to which all was handed is gone: this one goes on, and asks anew for each, at its place.
+
+        Bodies are interrupted as by any other lost hold. What was not handed over after all, where that was
+        unknown, simply stays."""
+        for arc in list(self._store.moved.values()):
+            self._store.reclaim(arc)
+        self._store.reclaimed, self._store.undecided = self._store.undecided, set()
         self.resume()

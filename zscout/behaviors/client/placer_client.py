@@ -4,25 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Collection
-from contextlib import ExitStack, suppress
-from types import TracebackType
 from typing import Final, Self, TypeVar
 
+from zscout import messages
 from zscout.behaviors.client.rcm_link import TRY_AGAIN
 from zscout.behaviors.client.request import RequestRefused
 from zscout.mesh import Mesh
-from zscout.messages import (
-    ComponentSpec,
-    EndComponent,
-    ListPlacements,
-    PlaceComponent,
-    Placement,
-    PlacementOperation,
-    Placements,
-    PlacerOperation,
-    Problem,
-    absurd,
-)
+from zscout.mesh.supervision import done_within
+from zscout.messages import ComponentSpec, Placement, PlacementOperation, Placements, PlacerOperation, Problem
 from zscout.types import NO_TERM, SECOND, ComponentId, HostName, Term
 
 TIMEOUT: Final = 5.0
@@ -52,31 +41,28 @@ class PlacerClient:
         self, mesh: Mesh, only: Collection[ComponentId] | None = None, *, timeout: float = PLACER_TIMEOUT
     ) -> None:
         self.mesh, self.only, self._timeout = mesh, only, timeout
+        self._list = messages.ListPlacements(next(iter(only)) if only is not None and len(only) == 1 else None)
         self.placements: dict[ComponentId, Placement] = {}
         self.cordoned: frozenset[HostName] = frozenset()
         self.term: Term = NO_TERM
         self.changed = asyncio.Event()
-        self._subscribed = ExitStack()
 
     def __enter__(self) -> Self:
-        subscription = self.mesh.subscribe(self.mesh.keys.placements, Placements, self._on_placements)
-        self._subscribed.callback(subscription.close)
+        self._subscription = self.mesh.subscribe(self.mesh.keys.placements, Placements, self._on_placements)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._subscribed.close()
+    def __exit__(self, *_: object) -> None:
+        self._subscription.close()
 
     # Requests
 
     async def place(self, component: ComponentId, spec: ComponentSpec, *, wait: float = 3.0) -> Placement:
         """Has it run somewhere, or returns its placement if it does. Raises RequestRefused."""
-        return await self.request(PlaceComponent(component, spec, wait=wait), Placement)
+        return await self.request(messages.PlaceComponent(component, spec, wait=wait), Placement)
 
     async def stop(self, component: ComponentId, *, wait: float = 0.0) -> Placement:
         """Stops it for good. Raises RequestRefused."""
-        return await self.request(EndComponent(component, wait=wait), Placement)
+        return await self.request(messages.EndComponent(component, wait=wait), Placement)
 
     async def request(self, operation: PlacerOperation, kind: type[R]) -> R:
         """Repeats the operation, which must be idempotent, until a placer answers. Raises RequestRefused,
@@ -117,21 +103,18 @@ class PlacerClient:
 
     async def refresh(self) -> None:
         """Lists all placements, or those in `only`. Raises RequestRefused, PlacerSilent."""
-        self._listed(await self.request(self._list(), Placements))
+        self._listed(await self.request(self._list, Placements))
 
     async def try_refresh(self) -> None:
         """The same with one query: without an answer `placements` stay as they are."""
-        listed = await self._ask(self._list(), Placements)
+        listed = await self._ask(self._list, Placements)
         if listed is not None:
             self._listed(listed)
 
     async def wait_changed(self) -> None:
         """Waits until something is published, and lists the placements if nothing is for a second. Raises
         RequestRefused, PlacerSilent."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(REFRESH_EVERY):
-                await self.changed.wait()
-        if not self.changed.is_set():
+        if not await done_within(REFRESH_EVERY, self.changed.wait()):
             await self.refresh()
         self.changed.clear()
 
@@ -159,17 +142,13 @@ class PlacerClient:
             raise RequestRefused(problem)
         return None
 
-    def _list(self) -> ListPlacements:
-        one = next(iter(self.only)) if self.only is not None and len(self.only) == 1 else None
-        return ListPlacements(one)
-
     def _listed(self, listed: Placements) -> None:
         self.placements = {}
         self.term, self.cordoned = listed.term, frozenset(listed.cordoned)
         self.take(*listed.components)
 
     def _on_placements(self, _key: str, published: Placements) -> None:
-        if published.term < self.term or absurd(published.term, self.term):
+        if published.term < self.term or messages.absurd(published.term, self.term):
             return
         self.term, self.cordoned = published.term, frozenset(published.cordoned)
         self.take(*published.components)

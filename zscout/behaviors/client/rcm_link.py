@@ -16,7 +16,7 @@ from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStor
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
-from zscout.mesh.supervision import StallWatch
+from zscout.mesh.supervision import StallWatch, done_within
 from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd
 from zscout.types import NO_TERM, SECOND, Ns, Term
 
@@ -80,11 +80,7 @@ class RcmLink:
 
     async def leader_within(self, seconds: float) -> bool:
         """Waits so long for a leader to appear since `leader_came` was cleared. False: none did."""
-        try:
-            async with asyncio.timeout(seconds):
-                return await self.leader_came.wait()
-        except TimeoutError:
-            return False
+        return await done_within(seconds, self.leader_came.wait())
 
     def _on_requests(self, request: IncomingQuery[RcAsk]) -> None:
         promise = request.message.promise
@@ -132,11 +128,11 @@ class RcmLink:
             problem = await self.ask(arc)
             if arc.state != "asking":
                 return
-            if problem is not None and problem.code not in TRY_AGAIN:
-                arc.state, arc.reason = "refused", problem.message
-                raise RequestRefused(problem)
             if problem is not None:
                 arc.reason = problem.message
+                if problem.code not in TRY_AGAIN:
+                    arc.state = "refused"
+                    raise RequestRefused(problem)
             elif self.leader is None:
                 arc.reason = "no RCM is on the mesh; start zscout-node"
             self.store.notify(arc)

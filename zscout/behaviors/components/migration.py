@@ -13,24 +13,12 @@ from zscout import messages
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.components.component import Component, SafePointGate
 from zscout.keyexpr import Role, Sender
-from zscout.messages import (
-    MAX_CHECKPOINT,
-    MAX_ERROR,
-    MAX_MOVE,
-    ActivateComponent,
-    ComponentList,
-    ComponentView,
-    ListComponents,
-    MoveComponent,
-    OpenRequest,
-    Problem,
-    RestoreComponent,
-    StopComponent,
-)
+from zscout.mesh.supervision import done_within
+from zscout.messages import MAX_CHECKPOINT, MAX_ERROR, MAX_MOVE, ComponentView, MoveComponent, OpenRequest, Problem
 from zscout.types import SECOND
 
 R = TypeVar("R")
-Operation = RestoreComponent | ActivateComponent | StopComponent | ListComponents
+Operation = messages.RestoreComponent | messages.ActivateComponent | messages.StopComponent | messages.ListComponents
 
 RESTORE_TIMEOUT: Final = 10.0
 ASK_TIMEOUT: Final = 2.0
@@ -111,12 +99,11 @@ class OutgoingMove:
             going_on = await self._confirmed()
         if not going_on:
             self._client.take_back()
-            raise NotMoved(
-                "move_failed", f"incarnation {self.incarnation} on {self.to} ended; its ARCs are asked anew here"
-            )
+            words = f"incarnation {self.incarnation} on {self.to} ended; its ARCs are asked anew here"
+            raise NotMoved("move_failed", words)
 
     async def _give(self, state: bytes, requests: list[OpenRequest]) -> None:
-        order = RestoreComponent(self._name, self.incarnation, state, requests)
+        order = messages.RestoreComponent(self._name, self.incarnation, state, requests)
         if len(messages.encode(order)) > MAX_MOVE:
             raise NotMoved("too_large", f"state and {len(requests)} requests are over {MAX_MOVE} bytes")
         deadline = self._client.mesh.now() + round(RESTORE_TIMEOUT * SECOND)
@@ -138,23 +125,22 @@ class OutgoingMove:
 
     async def _confirmed(self) -> bool:
         """Has the other one run, and waits for as long as that is not known. False: it is gone."""
-        return await self._until_known(ActivateComponent(self._name, self.incarnation))
+        return await self._until_known(messages.ActivateComponent(self._name, self.incarnation))
 
     async def _stop_there(self) -> bool:
         """It is unknown whether the hand-over was carried out: whoever runs by now has the ARCs. False: the
         other one did not, and will not."""
-        reply = await self._ask(ListComponents(self._name), ComponentList, ASK_TIMEOUT)
-        if isinstance(reply, ComponentList) and any(
+        reply = await self._ask(messages.ListComponents(self._name), messages.ComponentList, ASK_TIMEOUT)
+        if isinstance(reply, messages.ComponentList) and any(
             view.incarnation == self.incarnation and view.phase == "running" for view in reply.components
         ):
             return await self._confirmed()
-        return await self._until_known(StopComponent(self._name, self.incarnation, grace=0.0))
+        return await self._until_known(messages.StopComponent(self._name, self.incarnation, grace=0.0))
 
-    async def _until_known(self, operation: ActivateComponent | StopComponent) -> bool:
+    async def _until_known(self, operation: messages.ActivateComponent | messages.StopComponent) -> bool:
         pause, longest = PAUSES
         while not self.successor_runs.is_set():
-            reply = await self._ask(operation, ComponentView, ASK_TIMEOUT)
-            match reply:
+            match await self._ask(operation, ComponentView, ASK_TIMEOUT):
                 case ComponentView(phase="running"):
                     return True
                 case ComponentView(phase="ended", ended=how):
@@ -166,10 +152,7 @@ class OutgoingMove:
                     return True  # one that is higher still was started there: this one is over in any case
                 case None if not await self._lives():
                     return False
-            try:
-                async with asyncio.timeout(pause):
-                    await self.successor_runs.wait()
-            except TimeoutError:
+            if not await done_within(pause, self.successor_runs.wait()):
                 pause = min(longest, 2 * pause)
         return True
 
@@ -177,14 +160,10 @@ class OutgoingMove:
         """Whether the other process may still be there. It outlives its node by moments: once its client's
         token has gone, nothing of it will be heard any more."""
         mesh = self._client.mesh
-        nodes, clients = await asyncio.gather(
-            mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_TIMEOUT),
-            mesh.living(mesh.keys.alive_any(Role.CLIENT), timeout=LOOK_TIMEOUT),
-        )
-        its = f"{self._name}.{self.incarnation}"
-        return any(node.host == self.to for node in nodes) or any(
-            (client.host, client.name) == (self.to, its) for client in clients
-        )
+        looks = (mesh.living(mesh.keys.alive_any(role), timeout=LOOK_TIMEOUT) for role in (Role.NODE, Role.CLIENT))
+        nodes, clients = await asyncio.gather(*looks)
+        its = self.to, f"{self._name}.{self.incarnation}"
+        return any(node.host == self.to for node in nodes) or any((one.host, one.name) == its for one in clients)
 
     async def _ask(self, operation: Operation, kind: type[R], timeout: float) -> R | Problem | None:
         mesh = self._client.mesh

@@ -25,6 +25,7 @@ from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import BadFrame, ComponentJob, ComponentReport, EndReport, Order
 from zscout.behaviors.components.lifecycle import ComponentLifecycle
 from zscout.behaviors.components.processes import kill_family
+from zscout.mesh.supervision import done_within
 
 _PR_SET_PDEATHSIG: Final = 1
 REPORT_LAST: Final = 2.0
@@ -60,16 +61,11 @@ async def _live(job: ComponentJob, connection: socket.socket, orders: BinaryIO) 
         return loop.run_in_executor(speaker, _send, connection, channel.pack(one))
 
     life = ComponentLifecycle(job, report)
-
-    def deliver(order: Order) -> None:
-        loop.call_soon_threadsafe(life.order, order)
-
-    threading.Thread(target=_listen, args=(orders, job.tag, deliver), daemon=True).start()
+    listening = orders, job.tag, lambda order: loop.call_soon_threadsafe(life.order, order)
+    threading.Thread(target=_listen, args=listening, daemon=True).start()
     loop.add_signal_handler(signal.SIGTERM, life.end, EndReport("failed", "ended by SIGTERM"))
     ends = await life.run()
-    with suppress(TimeoutError):
-        async with asyncio.timeout(REPORT_LAST):
-            await report(ends)
+    await done_within(REPORT_LAST, report(ends))
     if ends.how in ("moved", "superseded"):
         # Nothing that is left here may unwind: another one runs.
         sys.stdout.flush()
@@ -83,7 +79,7 @@ def _send(connection: socket.socket, frame: bytes) -> None:
         connection.sendall(frame)
 
 
-def _listen(orders: BinaryIO, tag: str, deliver: Callable[[Order], None]) -> None:
+def _listen(orders: BinaryIO, tag: str, deliver: Callable[[Order], object]) -> None:
     """Receives orders until the node has closed. In a thread: it must work while the component computes."""
     try:
         while True:

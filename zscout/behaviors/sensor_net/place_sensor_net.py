@@ -18,7 +18,7 @@ from zscout.behaviors.sensor_net.net import Effect, SensorNet, StartRobot
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
 from zscout.drivers.driver import RcDirectory
 from zscout.mesh import Mesh
-from zscout.mesh.supervision import Supervisor, supervised
+from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.messages import MAX_COMPONENT_NAME, BehaviorSaid, ComponentSpec, Placement, Placements
 
 PERIOD: Final = 0.5
@@ -118,9 +118,7 @@ class PlaceSensorNet(Behavior):
     async def _end_all(self) -> None:
         members = self.net.members
         active = [name for name, robot in self._components.items() if members[robot].standing == "active"]
-        with suppress(TimeoutError):
-            async with asyncio.timeout(STOPPING):
-                await asyncio.gather(*(self._stop(name) for name in active))
+        await done_within(STOPPING, asyncio.gather(*(self._stop(name) for name in active)))
 
     def _now(self) -> float:
         return self._clock.read(self._mesh.now())
