@@ -11,30 +11,12 @@ from typing import Final
 
 import msgspec
 
+from zscout import messages
 from zscout.behaviors.components.component import installed_kinds
 from zscout.config.fleet import Fleet
 from zscout.config.node import MAX_KINDS, ComponentsConfig
 from zscout.keyexpr import BadName, check_name
 from zscout.mesh import IncomingQuery, Mesh, Refused, Supervisor
-from zscout.messages import (
-    MAX_ERROR,
-    MAX_MOVE,
-    MAX_PARAMS_SIZE,
-    MAX_PLACED,
-    ActivateComponent,
-    Checkpoint,
-    CheckpointComponent,
-    ComponentList,
-    ComponentOperation,
-    ListComponents,
-    MoveComponent,
-    Output,
-    Problem,
-    ReadOutput,
-    RestoreComponent,
-    StartComponent,
-    StopComponent,
-)
 from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.services.node.process_use import RunningComponent
@@ -77,7 +59,7 @@ class ComponentHost:
     async def start(self) -> None:
         await asyncio.to_thread(self._limits.sweep)
         key = self.mesh.keys.component(self.mesh.me.host)
-        self._served = self.mesh.serve(key, ComponentOperation, self._on_request, limit=MAX_MOVE)
+        self._served = self.mesh.serve(key, messages.ComponentOperation, self._on_request, limit=messages.MAX_MOVE)
 
     async def stop(self) -> None:
         """Ends all components, side by side, each within GRACE seconds."""
@@ -96,58 +78,59 @@ class ComponentHost:
 
     # What is asked
 
-    def _on_request(self, request: IncomingQuery[ComponentOperation]) -> None:
+    def _on_request(self, request: IncomingQuery[messages.ComponentOperation]) -> None:
         if self._underway >= MAX_UNDERWAY:
             raise Refused("busy", "too many operations are under way here; ask again")
         self._underway += 1
         self.supervisor.spawn(self._answer(request))
 
-    async def _answer(self, request: IncomingQuery[ComponentOperation]) -> None:
+    async def _answer(self, request: IncomingQuery[messages.ComponentOperation]) -> None:
         try:
             request.answer(await self._do(request.message))
         except Refused as refused:
             request.refuse(refused.problem)
         except BadName as error:
-            request.refuse(Problem("bad_request", str(error)))
+            request.refuse(messages.Problem("bad_request", str(error)))
         except Exception:
             log.exception("an operation on a component failed")
-            request.refuse(Problem("internal", "the request failed here; see this node's log"))
+            request.refuse(messages.Problem("internal", "the request failed here; see this node's log"))
         finally:
             self._underway -= 1
 
-    async def _do(self, operation: ComponentOperation) -> msgspec.Struct:
+    async def _do(self, operation: messages.ComponentOperation) -> msgspec.Struct:
         match operation:
-            case StartComponent():
+            case messages.StartComponent():
                 return await self._start(operation)
-            case StopComponent():
+            case messages.StopComponent():
                 process = self._find(operation.component, operation.incarnation, old="unknown_component")
                 await process.stop(operation.grace)
                 return process.view()
-            case CheckpointComponent():
+            case messages.CheckpointComponent():
                 process = self._find(operation.component)
                 state = await process.checkpoint()
-                return Checkpoint(operation.component, process.start.incarnation, state)
-            case ListComponents():
+                return messages.Checkpoint(operation.component, process.start.incarnation, state)
+            case messages.ListComponents():
                 return await self._list(operation.component)
-            case ReadOutput():
+            case messages.ReadOutput():
                 process = self._find(operation.component)
-                start, end, text = process.output.read(operation.start)
-                return Output(operation.component, process.start.incarnation, start, end, text, process.output.over)
-            case MoveComponent():
+                begin, end, text = process.output.read(operation.start)
+                own, over = process.start.incarnation, process.output.over
+                return messages.Output(operation.component, own, begin, end, text, over)
+            case messages.MoveComponent():
                 check_name(operation.to, "host")
                 if operation.to == self.mesh.me.host or operation.to_incarnation <= operation.incarnation:
                     raise Refused("bad_request", "it moves to another host, and gets a higher incarnation there")
                 return await self._find(operation.component, operation.incarnation).move(operation)
-            case RestoreComponent():
+            case messages.RestoreComponent():
                 process = self._find(operation.component, operation.incarnation)
                 await process.restore(operation)
                 return process.view()
-            case ActivateComponent():
+            case messages.ActivateComponent():
                 process = self._find(operation.component, operation.incarnation)
                 await process.activate(operation)
                 return process.view()
 
-    async def _start(self, start: StartComponent) -> msgspec.Struct:
+    async def _start(self, start: messages.StartComponent) -> msgspec.Struct:
         before = self._living.get(start.component)
         if before is not None and before.leaving and start.incarnation > before.start.incarnation:
             # It moved away, failed or is being stopped: what comes next may be here before it is quite gone.
@@ -158,7 +141,7 @@ class ComponentHost:
         await process.settled.wait()
         return process.view()
 
-    async def _launch(self, start: StartComponent) -> ComponentProcess:
+    async def _launch(self, start: messages.StartComponent) -> ComponentProcess:
         self._check(start)
         kinds = await asyncio.to_thread(installed_kinds)
         # Another one may have asked meanwhile.
@@ -167,9 +150,8 @@ class ComponentHost:
         where = kinds.get(start.spec.kind)
         if where is None:
             there = ", ".join(self._startable(kinds)) or "none"
-            raise Refused(
-                "unknown_kind", f"no kind {start.spec.kind!r} is installed here; there are {there}"[:MAX_ERROR]
-            )
+            message = f"no kind {start.spec.kind!r} is installed here; there are {there}"
+            raise Refused("unknown_kind", message[: messages.MAX_ERROR])
         if len(self._living) >= self._rules.max:
             raise Refused("too_many", f"{len(self._living)} components run here; [components] max allows no more")
         if self._stopping:
@@ -177,7 +159,7 @@ class ComponentHost:
         name = start.component
         self._known[name] = start.incarnation
         self._known.move_to_end(name)
-        while len(self._known) > MAX_PLACED:
+        while len(self._known) > messages.MAX_PLACED:
             self._known.popitem(last=False)
         self._ended.pop(name, None)
         process = ComponentProcess(self.mesh.me.host, self._fleet, self._limits, start, where, self._on_over)
@@ -186,7 +168,7 @@ class ComponentHost:
         log.info("starts %s.%d (%s)", name, start.incarnation, start.spec.kind)
         return process
 
-    def _same(self, start: StartComponent) -> ComponentProcess | None:
+    def _same(self, start: messages.StartComponent) -> ComponentProcess | None:
         """The process that this start has led to already. Raises Refused where another one is in its way."""
         name = start.component
         process = self._living.get(name) or self._ended.get(name)
@@ -199,7 +181,7 @@ class ComponentHost:
             raise Refused("runs_already", f"incarnation {known} of {name} lives here; stop it first")
         return None
 
-    def _check(self, start: StartComponent) -> None:
+    def _check(self, start: messages.StartComponent) -> None:
         check_name(start.component, "component")
         kinds = self._rules.kinds
         if not self._rules.allow:
@@ -207,16 +189,16 @@ class ComponentHost:
         if kinds is not None and start.spec.kind not in kinds:
             allowed = ", ".join(kinds) or "none"
             message = f"this host starts no {start.spec.kind!r}; [components] kinds names {allowed}"
-            raise Refused("not_allowed", message[:MAX_ERROR])
+            raise Refused("not_allowed", message[: messages.MAX_ERROR])
         size = len(msgspec.json.encode(start.spec.params))
-        if size > MAX_PARAMS_SIZE:
-            raise Refused("too_large", f"params are {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are taken")
+        if size > messages.MAX_PARAMS_SIZE:
+            raise Refused("too_large", f"params are {size} bytes as JSON; at most {messages.MAX_PARAMS_SIZE} are taken")
 
-    async def _list(self, component: str | None) -> ComponentList:
+    async def _list(self, component: str | None) -> messages.ComponentList:
         kinds = await asyncio.to_thread(installed_kinds)
         found = {**self._ended, **self._living}
         views = [found[name].view() for name in sorted(found) if component in (None, name)]
-        return ComponentList(self.mesh.me.host, views, self._startable(kinds)[:MAX_KINDS])
+        return messages.ComponentList(self.mesh.me.host, views, self._startable(kinds)[:MAX_KINDS])
 
     def _startable(self, kinds: dict[str, str]) -> list[str]:
         if not self._rules.allow:

@@ -18,17 +18,7 @@ import msgspec
 
 from zscout import messages
 from zscout.behaviors.components import channel
-from zscout.behaviors.components.channel import (
-    PATIENCE,
-    BadFrame,
-    ComponentJob,
-    ComponentReport,
-    EndReport,
-    Operation,
-    Order,
-    OrderAnswer,
-    PhaseReport,
-)
+from zscout.behaviors.components.channel import EndReport, Order, OrderAnswer
 from zscout.behaviors.components.processes import VARIABLE, kill_family
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import new_instance
@@ -134,7 +124,7 @@ class ComponentProcess:
 
     async def checkpoint(self) -> bytes:
         self._check_runs()
-        return (await self._ask(messages.CheckpointComponent(self.start.component), PATIENCE + SLACK)).state
+        return (await self._ask(messages.CheckpointComponent(self.start.component), channel.PATIENCE + SLACK)).state
 
     async def move(self, order: MoveComponent) -> Moved:
         """Asked again for the same move it answers with the outcome of that one."""
@@ -170,7 +160,7 @@ class ComponentProcess:
         if self.phase != "running":
             raise Refused("bad_request", f"{self.start.component} is {self.phase} here; it must run for that")
 
-    async def _ask(self, operation: Operation, timeout: float | None) -> OrderAnswer:
+    async def _ask(self, operation: channel.Operation, timeout: float | None) -> OrderAnswer:
         number = next(self._numbers)
         answered: asyncio.Future[OrderAnswer] = asyncio.get_running_loop().create_future()
         self._waiting[number] = answered
@@ -241,7 +231,7 @@ class ComponentProcess:
         loop = asyncio.get_running_loop()
         stream, writer = await asyncio.open_unix_connection(sock=connection, limit=channel.MAX_FRAME)
         self._writer = writer
-        self._send(ComponentJob(self.start, self._where, self._host, self._fleet, self._tag, self._group.each))
+        self._send(channel.ComponentJob(self.start, self._where, self._host, self._fleet, self._tag, self._group.each))
         if self.phase == "stopping":
             self._send(Order(0, messages.StopComponent(self.start.component)))
         if self._verdict is not None:
@@ -275,16 +265,16 @@ class ComponentProcess:
         )
 
     async def _receive(self, stream: asyncio.StreamReader) -> None:
-        report: ComponentReport | None
+        report: channel.ComponentReport | None
         try:
-            while (report := await channel.read(stream, ComponentReport)) is not None:
+            while (report := await channel.read(stream, channel.ComponentReport)) is not None:
                 self._on_message(report)
-        except BadFrame as error:
+        except channel.BadFrame as error:
             self._kill(EndReport("failed", f"it was killed: what it sent to its node is no message: {error}"))
 
-    def _on_message(self, report: ComponentReport) -> None:
+    def _on_message(self, report: channel.ComponentReport) -> None:
         match report:
-            case PhaseReport(phase=phase, movable=movable):
+            case channel.PhaseReport(phase=phase, movable=movable):
                 self.movable = movable
                 if self.phase != "stopping":
                     self.phase = phase

@@ -11,17 +11,7 @@ from typing import Final, TypeAlias
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Mesh, Supervisor
 from zscout.messages import LoadReport
-from zscout.services.node.host_figures import (
-    Cgroup,
-    CpuMeter,
-    HostMemory,
-    Paced,
-    clock,
-    cores,
-    memory,
-    speed,
-    temperature,
-)
+from zscout.services.node import host_figures
 from zscout.services.node.process_use import Running, TreeMeter, TreeUse, UseMeter, faded
 
 log = logging.getLogger("zscout.load")
@@ -115,9 +105,9 @@ class TreeLoad:
     def __init__(self, meter: TreeMeter) -> None:
         self._meter = meter
         self._averages = 0.0, 0.0, 0.0
-        self._uses = Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
+        self._uses = host_figures.Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
 
-    def __call__(self, size: float, ram: HostMemory) -> LoadFigures:
+    def __call__(self, size: float, ram: host_figures.HostMemory) -> LoadFigures:
         """Of so many cores, with this memory; CPU use since the tree was last looked at."""
         use = self._uses()
         return self._averages, min(100.0, 100 * use.cores / size), max(0, ram.total - use.memory)
@@ -135,20 +125,20 @@ class Gauge:
         self, host: str, labels: tuple[str, ...] = (), running: Running = tuple, *, load: TreeLoad | None = None
     ) -> None:
         self._host, self._labels = host, labels
-        self._cgroup = Cgroup()
-        self._cpu = CpuMeter(self._cgroup)
+        self._cgroup = host_figures.Cgroup()
+        self._cpu = host_figures.CpuMeter(self._cgroup)
         self._load = load or self._host_load
         self._number = 0
         self._speed = 0.0
-        self._speeds = Paced(self._measure_speed, least=SPEED_EVERY, share=1.0)
-        self._clocks = Paced(clock, least=SENSORS_EVERY, share=SENSORS_SHARE)
-        self._temperatures = Paced(temperature, least=SENSORS_EVERY, share=SENSORS_SHARE)
-        self._uses = Paced(UseMeter(running).measure, least=PERIOD / 2, share=USES_SHARE)
+        self._speeds = host_figures.Paced(self._measure_speed, least=SPEED_EVERY, share=1.0)
+        self._clocks = host_figures.Paced(host_figures.clock, least=SENSORS_EVERY, share=SENSORS_SHARE)
+        self._temperatures = host_figures.Paced(host_figures.temperature, least=SENSORS_EVERY, share=SENSORS_SHARE)
+        self._uses = host_figures.Paced(UseMeter(running).measure, least=PERIOD / 2, share=USES_SHARE)
 
     def report(self) -> LoadReport:
         """The host's load now; CPU use since the last call."""
         self._number += 1
-        size, ram = cores(self._cgroup), memory(self._cgroup)
+        size, ram = host_figures.cores(self._cgroup), host_figures.memory(self._cgroup)
         averages, percent, available = self._load(size, ram)
         now, rated = self._clocks()
         return LoadReport(
@@ -168,12 +158,12 @@ class Gauge:
             components=self._uses(),
         )
 
-    def _host_load(self, size: float, ram: HostMemory) -> LoadFigures:
+    def _host_load(self, size: float, ram: host_figures.HostMemory) -> LoadFigures:
         """Of the whole host, or of the container where that has limits; CPU use since the last call."""
         return os.getloadavg(), self._cpu.percent(size), ram.available
 
     def _measure_speed(self) -> float:
-        found = speed(SPEED_TRIES) if self._speed else speed()
+        found = host_figures.speed(SPEED_TRIES) if self._speed else host_figures.speed()
         # A few tries may find a processor that was only asleep: believed at once if faster, else by halves.
         self._speed = found if found > self._speed else (self._speed + found) / 2
         return self._speed

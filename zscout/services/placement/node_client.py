@@ -7,17 +7,8 @@ from typing import Final, TypeVar
 
 import msgspec
 
+from zscout import messages
 from zscout.mesh import Mesh, Reply
-from zscout.messages import (
-    MAX_TAIL,
-    ComponentList,
-    ComponentView,
-    ListComponents,
-    MoveComponent,
-    Moved,
-    StartComponent,
-    StopComponent,
-)
 from zscout.placement.events import (
     ComponentsListed,
     HostCommand,
@@ -44,42 +35,42 @@ class NodeClient:
     async def carry_out(self, command: HostCommand) -> PlacerEvent | None:
         """None: a list that was not answered."""
         match command.operation:
-            case StartComponent() as start:
+            case messages.StartComponent() as start:
                 return await self._start(command.host, start)
-            case StopComponent() as stop:
+            case messages.StopComponent() as stop:
                 return await self._stop(command.host, stop)
-            case MoveComponent() as move:
+            case messages.MoveComponent() as move:
                 return await self._move(command.host, move)
-            case ListComponents() as listing:
-                reply = await self._ask(command.host, listing, ComponentList, LIST_TIMEOUT)
+            case messages.ListComponents() as listing:
+                reply = await self._ask(command.host, listing, messages.ComponentList, LIST_TIMEOUT)
                 if reply is None or reply.message is None:
                     return None
                 return ComponentsListed(command.host, reply.message.components, listing.component)
 
-    async def _start(self, host: HostName, start: StartComponent) -> StartAnswered:
+    async def _start(self, host: HostName, start: messages.StartComponent) -> StartAnswered:
         answered = partial(StartAnswered, start.component, start.incarnation, host)
-        reply = await self._ask(host, start, ComponentView, self._start_timeout)
+        reply = await self._ask(host, start, messages.ComponentView, self._start_timeout)
         if reply is None:
             return answered("unknown", f"{host} did not answer")
         view = reply.message
         if view is None:
             code, words = (reply.problem.code, reply.problem.message) if reply.problem else ("unknown", "")
-            return answered("refused", words[:MAX_TAIL], again=code not in HOPELESS)
+            return answered("refused", words[: messages.MAX_TAIL], again=code not in HOPELESS)
         if view.phase in ("running", "standby"):
             return answered("ok", movable=view.movable)
         if view.phase == "ended":
-            return answered("failed", view.reason, view.tail[:MAX_TAIL])
+            return answered("failed", view.reason, view.tail[: messages.MAX_TAIL])
         return answered("unknown", f"it is still {view.phase}")
 
-    async def _stop(self, host: HostName, stop: StopComponent) -> StopAnswered:
-        reply = await self._ask(host, stop, ComponentView, stop.grace + ANSWER_SLACK)
+    async def _stop(self, host: HostName, stop: messages.StopComponent) -> StopAnswered:
+        reply = await self._ask(host, stop, messages.ComponentView, stop.grace + ANSWER_SLACK)
         gone = reply is not None and reply.problem is not None and reply.problem.code == "unknown_component"
         ended = reply is not None and reply.message is not None and reply.message.phase == "ended"
         return StopAnswered(stop.component, stop.incarnation or 0, host, done=ended or gone)
 
-    async def _move(self, host: HostName, move: MoveComponent) -> MoveAnswered:
+    async def _move(self, host: HostName, move: messages.MoveComponent) -> MoveAnswered:
         answered = partial(MoveAnswered, move.component, move.incarnation, host)
-        reply = await self._ask(host, move, Moved, move.patience + self._start_timeout)
+        reply = await self._ask(host, move, messages.Moved, move.patience + self._start_timeout)
         if reply is None:
             return answered("unknown", f"{host} did not answer")
         if reply.message is None:

@@ -10,23 +10,10 @@ from typing import Final, TypeAlias
 import msgspec
 from msgspec import structs
 
+from zscout import messages
 from zscout.keyexpr import check_name
 from zscout.mesh import IncomingQuery, Refused
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import (
-    MAX_PARAMS_SIZE,
-    ComponentSpec,
-    DrainHost,
-    EndComponent,
-    ListPlacements,
-    MigrateComponent,
-    PlaceComponent,
-    Placement,
-    PlacementOperation,
-    Placements,
-    PlacerOperation,
-    UncordonHost,
-)
 from zscout.placement.events import PlacementRefused, PlacerEvent
 from zscout.placement.placer import Placer
 from zscout.placement.state import OVER
@@ -36,7 +23,7 @@ MAX_WAIT: Final = 60.0
 MAX_WAITING: Final = 1_000
 """Requests that wait for their answer at one time."""
 
-PlacerQuery: TypeAlias = IncomingQuery[PlacerOperation]
+PlacerQuery: TypeAlias = IncomingQuery[messages.PlacerOperation]
 
 SETTLED: Final = OVER | {"running", "waiting"}
 
@@ -45,8 +32,8 @@ SETTLED: Final = OVER | {"running", "waiting"}
 class _Waiting:
     """An operation that has not come to its end; `before` is the status when it was requested."""
 
-    operation: PlacementOperation
-    before: Placement | None
+    operation: messages.PlacementOperation
+    before: messages.Placement | None
     timer: TimerHandle
 
 
@@ -65,7 +52,7 @@ class PlacerRequestHandler:
     def receive(self, query: PlacerQuery) -> None:
         """Answers it, carries it out or keeps it until `open`. Raises Refused and BadName."""
         operation = query.message
-        if isinstance(operation, ListPlacements):
+        if isinstance(operation, messages.ListPlacements):
             query.answer(self.placements(operation.component))
             return
         if len(self._early) + len(self._waiting) >= MAX_WAITING:
@@ -92,14 +79,14 @@ class PlacerRequestHandler:
 
     def _carry_out(self, query: PlacerQuery, event: PlacerEvent) -> None:
         operation = query.message
-        if isinstance(operation, PlacementOperation):
+        if isinstance(operation, messages.PlacementOperation):
             before = self._placer.components.get(operation.component)
             timer = self._supervisor.call_later(min(operation.wait, MAX_WAIT), self._timed_out, query)
             self._waiting[query] = _Waiting(operation, before, timer)
         if refusals := self._feed(event):
             self._pop(query)
             query.refuse(Refused(refusals[0].code, refusals[0].message).problem)
-        elif isinstance(operation, DrainHost | UncordonHost):
+        elif isinstance(operation, messages.DrainHost | messages.UncordonHost):
             query.answer(self.placements(host=operation.host))
 
     def changed(self, components: Collection[str]) -> None:
@@ -109,23 +96,23 @@ class PlacerRequestHandler:
             if component not in components:
                 continue
             status = self._placer.components.get(component)
-            ends = OVER if isinstance(operation, EndComponent) else SETTLED
+            ends = OVER if isinstance(operation, messages.EndComponent) else SETTLED
             if status is not None and status.state not in ends:
                 continue
             self._pop(query)
             if status is None:
                 query.refuse(Refused("unknown_component", "nothing is known of it").problem)
-            elif isinstance(operation, MigrateComponent) and _stayed(waiting.before, status, operation):
+            elif isinstance(operation, messages.MigrateComponent) and _stayed(waiting.before, status, operation):
                 reason = status.reason or f"it goes on on {status.host}"
                 query.refuse(Refused("move_failed", reason).problem)
             else:
                 query.answer(status)
 
-    def placements(self, component: str | None = None, *, host: str | None = None) -> Placements:
+    def placements(self, component: str | None = None, *, host: str | None = None) -> messages.Placements:
         """All components, or that one, or those of a host."""
         components = sorted(self._placer.components.items())
         found = [one for name, one in components if component in (None, name) and host in (None, one.host)]
-        return Placements(self.term, found, sorted(self._placer.cordoned))
+        return messages.Placements(self.term, found, sorted(self._placer.cordoned))
 
     def _timed_out(self, query: PlacerQuery) -> None:
         waiting = self._pop(query)
@@ -140,24 +127,24 @@ class PlacerRequestHandler:
         return waiting
 
 
-def _stayed(before: Placement | None, now: Placement, move: MigrateComponent) -> bool:
+def _stayed(before: messages.Placement | None, now: messages.Placement, move: messages.MigrateComponent) -> bool:
     return before is not None and now.host == before.host and now.host != move.to
 
 
-def _event_of(operation: PlacementOperation | DrainHost | UncordonHost) -> PlacerEvent:
+def _event_of(operation: messages.PlacementOperation | messages.DrainHost | messages.UncordonHost) -> PlacerEvent:
     """The operation, its spec in order. Raises BadName or Refused for what can't be."""
-    if isinstance(operation, DrainHost | UncordonHost):
+    if isinstance(operation, messages.DrainHost | messages.UncordonHost):
         check_name(operation.host, "host")
         return operation
     check_name(operation.component, "component")
-    if isinstance(operation, PlaceComponent):
+    if isinstance(operation, messages.PlaceComponent):
         return structs.replace(operation, spec=_checked(operation.spec))
-    if isinstance(operation, MigrateComponent) and operation.to is not None:
+    if isinstance(operation, messages.MigrateComponent) and operation.to is not None:
         check_name(operation.to, "host")
     return operation
 
 
-def _checked(spec: ComponentSpec) -> ComponentSpec:
+def _checked(spec: messages.ComponentSpec) -> messages.ComponentSpec:
     """In one order, so that equal specs compare so."""
     check_name(spec.kind, "kind")
     for host in spec.hosts or ():
@@ -165,7 +152,7 @@ def _checked(spec: ComponentSpec) -> ComponentSpec:
     for label in spec.labels:
         check_name(label, "label")
     size = len(msgspec.json.encode(spec.params))
-    if size > MAX_PARAMS_SIZE:
-        raise Refused("too_large", f"the parameters have {size} bytes; at most {MAX_PARAMS_SIZE} are taken")
+    if size > messages.MAX_PARAMS_SIZE:
+        raise Refused("too_large", f"the parameters have {size} bytes; at most {messages.MAX_PARAMS_SIZE} are taken")
     hosts = None if spec.hosts is None else sorted(set(spec.hosts))
     return structs.replace(spec, labels=sorted(set(spec.labels)), hosts=hosts)

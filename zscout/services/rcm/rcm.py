@@ -16,27 +16,11 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 from typing import Any
 
+from zscout import messages
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import (
-    Ballot,
-    Grants,
-    Holder,
-    HoldView,
-    Operation,
-    Proposal,
-    ProposedHolder,
-    RcmState,
-    RcState,
-    RcView,
-    Revocation,
-    StateAsk,
-    WaitView,
-    decimal_seconds,
-    decimals,
-)
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     ArcRequest,
@@ -94,7 +78,7 @@ class Rcm:
         self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer)
         self.requests = RequestHandler(mesh, fleet, self.core, self.registry, self.membership, supervisor, receive)
         self._heartbeat = fleet.timing.heartbeat
-        self._grants = mesh.publisher(mesh.keys.grants, Grants)
+        self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
         self.seq = 0
         """The last number that was published."""
         self._published: Ns = 0
@@ -123,8 +107,8 @@ class Rcm:
         self._decide([*joined, lead], named=recovered.rcs)
         limit = self.fleet.limits.max_payload
         self._declared = [
-            mesh.serve(keys.schedule_any, Operation, guard(self.requests.on_operation), limit=limit),
-            mesh.serve(keys.rcm_state, StateAsk, guard(self._on_state_asked)),
+            mesh.serve(keys.schedule_any, messages.Operation, guard(self.requests.on_operation), limit=limit),
+            mesh.serve(keys.rcm_state, messages.StateAsk, guard(self._on_state_asked)),
             *self.membership.watch(),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
         ]
@@ -152,7 +136,7 @@ class Rcm:
             self.requests.flush()
             self._decide(events)
 
-    def _compare(self, rc: RcName, state: RcState) -> None:
+    def _compare(self, rc: RcName, state: messages.RcState) -> None:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
         if not self.supervisor.active:
             return
@@ -233,8 +217,8 @@ class Rcm:
             else:
                 self._put(self.seq, {}, [])
 
-    def _put(self, number: int, rcs: dict[RcName, list[Holder]], revoked: list[Revocation]) -> None:
-        self._grants.put(Grants(self.term, number, self.seq, self._heartbeat / SECOND, rcs, revoked))
+    def _put(self, number: int, rcs: dict[RcName, list[messages.Holder]], revoked: list[messages.Revocation]) -> None:
+        self._grants.put(messages.Grants(self.term, number, self.seq, self._heartbeat / SECOND, rcs, revoked))
         self.seq, self._published = number, self.mesh.now()
 
     # Out: proposals, and ballots in
@@ -242,21 +226,23 @@ class Rcm:
     def _propose(self, effect: Propose) -> None:
         arcs = ((self.core.arc(arc), params) for arc, params in effect.holders.items())
         holders = [
-            ProposedHolder(request_id(arc.id), arc.name, arc.request.client, decimals(params))
+            messages.ProposedHolder(request_id(arc.id), arc.name, arc.request.client, messages.decimals(params))
             for arc, params in arcs
             if arc is not None
         ]
-        proposal = Proposal(proposal=effect.proposal, term=self.term, holders=holders)
+        proposal = messages.Proposal(proposal=effect.proposal, term=self.term, holders=holders)
         # Overdue once; an answer that comes before the query ends still counts.
         overdue = self.supervisor.call_later(self._vote_timeout, self._receive, VoteOverdue(effect.proposal))
         voted = partial(self._voted, effect.rc, effect.proposal, overdue)
         late = max(LATE_VOTE, 2 * self._vote_timeout)
         try:
-            self.mesh.ask_then(self.mesh.keys.vote(effect.rc), proposal, Ballot, voted, timeout=late)
+            self.mesh.ask_then(self.mesh.keys.vote(effect.rc), proposal, messages.Ballot, voted, timeout=late)
         except MeshError as error:
             log.warning("%s", error)
 
-    def _on_ballot(self, rc: RcName, proposal: int, overdue: asyncio.TimerHandle, reply: Reply[Ballot] | None) -> None:
+    def _on_ballot(
+        self, rc: RcName, proposal: int, overdue: asyncio.TimerHandle, reply: Reply[messages.Ballot] | None
+    ) -> None:
         overdue.cancel()
         ballot = reply.message if reply is not None else None
         if ballot is not None and ballot.proposal == proposal:
@@ -268,23 +254,23 @@ class Rcm:
 
     # The present state
 
-    def _on_state_asked(self, query: IncomingQuery[StateAsk]) -> None:
+    def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
         asked, now = query.message, self.mesh.now()
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
         if asked.holds_only:
-            query.answer(RcmState(self.term, self.seq, self.mesh.me.host, holds))
+            query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, holds))
             return
         starts = self.registry.starts() if asked.forecast else {}
         query.answer(
-            RcmState(
+            messages.RcmState(
                 term=self.term,
                 seq=self.seq,
                 host=self.mesh.me.host,
                 holds=holds,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
                 rcs=[
-                    RcView(rc.name, rc.present, rc.sharable, [request_id(arc) for arc in rc.holders])
+                    messages.RcView(rc.name, rc.present, rc.sharable, [request_id(arc) for arc in rc.holders])
                     for rc in status.rcs
                 ],
                 story=self.registry.story(asked.arc) if asked.arc is not None else [],
@@ -304,20 +290,20 @@ def _of(arc: ArcStatus) -> dict[str, Any]:
         "client": arc.request.client,
         "priority": arc.request.priority,
         "place": arc.place,
-        "min_runtime": decimal_seconds(arc.request.min_runtime),
+        "min_runtime": messages.decimal_seconds(arc.request.min_runtime),
     }
 
 
-def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[Holder]:
+def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Holder]:
     """All holders of an RC."""
     return [
-        Holder(
+        messages.Holder(
             **_of(arc),
             grant=arc.hold.grant,
             rcs=sorted(arc.needs),
             remaining=(arc.hold.end - now) / SECOND,
             keep=arc.request.keep,
-            params=decimals(arc.needs[rc]),
+            params=messages.decimals(arc.needs[rc]),
             bound=dict(arc.bound),
         )
         for arc in arcs
@@ -325,8 +311,8 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[Holder]:
     ]
 
 
-def _revocation(effect: HoldEnded, name: str) -> Revocation:
-    return Revocation(
+def _revocation(effect: HoldEnded, name: str) -> messages.Revocation:
+    return messages.Revocation(
         id=request_id(effect.arc),
         arc=name,
         client=effect.client,
@@ -339,11 +325,11 @@ def _revocation(effect: HoldEnded, name: str) -> Revocation:
     )
 
 
-def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> HoldView:
-    return HoldView(
+def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> messages.HoldView:
+    return messages.HoldView(
         **_of(arc),
         grant=hold.grant,
-        needs={rc: decimals(params) for rc, params in sorted(arc.needs.items())},
+        needs={rc: messages.decimals(params) for rc, params in sorted(arc.needs.items())},
         held=(now - hold.start) / SECOND,
         remaining=(hold.end - now) / SECOND,
         keep=arc.request.keep,
@@ -351,10 +337,10 @@ def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> HoldView:
     )
 
 
-def _wait_view(arc: ArcStatus, now: Ns, start: Ns | None) -> WaitView:
-    return WaitView(
+def _wait_view(arc: ArcStatus, now: Ns, start: Ns | None) -> messages.WaitView:
+    return messages.WaitView(
         **_of(arc),
-        needs={need: decimals(params) for need, params in sorted(arc.request.needs.items())},
+        needs={need: messages.decimals(params) for need, params in sorted(arc.request.needs.items())},
         waited=(now - arc.since) / SECOND,
         reason=str(arc.reason or ""),
         preemptions=arc.preemptions,

@@ -12,24 +12,10 @@ import logging
 from contextlib import suppress
 from typing import Final
 
+from zscout import messages
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Declaration, Mesh, Supervisor
-from zscout.messages import (
-    MAX_PLAN,
-    BehaviorSaid,
-    BuildingPlan,
-    BuildingPoses,
-    Grants,
-    ListPlacements,
-    LoadReport,
-    Notice,
-    Placements,
-    PlanAsk,
-    RcmState,
-    RcState,
-    StateAsk,
-)
 from zscout.services.recorder.hosts import MAX_FOLLOWED
 from zscout.services.recorder.request_tracker import RequestTracker
 from zscout.services.recorder.robots import MAX_CAMERAS
@@ -101,18 +87,18 @@ class Recorder:
         self._supervisor = Supervisor("the recorder", lambda _: stop.set())
         keys, subscribe, guard = self.mesh.keys, self.mesh.subscribe, self._supervisor.guard
         self._declared = [
-            subscribe(keys.grants, Grants, guard(self._on_grants), depth=DEPTH),
-            subscribe(keys.notice_any, Notice, guard(self._on_notice), depth=DEPTH),
-            subscribe(keys.rc_state_any, RcState, guard(self._on_rc_state), depth=DEPTH),
-            subscribe(keys.load_any, LoadReport, guard(self._on_load)),
-            subscribe(keys.placements, Placements, guard(self._on_placements), depth=DEPTH),
+            subscribe(keys.grants, messages.Grants, guard(self._on_grants), depth=DEPTH),
+            subscribe(keys.notice_any, messages.Notice, guard(self._on_notice), depth=DEPTH),
+            subscribe(keys.rc_state_any, messages.RcState, guard(self._on_rc_state), depth=DEPTH),
+            subscribe(keys.load_any, messages.LoadReport, guard(self._on_load)),
+            subscribe(keys.placements, messages.Placements, guard(self._on_placements), depth=DEPTH),
             self.mesh.watch(keys.alive_any(), guard(self._on_token)),
         ]
         # Apart: of what these miss, the RCM's state has nothing.
         behavior, poses = guard(self._on_behavior), guard(self._on_poses)
         robots = [
-            subscribe(keys.behavior_any, BehaviorSaid, behavior, depth=ROBOT_DEPTH, limit=MAX_REPORT),
-            subscribe(keys.building_poses_any, BuildingPoses, poses, depth=ROBOT_DEPTH, limit=MAX_POSES),
+            subscribe(keys.behavior_any, messages.BehaviorSaid, behavior, depth=ROBOT_DEPTH, limit=MAX_REPORT),
+            subscribe(keys.building_poses_any, messages.BuildingPoses, poses, depth=ROBOT_DEPTH, limit=MAX_POSES),
         ]
         self._wanted.set()
         self._placer_wanted.set()
@@ -124,7 +110,7 @@ class Recorder:
                 raise RecorderFailed from self._supervisor.error
             # `stop` may be quicker than what was published before. An answer of the RCM comes behind all that
             # it has published, on the same link; where nobody leads there is nothing to wait for.
-            await self.mesh.ask(keys.rcm_state, StateAsk(), RcmState, timeout=DRAIN, enough=lambda _: True)
+            await self.mesh.ask_one(keys.rcm_state, messages.StateAsk(), messages.RcmState, timeout=DRAIN)
         finally:
             await self._supervisor.close()
             for declared in [*robots, *reversed(self._declared)]:
@@ -133,15 +119,15 @@ class Recorder:
     def _now(self) -> float:
         return (self.mesh.now() - self._zero) / SECOND
 
-    def _on_grants(self, _key: str, grants: Grants) -> None:
+    def _on_grants(self, _key: str, grants: messages.Grants) -> None:
         if self._requests.grants(self._now(), grants):
             self._wanted.set()
 
-    def _on_notice(self, key: str, notice: Notice) -> None:
+    def _on_notice(self, key: str, notice: messages.Notice) -> None:
         if str(self.mesh.keys.sender_of(key)) == notice.client:
             self._requests.notice(self._now(), notice)
 
-    def _on_rc_state(self, key: str, state: RcState) -> None:
+    def _on_rc_state(self, key: str, state: messages.RcState) -> None:
         """A hold that ended at the device has ended, whether an RCM is there to publish it or not."""
         if self.mesh.keys.rc_of(key) != state.rc:
             return
@@ -150,7 +136,7 @@ class Recorder:
             self._requests.dropped(at, state.rc, {ended.grant for ended in state.ended})
         self._robots.state(at, state)
 
-    def _on_load(self, key: str, report: LoadReport) -> None:
+    def _on_load(self, key: str, report: messages.LoadReport) -> None:
         host, at = self.mesh.keys.host_of(key), self._now()
         if host == report.host:
             self._hosts.load(at, host, report.load_average[0], report.cpu / 100)
@@ -203,7 +189,8 @@ class Recorder:
 
     async def _read(self) -> bool:
         """Whether the state is known now. Without a leader, the token of the next wakes `_keep_reading`."""
-        replies = await self.mesh.ask(self.mesh.keys.rcm_state, StateAsk(), RcmState, timeout=READ_TIMEOUT)
+        key, ask = self.mesh.keys.rcm_state, messages.StateAsk()
+        replies = await self.mesh.ask(key, ask, messages.RcmState, timeout=READ_TIMEOUT)
         states = [reply.message for reply in replies if reply.message is not None]
         newest = max(states, key=lambda state: (state.term, state.seq), default=None)
         if newest is None or not self._requests.state(self._now(), newest):
@@ -216,7 +203,7 @@ class Recorder:
 
     async def _keep_asking_placer(self) -> None:
         """Asks the placer at the start, and whenever something may have been missed. Does not return."""
-        failed = 0
+        key, failed = self.mesh.keys.placer, 0
         while True:
             with suppress(TimeoutError):
                 async with asyncio.timeout(AGAIN if 0 < failed < TRIES else None):
@@ -224,7 +211,7 @@ class Recorder:
                     failed = 0
             self._placer_wanted.clear()
             self._fresher = fresher = set[str]()
-            reply = await self.mesh.ask_one(self.mesh.keys.placer, ListPlacements(), Placements, timeout=READ_TIMEOUT)
+            reply = await self.mesh.ask_one(key, messages.ListPlacements(), messages.Placements, timeout=READ_TIMEOUT)
             self._fresher = None
             if reply is None or reply.message is None:
                 failed += 1
@@ -232,7 +219,7 @@ class Recorder:
                 failed = 0
                 self._hosts.placements(self._now(), reply.message, fresher)
 
-    def _on_placements(self, _key: str, news: Placements) -> None:
+    def _on_placements(self, _key: str, news: messages.Placements) -> None:
         if self._fresher is not None and len(self._fresher) < MAX_FOLLOWED:
             self._fresher.update(one.component for one in news.components)
             self._fresher.update(news.forgotten)
@@ -263,10 +250,10 @@ class Recorder:
                 self._robots.frame(self._now(), camera, frame.head, frame.jpeg)
                 await asyncio.sleep(1 / self.frames)
 
-    def _on_behavior(self, key: str, report: BehaviorSaid) -> None:
+    def _on_behavior(self, key: str, report: messages.BehaviorSaid) -> None:
         self._robots.behavior(self._now(), self.mesh.keys.sender_of(key), report)
 
-    def _on_poses(self, key: str, poses: BuildingPoses) -> None:
+    def _on_poses(self, key: str, poses: messages.BuildingPoses) -> None:
         at = self._now()
         self._robots.floor.poses(at, self.mesh.keys.sender_of(key), poses)
         if self._asking is None or self._asking.done():
@@ -277,7 +264,12 @@ class Recorder:
     async def _ask_plan(self, sender: Sender) -> None:
         key = self.mesh.keys.building_plan(sender)
         replies = await self.mesh.ask(
-            key, PlanAsk(), BuildingPlan, timeout=READ_TIMEOUT, enough=lambda _: True, limit=MAX_PLAN
+            key,
+            messages.PlanAsk(),
+            messages.BuildingPlan,
+            timeout=READ_TIMEOUT,
+            enough=lambda _: True,
+            limit=messages.MAX_PLAN,
         )
         for reply in replies:
             if reply.message is not None:
