@@ -126,7 +126,7 @@ def wire() -> dict[str, Any]:
 def _subclasses(kind: type) -> set[type]:
     children: list[type] = kind.__subclasses__()
     below = {one for child in children for one in (child, *_subclasses(child))}
-    return {one for one in below if one.__module__.startswith("zscout.messages")}
+    return {one for one in below if one.__module__.startswith("zscout.messages") and not one.__name__.startswith("_")}
 
 
 def _shape(told: Any, shapes: dict[str, Any], kinds: dict[str, type]) -> Any:

@@ -14,13 +14,17 @@ MAX_OTHERS = 255
 """ARCs that one hand-over takes along, beside the one that it names first."""
 
 
-class Ask(Message, frozen=True, tag_field="op", tag="request"):
-    """Asks for an ARC: all of `needs`, for at least `min_runtime` seconds. A need is the name of an RC, or a
-    pattern that any one RC meets (`keyexpr.check_need`).
+class _ArcParty(Message, frozen=True):
+    """The ARC that a message is about, and its owner."""
 
-    `id` is the client's own and stays the same however often it asks; `place` is what an earlier RCM gave,
-    and `waited` the seconds since it was last queued there.
-    """
+    id: str
+    arc: str
+    client: str
+
+
+class _Wanted(Message, frozen=True):
+    """What a client wants of an ARC: all of `needs`, for at least `min_runtime` seconds. A need is the name of an RC, or
+    a pattern that any one RC meets (`keyexpr.check_need`)."""
 
     id: str
     arc: str
@@ -28,6 +32,12 @@ class Ask(Message, frozen=True, tag_field="op", tag="request"):
     priority: int
     min_runtime: Decimal
     keep: bool = False
+
+
+class Ask(_Wanted, frozen=True, tag_field="op", tag="request"):
+    """Asks for an ARC. `id` is the client's own and stays the same however often it asks; `place` is what an earlier
+    RCM gave, and `waited` the seconds since it was last queued there."""
+
     place: Place | None = None
     waited: Elapsed = 0.0
     estimate: bool = False
@@ -59,15 +69,8 @@ class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
     others: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
 
 
-class Foresee(Message, frozen=True, tag_field="op", tag="foresee"):
+class Foresee(_Wanted, frozen=True, tag_field="op", tag="foresee"):
     """Asks for the forecast of a request without making it. Answered with a Foresight."""
-
-    id: str
-    arc: str
-    needs: dict[str, Amounts]
-    priority: int
-    min_runtime: Decimal
-    keep: bool = False
 
 
 class Foresight(Message, frozen=True):
@@ -86,12 +89,9 @@ Operation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
 NAMES_ONCE.add(Operation)
 
 
-class ReasonParty(Message, frozen=True):
+class ReasonParty(_ArcParty, frozen=True):
     """An ARC that is in another's way, or was preferred to it."""
 
-    id: str
-    arc: str
-    client: str
     priority: int
 
 
@@ -110,15 +110,12 @@ class ReasonInfo(Message, frozen=True):
     """The pattern of its needs that is not met; the rest is about one of the RCs that would meet it."""
 
 
-class Notice(Message, frozen=True):
+class Notice(_ArcParty, frozen=True):
     """The state of one request: the answer to an operation, and published to its client at each change.
 
     Of two notices about one request the one with the greater `(term, step)` is the newer.
     """
 
-    id: str
-    arc: str
-    client: str
     state: State
     term: Term
     step: int
@@ -148,15 +145,12 @@ class Notice(Message, frozen=True):
 # From the RCM to all
 
 
-class Holder(Message, frozen=True):
+class Holder(_ArcParty, frozen=True):
     """One holder of one RC, so complete that a new RCM can recover its ARC from the RCs' states alone.
 
     `rcs` names the whole gang, `bound` the RC that meets each of its patterns. `remaining` seconds of its
     minimum runtime are left, negative where it is over; with `keep` the hold does not end then."""
 
-    id: str
-    arc: str
-    client: str
     grant: Grant
     place: Place
     rcs: list[str]
@@ -168,12 +162,9 @@ class Holder(Message, frozen=True):
     bound: dict[str, str] = {}
 
 
-class Revocation(Message, frozen=True):
+class Revocation(_ArcParty, frozen=True):
     """A hold that is over, by name."""
 
-    id: str
-    arc: str
-    client: str
     grant: Grant
     rcs: list[str]
     outcome: str
@@ -210,13 +201,10 @@ class StateAsk(Message, frozen=True):
     """Whether to estimate when queued ARCs will start."""
 
 
-class HoldView(Message, frozen=True):
+class HoldView(_ArcParty, frozen=True):
     """A hold in force. `held` is how long it has stood, in seconds; `needs` are by RC, `bound` the RC that
     meets each of its patterns."""
 
-    id: str
-    arc: str
-    client: str
     priority: int
     grant: Grant
     place: Place
@@ -228,12 +216,9 @@ class HoldView(Message, frozen=True):
     bound: dict[str, str] = {}
 
 
-class WaitView(Message, frozen=True):
+class WaitView(_ArcParty, frozen=True):
     """An ARC in the queue, in rank order. `waited` seconds since it was last queued; `needs` as asked."""
 
-    id: str
-    arc: str
-    client: str
     priority: int
     place: Place
     needs: dict[str, Amounts]
@@ -278,15 +263,9 @@ class RcmState(Message, frozen=True):
 # Clients
 
 
-class OpenRequest(Message, frozen=True):
+class OpenRequest(_Wanted, frozen=True):
     """A request as its client knows it, for an RCM that takes the lead. `waited` as in Ask."""
 
-    id: str
-    arc: str
-    needs: dict[str, Amounts]
-    priority: int
-    min_runtime: Decimal
-    keep: bool = False
     place: Place | None = None
     waited: Elapsed = 0.0
     grant: Grant | None = None
