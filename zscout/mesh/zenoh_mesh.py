@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import functools
 import json
 import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import zenoh
 from zenoh.handlers import Callback, RingChannel
@@ -38,7 +38,7 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
     Quality.DATA: {"congestion_control": DROP, "priority": zenoh.Priority.DATA_LOW, "express": False},
     Quality.FRAME: {"congestion_control": DROP, "priority": zenoh.Priority.DATA, "express": True},
 }
-_ENCODINGS: dict[type, zenoh.Encoding] = {}
+T = TypeVar("T")
 
 
 def zenoh_config(config: MeshConfig) -> zenoh.Config:
@@ -73,30 +73,33 @@ class ZenohMesh(Mesh):
         """Joins the mesh of `fleet`. Raises MeshError where an address can't be had."""
         keys = Keys(fleet)
         settings = zenoh_config(config or MeshConfig())
-        opening: Future[zenoh.Session] = Future()
-        opening.set_running_or_notify_cancel()
-        threading.Thread(target=_join, args=(opening, settings), name="joins the mesh", daemon=True).start()
+        opening = _in_thread("joins the mesh", lambda: zenoh.open(settings))
         try:
             session = await asyncio.wrap_future(opening)
         except asyncio.CancelledError:
-            opening.add_done_callback(_close_abandoned)
+            # In a thread of its own: this may be the event loop's.
+            opening.add_done_callback(
+                lambda opened: opened.exception() or _in_thread("closes the mesh", opened.result().close)
+            )
             raise
         except zenoh.ZError as error:
             raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
         return cls(ZenohTransport(session), keys, me, clock.now)
 
 
-def _join(opening: Future[zenoh.Session], settings: zenoh.Config) -> None:
-    try:
-        opening.set_result(zenoh.open(settings))
-    except BaseException as error:  # noqa: BLE001 - it is raised to who awaits it
-        opening.set_exception(error)
+def _in_thread(name: str, call: Callable[[], T]) -> Future[T]:
+    """Calls in a daemon thread: one of asyncio's own would be joined when the loop ends, however long it takes."""
+    future: Future[T] = Future()
+    future.set_running_or_notify_cancel()
 
+    def run() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:  # noqa: BLE001 - it is raised to who awaits it
+            future.set_exception(error)
 
-def _close_abandoned(opening: Future[zenoh.Session]) -> None:
-    """Whoever wanted this session was cancelled. In a thread: this may be the event loop's."""
-    if opening.exception() is None:
-        threading.Thread(target=opening.result().close, name="closes the mesh", daemon=True).start()
+    threading.Thread(target=run, name=name, daemon=True).start()
+    return future
 
 
 class ZenohTransport(Transport):
@@ -110,22 +113,12 @@ class ZenohTransport(Transport):
         return len(self._session.info.links())
 
     async def close(self) -> None:
-        # In a daemon thread: one of asyncio's own would be joined when the loop ends, however long it takes.
-        loop = asyncio.get_running_loop()
-        closed = asyncio.Event()
-
-        def close() -> None:
-            try:
-                self._session.close()  # type: ignore[no-untyped-call]
-            except zenoh.ZError as error:
-                log.warning("the mesh session did not close cleanly: %s", error)
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(closed.set)
-
-        threading.Thread(target=close, name="closes the mesh", daemon=True).start()
+        closing = _in_thread("closes the mesh", self._session.close)
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
-                await closed.wait()
+                await asyncio.wrap_future(closing)
+        except zenoh.ZError as error:
+            log.warning("the mesh session did not close cleanly: %s", error)
         except TimeoutError:
             log.warning("the mesh session did not close within %g s", CLOSE_TIMEOUT)
 
@@ -242,13 +235,11 @@ class ZenohPublisher(TransportPublisher):
         return bool(status.matching)
 
 
+@functools.cache
 def _encoding(kind: type | None) -> zenoh.Encoding:
     if kind is None:
         return zenoh.Encoding.IMAGE_JPEG
-    encoding = _ENCODINGS.get(kind)
-    if encoding is None:
-        encoding = _ENCODINGS[kind] = zenoh.Encoding.APPLICATION_JSON.with_schema(messages.schema(kind))
-    return encoding
+    return zenoh.Encoding.APPLICATION_JSON.with_schema(messages.schema(kind))
 
 
 def _collecting(to: Collector) -> Callback[zenoh.Reply]:

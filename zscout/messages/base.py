@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from decimal import Decimal
 from fractions import Fraction
+from functools import cache
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import msgspec
@@ -61,7 +62,7 @@ class Problem(Message, frozen=True):
 
 T = TypeVar("T")
 _ENCODER = msgspec.json.Encoder(decimal_format="number")
-_DECODERS: dict[Any, msgspec.json.Decoder[Any]] = {}
+_decoder: Callable[[Any], msgspec.json.Decoder[Any]] = cache(msgspec.json.Decoder)
 NAMES_ONCE: set[Any] = set()
 """Kinds in which a name that stands twice in one object is refused. The decoder alone takes the last, which
 in a request would silently drop a need; elsewhere the 6 us are not worth it."""
@@ -86,11 +87,8 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
     """`payload` as a message of `kind` (a struct, or a union of tagged ones). Raises Malformed."""
     if len(payload) > limit:
         raise Malformed(f"{len(payload)} bytes are too many; at most {limit} are taken")
-    decoder = _DECODERS.get(kind)
-    if decoder is None:
-        decoder = _DECODERS[kind] = msgspec.json.Decoder(kind)
     try:
-        message: T = decoder.decode(payload)
+        message: T = _decoder(kind).decode(payload)
         if kind in NAMES_ONCE:
             _ONCE.decode(payload.decode())
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:

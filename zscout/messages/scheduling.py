@@ -23,8 +23,8 @@ class _ArcParty(Message, frozen=True):
 
 
 class _Wanted(Message, frozen=True):
-    """What a client wants of an ARC: all of `needs`, for at least `min_runtime` seconds. A need is the name of an RC, or
-    a pattern that any one RC meets (`keyexpr.check_need`)."""
+    """What a client wants of an ARC: all of `needs`, for at least `min_runtime` seconds. A need is the name of an RC,
+    or a pattern that any one RC meets (`keyexpr.check_need`)."""
 
     id: str
     arc: str
