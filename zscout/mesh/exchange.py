@@ -83,6 +83,7 @@ class Backlog:
     pending: int = 0
     missed: int = 0
     closed: bool = False
+    """Nothing that still waits is handled any more. Subscriptions that share a backlog do not ask."""
     depth: int = QUEUE_DEPTH
 
 
@@ -101,6 +102,7 @@ class Declaration:
     def close(self) -> None:
         undeclare, self._undeclare = self._undeclare, None
         if undeclare is not None:
+            self._state.closed = True
             undeclare()
 
 

@@ -7,6 +7,7 @@ at once is dropped, and a subscriber slower than the frames misses those in betw
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import threading
 from collections.abc import Callable
@@ -41,25 +42,18 @@ class FramePublisher:
     def __init__(self, publisher: TransportPublisher, deliver: Callable[..., None]) -> None:
         self._publisher, self._deliver = publisher, deliver
         self.close = publisher.undeclare
-        self._watched = False
-
-    @property
-    def watched(self) -> bool:
+        self.watched = False
         """Whether there are subscribers, as far as is known since `follow`."""
-        return self._watched
 
     def follow(self, changed: Callable[[bool], None]) -> None:
         """Calls `changed(watched)` in the event loop whenever that changes from now on."""
 
         def update(watched: bool) -> None:
-            if watched != self._watched:
-                self._watched = watched
+            if watched != self.watched:
+                self.watched = watched
                 changed(watched)
 
-        def on_matching(watched: bool) -> None:
-            self._deliver(update, watched)
-
-        update(self._publisher.match(on_matching))
+        update(self._publisher.match(functools.partial(self._deliver, update)))
 
     def put(self, head: FrameHead, jpeg: bytes) -> None:
         """Publishes a frame, or drops it where that would have to wait. Raises ValueError for more than

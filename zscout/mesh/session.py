@@ -7,6 +7,7 @@ came, with one wake-up for a burst. Handlers are plain functions that run there 
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from collections import deque
 from collections.abc import Callable
@@ -43,6 +44,8 @@ RING_DEPTH = 32
 FINAL_SLACK = 0.5
 """Seconds after its timeout at which a query is over though the transport has not reported that."""
 
+_Subscription: TypeAlias = tuple[Backlog, list[Callable[[str, Any], None]], Undeclare]
+"""One whose publications are decoded once for all handlers of this process."""
 OnReply: TypeAlias = Callable[[str, bytes, bool], bool]
 """Called with a reply's key, payload, and whether it is a message; returns whether that is enough."""
 
@@ -124,15 +127,6 @@ def guarded(call: Callable[..., None], *args: Any) -> None:
         log.warning("ignored what came under a bad name: %s", error)
     except Exception:
         log.exception("a handler failed")
-
-
-@dataclass(slots=True)
-class _Subscription:
-    """One whose publications are decoded once for all handlers of this process."""
-
-    state: Backlog
-    handlers: list[Callable[[str, Any], None]] = field(default_factory=list)
-    undeclare: Undeclare = lambda: None
 
 
 class Mesh:
@@ -292,7 +286,7 @@ class Mesh:
                 incoming.refuse(Problem("internal", "the request failed here; see this node's log"))
                 raise
 
-        return _closing(state, self._transport.queryable(key, on_query))
+        return Declaration(self._transport.queryable(key, on_query), state)
 
     # Publications
 
@@ -320,39 +314,38 @@ class Mesh:
 
         All subscriptions that are alike share one declaration and one decoding of each message."""
         alike = (key, kind, depth, limit)
-        shared = self._shared.get(alike)
-        if shared is None:
-            shared = self._shared[alike] = _Subscription(Backlog(depth=depth))
-            shared.undeclare = self._subscribe(key, kind, shared, limit)
-        handlers, state, undeclare = shared.handlers, shared.state, shared.undeclare
+        if alike not in self._shared:
+            self._shared[alike] = self._subscribe(key, kind, depth, limit)
+        state, handlers, undeclare = self._shared[alike]
         handlers.append(handler)
 
         def leave() -> None:
             handlers.remove(handler)
             if not handlers:
-                state.closed = True
                 del self._shared[alike]
                 undeclare()
 
         return Declaration(leave, state)
 
-    def _subscribe(self, key: str, kind: type[S], shared: _Subscription, limit: int) -> Undeclare:
+    def _subscribe(self, key: str, kind: type[S], depth: int, limit: int) -> _Subscription:
+        state, handlers = Backlog(depth=depth), list[Callable[[str, Any], None]]()
+
         def on_sample(name: str, payload: bytes, _: bytes | None) -> None:
-            if not self._inbox.offer(shared.state, handle, name, payload):
-                shared.state.missed += 1
+            if not self._inbox.offer(state, handle, name, payload):
+                state.missed += 1
 
         def handle(name: str, payload: bytes) -> None:
-            if shared.state.closed:
+            if not handlers:
                 return
             try:
                 message: S = messages.decode(payload, kind, limit)
             except Malformed as error:
                 log.warning("ignored a publication on %.200r: %s", name, error)
                 return
-            for handler in tuple(shared.handlers):
+            for handler in tuple(handlers):
                 guarded(handler, name, message)
 
-        return self._transport.subscriber(key, on_sample)
+        return state, handlers, self._transport.subscriber(key, on_sample)
 
     def poll_latest(self, key: str, kind: type[S], *, depth: int = RING_DEPTH) -> PolledSubscription[S]:
         """Keeps the latest `depth` publications on `key`, without waking the event loop, until they are taken."""
@@ -379,15 +372,13 @@ class Mesh:
         goes, and for those that live already."""
         state = Backlog()
 
-        def on_token(text: str, alive: bool) -> None:
-            self._inbox.deliver(handle, text, alive)
-
         def handle(text: str, alive: bool) -> None:
             token = None if state.closed else self._token_of(text)
             if token is not None:
                 handler(token, alive)
 
-        return _closing(state, self._transport.token_subscriber(key, on_token))
+        deliver = functools.partial(self._inbox.deliver, handle)
+        return Declaration(self._transport.token_subscriber(key, deliver), state)
 
     async def living(self, key: str, *, timeout: float) -> list[Token]:
         """Queries liveliness once: the tokens on `key` that live now, sorted."""
@@ -448,13 +439,3 @@ def _read_reply(key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -
 
 def _refuse(query: TransportQuery, code: str, message: str) -> None:
     query.reply_error(messages.encode(Problem(code, message)), Problem)
-
-
-def _closing(state: Backlog, undeclare: Undeclare) -> Declaration:
-    """A declaration after whose end nothing that still waits is handled."""
-
-    def leave() -> None:
-        state.closed = True
-        undeclare()
-
-    return Declaration(leave)

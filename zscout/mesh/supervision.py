@@ -111,16 +111,16 @@ class Supervisor:
         self._cancelled = True
         for handle in tuple(self._timers):
             handle.cancel()
-        current = _current_task()
         for task in tuple(self._tasks):
-            if task is not current:
+            # Asked by its loop, which may have stopped.
+            if task is not asyncio.current_task(task.get_loop()):
                 task.cancel()
 
     async def close(self) -> None:
         """Cancels all, and returns when all tasks have ended, but for the one that calls; after CLOSE_TIMEOUT
         those that still run are logged."""
         self.cancel()
-        tasks = self._tasks - {_current_task()}
+        tasks = self._tasks - {asyncio.current_task()}
         if tasks:
             _, stuck = await asyncio.wait(tasks, timeout=CLOSE_TIMEOUT)
             for task in stuck:
@@ -169,13 +169,6 @@ async def done_within(seconds: float | None, work: Awaitable[object]) -> bool:
             await work
             return True
     return False
-
-
-def _current_task() -> asyncio.Task[Any] | None:
-    try:
-        return asyncio.current_task()
-    except RuntimeError:  # the loop has stopped
-        return None
 
 
 class HostClock:
