@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from zscout.drivers.airtime import Bucket
@@ -27,7 +28,7 @@ from zscout.drivers.capture import Capture, CapturedFrame, seconds
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.mesh import Refused
 from zscout.messages import MAX_FRAME, Figures, FrameHead, Holder
-from zscout.types import SECOND, Grant
+from zscout.types import SECOND
 
 if TYPE_CHECKING:
     from zscout.mesh.frames import FramePublisher
@@ -183,16 +184,8 @@ class FramegrabberDriver(Driver):
         capture = self._capture
         if capture is None or source != self._source:
             capture = self._open(source)
-        self._pump = FramePump(
-            self._publisher,
-            capture,
-            self._meter,
-            first=self._before["number"],
-            grant=holder.grant,
-            source=source,
-            rate=self._rate,
-            quality=self._quality,
-        )
+        head = FrameHead(self._before["number"], time=0, width=0, height=0, grant=holder.grant, source=source)
+        self._pump = FramePump(self._publisher, capture, self._meter, head, rate=self._rate, quality=self._quality)
 
     def _open(self, source: str) -> Capture:
         self._let_go()
@@ -213,7 +206,7 @@ class FramegrabberDriver(Driver):
     def _stop_pump(self) -> None:
         if self._pump is not None:
             self._pump.stop()
-            self._pump = None
+        self._pump = None
 
     def _close_unless_needed(self) -> None:
         """A source stays open while the framegrabber is held, and afterwards while it has subscribers: the
@@ -302,7 +295,7 @@ class FrameMeter:
 
 class FramePump:
     """Publishes the pictures of a capture that are read from now on, until it is stopped; in a thread of its
-    own. Numbers go on from `first`.
+    own. `head` is what the heads of frames have in common; their numbers go on from its number.
 
     At most `rate` frames a second, with JPEG `quality` 1..100, and only while somebody subscribes: otherwise
     nothing is even encoded.
@@ -313,15 +306,12 @@ class FramePump:
         publisher: FramePublisher,
         capture: Capture,
         meter: FrameMeter,
+        head: FrameHead,
         *,
-        first: int,
-        grant: Grant,
-        source: str,
         rate: float,
         quality: int,
     ) -> None:
-        self._publisher, self._capture, self._meter = publisher, capture, meter
-        self._first, self._grant, self._source = first, grant, source
+        self._publisher, self._capture, self._meter, self._head = publisher, capture, meter, head
         self._quality = quality
         self._pace = pace_of(rate)
         self._after = capture.number
@@ -365,14 +355,8 @@ class FramePump:
             )
             return
         height, width = captured.picture.shape[:2]
-        head = FrameHead(
-            number=self._first + captured.number,
-            time=captured.time,
-            width=width,
-            height=height,
-            grant=self._grant,
-            source=self._source,
-        )
+        number = self._head.number + captured.number
+        head = structs.replace(self._head, number=number, time=captured.time, width=width, height=height)
         with self._lock:
             now = seconds()
             if not self._stopped and now - captured.time <= MAX_AGE:

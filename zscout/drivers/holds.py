@@ -57,21 +57,15 @@ class HoldChange:
         return bool(self.began or self.removed)
 
     @property
-    def handed_over(self) -> bool:
-        """Whether a holder goes on in another client: the same ARC has the same place."""
-        before = {holder.place: holder.client for holder in self.removed}
-        return any(before.get(holder.place, holder.client) != holder.client for holder in self.began)
-
-    @property
     def removed_not_handed_over(self) -> list[Holder]:
-        """Of the removed, those that do not go on in another client."""
+        """Of the removed, those that do not go on in another client: there the same ARC has the same place."""
         after = {holder.place: holder.client for holder in self.began}
         return [holder for holder in self.removed if after.get(holder.place, holder.client) == holder.client]
 
     @property
     def interrupts(self) -> bool:
         """Whether the device serves nobody between what was before and what is after."""
-        return not self.stayed and not self.handed_over
+        return not self.stayed and self.removed_not_handed_over == self.removed
 
 
 class HoldTable:

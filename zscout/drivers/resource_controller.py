@@ -158,8 +158,7 @@ class ResourceController:
             self._declared.append(mesh.serve(keys.vote(self.name), Proposal, self._on_proposal))
         command = keys.command_any(self.name)
         self._declared.append(mesh.serve(command, Command, self._on_command, depth=COMMAND_QUEUE))
-        token = Token(mesh.me.host, Role.RC, self.name, self.instance)
-        self._declared.append(mesh.alive(token))
+        self._declared.append(mesh.alive(Token(mesh.me.host, Role.RC, self.name, self.instance)))
 
     async def stop(self) -> None:
         """Leaves the mesh and puts the device into its safe state; once, however often it is called."""

@@ -95,7 +95,6 @@ class RobotDriver(Driver):
     async def close(self) -> None:
         for declared in self._declared:
             declared.close()
-        self._drop(Refused("ended", "the hold ended before it was sent"))
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
         """Only the camera warms up, and not before a command switches it on."""

@@ -13,11 +13,11 @@ command nothing of a halt is left but "transmitter off".
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, islice
 from typing import Final
 
 from zscout.drivers.airtime import RESERVE, Bucket, Share, urgent_burst
@@ -43,7 +43,7 @@ SPACING: Final[Ns] = SECOND // 20
 """From one to the next: longer than most bursts of interference, short against a person's patience."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class QueuedPacket:
     """A holder's packet that has not gone out. `entered`: when its bucket let it into the queue."""
 
@@ -52,7 +52,6 @@ class QueuedPacket:
     command: RadioDrive | RadioCamera
     arrived: Ns
     entered: Fraction = Fraction(0)
-    queued: bool = False
 
     @property
     def size(self) -> int:
@@ -149,7 +148,7 @@ class _HolderQueue:
         while self.bucket is not None and (at := self.enters_at()) is not None and at <= now:
             first = self.waiting.popleft()
             self.bucket.take(first.size, at)
-            first.entered, first.queued = at, True
+            first.entered = at
             yield first
 
 
@@ -158,14 +157,13 @@ class TransmitQueue:
 
     def __init__(self, rate: Fraction, *, first_number: int = 0) -> None:
         self._ns_per_byte = SECOND / rate
-        self._first_number = first_number
         self._ahead = MAX_PACKET * self._ns_per_byte
         """How much earlier than the line is free the next packet is written: one waits in the kernel."""
         self._free_at = Fraction(0)
         self.members: dict[Place, _HolderQueue] = {}
         self._queue: deque[QueuedPacket] = deque()
         self._urgent: dict[int, tuple[type[StopPacket] | type[HaltPacket], Ns]] = {}
-        self._robots: dict[int, _Robot] = {}
+        self._robots: defaultdict[int, _Robot] = defaultdict(lambda: _Robot(first_number))
         self._reserve = Bucket(Fraction(urgent_burst(0)), rate * RESERVE, 0)
         self.replaced = 0
         """Drive and camera packets that a newer command made void before they went out."""
@@ -178,7 +176,7 @@ class TransmitQueue:
         """A holder begins. On a busy line it earns its first packet, so that the bound holds for all."""
         if place not in self.members:
             self.members[place] = _HolderQueue(share, now, full=not self._queue and not self._urgent)
-            self._fit_reserve()
+            self._reserve.size = Fraction(urgent_burst(len(self.members)))
 
     def leave(self, place: Place) -> set[int]:
         """A holder is gone, and what waits for it. Returns the robots that it made do something."""
@@ -186,11 +184,8 @@ class TransmitQueue:
             return set()
         self.dropped += self._remove(lambda waiting: waiting.place == place)
         member = self.members.pop(place)
-        self._fit_reserve()
-        return member.robots
-
-    def _fit_reserve(self) -> None:
         self._reserve.size = Fraction(urgent_burst(len(self.members)))
+        return member.robots
 
     # What is to be sent
 
@@ -223,13 +218,9 @@ class TransmitQueue:
                 raise Refused("busy", "too many packets of this ARC wait; send fewer")
             member.waiting.append(waiting)
             self._release(now)
-        if waiting.queued:
-            ahead = len(self._urgent) * OVERHEAD
-            for queued in self._queue:
-                ahead += queued.size
-                if queued is waiting:
-                    break
-            return self._carried(ahead, now)
+        if waiting in self._queue:
+            up_to_it = islice(self._queue, self._queue.index(waiting) + 1)
+            return self._carried(len(self._urgent) * OVERHEAD + sum(queued.size for queued in up_to_it), now)
         begins = max(member.bucket.ready(waiting.size), self._free_at, Fraction(now))
         return round(begins - now + waiting.size * self._ns_per_byte)
 
@@ -268,7 +259,7 @@ class TransmitQueue:
         if self._urgent:
             number = next(iter(self._urgent))
             kind, since = self._urgent.pop(number)
-            robot = self._robot(number)
+            robot = self._robots[number]
             return self._transmit(kind(number, robot.number()), Fraction(since), now)
         due = [(repeat.due, robot, repeat) for robot, repeat in self._repeats() if self._may_repeat(repeat) <= now]
         if due:
@@ -279,7 +270,7 @@ class TransmitQueue:
             if not in_force(waiting.grant):
                 self.dropped += 1
                 continue
-            command, number = waiting.command, self._robot(waiting.command.robot).number()
+            command, number = waiting.command, self._robots[waiting.command.robot].number()
             packet: Packet
             if isinstance(command, RadioDrive):
                 packet = DrivePacket(command.robot, number, command.left, command.right, command.lasts)
@@ -330,9 +321,6 @@ class TransmitQueue:
         if repeat or isinstance(packet, StopPacket | HaltPacket):
             self._reserve.take(size, now)
         if not repeat:
-            self._robot(packet.robot).sent(packet, now)
+            self._robots[packet.robot].sent(packet, now)
         self._free_at = max(self._free_at, Fraction(now)) + size * self._ns_per_byte
         return OutgoingPacket(packet, entered, self._free_at, repeat)
-
-    def _robot(self, robot: int) -> _Robot:
-        return self._robots.setdefault(robot, _Robot(self._first_number))
