@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import heapq
 
-from zscout.scheduling.priority import VOTING, Admissible, AdmissionCheck, Inadmissible, Priority, VotesNeeded
+from zscout.scheduling.priority import VOTING, Admissible, AdmissionCheck, Priority, VotesNeeded
 from zscout.scheduling.reason import ReasonCode, of_rcs
+from zscout.scheduling.reservations import Inadmissible
 from zscout.scheduling.state import Actions, SchedulerState
 
 

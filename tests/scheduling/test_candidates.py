@@ -26,7 +26,7 @@ def everyone_looked_at(state: SchedulerState, votes: Votes, now: Ns) -> set[str]
     movable: dict[str, Arc] = {}
     found: set[str] = set()
     for arc in sorted(state.queued.values(), key=lambda arc: arc.rank):
-        if arc.unbound or any(not rc.present for rc in arc.rcs):
+        if (arc.patterns and not arc.bound) or any(not rc.present for rc in arc.rcs):
             continue
         stays = {
             rc.name: [

@@ -25,7 +25,6 @@ from zscout.scheduling.model import (
     RcLost,
     RcReported,
     RecoveredHold,
-    RecoveredRequest,
     Released,
     Requested,
     Tick,
@@ -274,7 +273,7 @@ def test_a_hold_whose_time_ran_out_between_two_terms_is_completed_at_once() -> N
     core = Core()
     now = 60 * SECOND
     over = standing(request("over", "robot/a"), 1)
-    waits = RecoveredRequest(request("next", "robot/a"), Place(OLD, 2))
+    waits = Requested(request("next", "robot/a"), Place(OLD, 2))
     effects = core.handle(now, RcJoined("robot/a", sharable=False), LeadTaken(NEW, (over,), (waits,)))
     validate(core)
     assert [(gone.arc, gone.outcome) for gone in only(HoldEnded, effects)] == [("over", Outcome.COMPLETED)]

@@ -15,7 +15,6 @@ from zscout.scheduling.model import (
     Outcome,
     Propose,
     RecoveredHold,
-    RecoveredRequest,
     Released,
     Requested,
     Tick,
@@ -57,7 +56,7 @@ def test_one_arc_that_two_clients_tell_of_is_one_again_after_the_hand_over() -> 
             if runs:
                 standing.append(RecoveredHold(wanted, shared, Grant(Term(1, "old"), seq), 0, 10 * SECOND))
             else:
-                waiting.append(RecoveredRequest(wanted, shared))
+                waiting.append(Requested(wanted, shared))
         core.handle(0, LeadTaken(Term(2, "now"), tuple(standing), tuple(waiting)))
         core.handle(1, HandedOver("old/x", "new", "new/x"))
         validate(core)

@@ -12,7 +12,7 @@ from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcRequest, Effect, LeadTaken, RcJoined, RecoveredRequest, Requested, Tick
+from zscout.scheduling.model import ArcRequest, Effect, LeadTaken, RcJoined, Requested, Tick
 from zscout.scheduling.replay import Replay, replay
 from zscout.scheduling.reservations import MAX_STARVING
 from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
@@ -159,7 +159,7 @@ def test_who_has_waited_under_another_rcm_goes_on_waiting_not_anew() -> None:
     now = 100 * SECOND
     wide = ArcRequest("wide", "h/c", {"robot/a": {}, "robot/b": {}}, 1, SECOND)
     long = ArcRequest("long", "h/c", {"robot/a": {}}, 1, 10 * SECOND)
-    waiting = (RecoveredRequest(wide, Place(NO_TERM, 1), now - PATIENCE),)
+    waiting = (Requested(wide, Place(NO_TERM, 1), now - PATIENCE),)
     core.handle(now, RcJoined("robot/b", sharable=False), LeadTaken(TERM, (), waiting))
     # Nobody is kept a place that an absent RC leaves open for who knows how long.
     core.handle(now, RcJoined("robot/a", sharable=False), Requested(long))

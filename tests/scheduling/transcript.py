@@ -38,7 +38,6 @@ from zscout.scheduling.model import (
     RcLost,
     RcReported,
     RecoveredHold,
-    RecoveredRequest,
     Released,
     Requested,
     Tick,
@@ -58,7 +57,7 @@ class CorePlayer:
     core: Core = field(default_factory=Core)
     now: Ns = 0
     standing: list[RecoveredHold] = field(default_factory=list)
-    waiting: list[RecoveredRequest] = field(default_factory=list)
+    waiting: list[Requested] = field(default_factory=list)
 
     def batch(self, line: str) -> list[str]:
         events: list[Event] = []
@@ -90,7 +89,7 @@ class CorePlayer:
                 return None
             case "waiting":
                 request, options = _request(rest)
-                self.waiting.append(RecoveredRequest(request, _place(options["place"])))
+                self.waiting.append(Requested(request, _place(options["place"])))
                 return None
             case "lead":
                 lead = LeadTaken(_term(first), tuple(self.standing), tuple(self.waiting))

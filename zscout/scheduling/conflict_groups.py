@@ -85,7 +85,7 @@ class _Search:
             heapq.heappush(self._heap, following)
 
     def _might_start(self, arc: Arc) -> bool:
-        if arc.mask & ~self.state.present or arc.unbound:
+        if arc.mask & ~self.state.present or (arc.patterns and not arc.bound):
             return False
         for rc in arc.rcs:
             if rc.sharable:

@@ -19,26 +19,8 @@ from dataclasses import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.keyexpr import is_pattern
-from zscout.scheduling import model as on
-from zscout.scheduling.model import (
-    QUANTUM,
-    Arc,
-    ArcRequest,
-    ArcState,
-    ArcStatus,
-    Dropped,
-    Effect,
-    Granted,
-    Hold,
-    HoldEnded,
-    Outcome,
-    Propose,
-    Queued,
-    Rc,
-    RcStatus,
-    Status,
-    WakeAt,
-)
+from zscout.scheduling import model
+from zscout.scheduling.model import QUANTUM, Arc, ArcState, ArcStatus, Hold, Outcome, Rc, RcStatus, Status
 from zscout.scheduling.priority import AdmissionCheck, Priority
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.state import SchedulerState, Strategy
@@ -59,12 +41,12 @@ class Core:
         self.batches = 0
         """How many batches of events were handled."""
         self._arrivals = 0
-        self._effects: list[Effect] = []
+        self._effects: list[model.Effect] = []
         self._wake: Ns | None = None
         self._run_again = False
         """Whether the strategy asked for another pass at once."""
 
-    def handle(self, now: Ns, *events: on.Event) -> list[Effect]:
+    def handle(self, now: Ns, *events: model.Event) -> list[model.Effect]:
         """Applies one instant's events and runs a pass. Raises ValueError where `now` goes backwards.
 
         1. End the holds whose minimum runtime is over.
@@ -131,17 +113,17 @@ class Core:
         """Whether this core may have given out `place`; True for other terms, of which it does not know."""
         return place.term != self.term or place.arrival <= self._arrivals
 
-    def as_events(self, term: Term) -> tuple[list[on.Event], on.LeadTaken]:
+    def as_events(self, term: Term) -> tuple[list[model.Event], model.LeadTaken]:
         """The events that bring another core to the state of this one, in a term of its own."""
         state = self._state
-        joined: list[on.Event] = [on.RcJoined(rc.name, rc.sharable) for rc in state.rcs.values() if rc.present]
+        joined: list[model.Event] = [model.RcJoined(rc.name, rc.sharable) for rc in state.rcs.values() if rc.present]
         recovered_holds = tuple(
-            on.RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
+            model.RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
             for arc in state.running.values()
             if arc.hold is not None
         )
-        waiting = tuple(on.RecoveredRequest(arc.request, arc.place, arc.since) for arc in state.queued.values())
-        return joined, on.LeadTaken(term, recovered_holds, waiting)
+        waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in state.queued.values())
+        return joined, model.LeadTaken(term, recovered_holds, waiting)
 
     def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
         """Whether an RC would accept these holders, by the votes that it has given; True if unknown."""
@@ -169,48 +151,47 @@ class Core:
 
     # Events
 
-    def _apply(self, event: on.Event) -> None:
+    def _apply(self, event: model.Event) -> None:
         match event:
-            case on.Requested(request, place, since):
-                self._ask(request, place, since)
-            case on.Cancelled(arc, by):
+            case model.Requested():
+                self._ask(event)
+            case model.Cancelled(arc, by):
                 self._end_request(arc, Outcome.CANCELLED, Reason(ReasonCode.CANCELLED, detail=by))
-            case on.Released(arc, by):
+            case model.Released(arc, by):
                 self._end_request(arc, Outcome.RELEASED, Reason(ReasonCode.RELEASED, detail=by))
-            case on.Vote(proposal, accept, reason):
+            case model.Vote(proposal, accept, reason):
                 self._votes.answer(proposal, accept=accept, reason=reason)
-            case on.VoteOverdue(proposal):
+            case model.VoteOverdue(proposal):
                 self._votes.overdue(proposal, self._state.now)
-            case on.RcJoined(rc, sharable):
+            case model.RcJoined(rc, sharable):
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
                 self._state.join(rc, sharable=sharable)
-            case on.RcReported(rc, ended, rules_changed):
+            case model.RcReported(rc, ended, rules_changed):
                 for arc in ended:
                     if arc in self._state.rc(rc).holders:
                         self._end_hold(self._state.running[arc], Outcome.LOST, Reason(ReasonCode.RC_ENDED, (rc,)))
                 if rules_changed:
                     self._votes.forget_rc(rc)
-            case on.RcLost(rc, reason):
+            case model.RcLost(rc, reason):
                 self._lose_rc(rc, reason)
-            case on.ClientLost(client, reason):
+            case model.ClientLost(client, reason):
                 for lost in self.arcs_of(client):
                     why = Reason(ReasonCode.CLIENT_LOST, detail=reason)
                     self._end_request(lost, Outcome.CLIENT_LOST, why)
-            case on.HandedOver(arc, to, renamed):
+            case model.HandedOver(arc, to, renamed):
                 self._hand_over(arc, to, renamed)
-            case on.LeadTaken(term, recovered_holds, waiting):
+            case model.LeadTaken(term, recovered_holds, waiting):
                 self._take_lead(term, recovered_holds, waiting)
-            case on.Tick():
+            case model.Tick():
                 pass
 
-    def _ask(self, request: ArcRequest, place: Place | None, since: Ns | None) -> None:
-        if self._state.arc(request.arc) is not None:
-            return
-        since = self._state.now if since is None else min(since, self._state.now)
-        self._state.enqueue(self._new_arc(request, place), since)
+    def _ask(self, asked: model.Requested) -> None:
+        if self._state.arc(asked.request.arc) is None:
+            since = self._state.now if asked.since is None else min(asked.since, self._state.now)
+            self._state.enqueue(self._new_arc(asked.request, asked.place), since)
 
-    def _new_arc(self, request: ArcRequest, place: Place | None) -> Arc:
+    def _new_arc(self, request: model.ArcRequest, place: Place | None) -> Arc:
         if place is None:
             self._arrivals += 1
             place = Place(self.term, self._arrivals)
@@ -220,7 +201,7 @@ class Core:
         named = self._state.mask([need for need in request.needs if need not in patterns])
         arc = Arc(request, place, named, patterns, named)
         if patterns:
-            self._state.unbind(arc)
+            self._state.bind(arc, {})
         return arc
 
     def _end_request(self, arc_id: ArcId, outcome: Outcome, reason: Reason) -> None:
@@ -234,7 +215,7 @@ class Core:
             return
         self._state.dequeue(arc)
         self._forget(arc)
-        self._effects.append(Dropped(arc.id, arc.request.client, outcome, reason))
+        self._effects.append(model.Dropped(arc.id, arc.request.client, outcome, reason))
 
     def _lose_rc(self, name: str, reason: str) -> None:
         """An RC is gone: each gang it was part of ends as a whole and is queued with its place."""
@@ -259,7 +240,7 @@ class Core:
             self._state.dequeue(existing)
             self._forget(existing)
         if arc.hold is None:
-            self._effects.append(Dropped(arc.id, arc.request.client, Outcome.HANDED_OVER, reason))
+            self._effects.append(model.Dropped(arc.id, arc.request.client, Outcome.HANDED_OVER, reason))
         else:
             old = self._revocation(arc, arc.hold, Outcome.HANDED_OVER, reason, requeued=False)
             self._effects.append(old)
@@ -270,10 +251,10 @@ class Core:
             arc.hold = replace(arc.hold, grant=self._next_grant())
             self._effects.append(self._granted(arc, arc.hold))
         elif arc.reason:
-            self._effects.append(Queued(arc.id, to, arc.reason))
+            self._effects.append(model.Queued(arc.id, to, arc.reason))
 
     def _take_lead(
-        self, term: Term, recovered_holds: tuple[on.RecoveredHold, ...], waiting: tuple[on.RecoveredRequest, ...]
+        self, term: Term, recovered_holds: tuple[model.RecoveredHold, ...], waiting: tuple[model.Requested, ...]
     ) -> None:
         if term <= self.term:
             raise ValueError(f"the new term {term} is not above {self.term}")
@@ -299,8 +280,8 @@ class Core:
             else:
                 self._state.start(arc, hold)
         self._expire()
-        for one in waiting:
-            self._ask(*one)
+        for asked in waiting:
+            self._ask(asked)
 
     def _expire(self) -> None:
         for arc in self._state.expired_arcs():
@@ -329,7 +310,7 @@ class Core:
         if reason == arc.reason or (not settled and arc.reason):
             return
         arc.reason = reason
-        self._effects.append(Queued(arc.id, arc.request.client, reason, settled))
+        self._effects.append(model.Queued(arc.id, arc.request.client, reason, settled))
 
     def propose(self, rc: Rc, holders: HolderSet) -> None:
         number = self._votes.propose(rc.name, holders, self._state.now)
@@ -337,7 +318,7 @@ class Core:
             return
         arcs = (self._state.arc(holder) for holder in sorted(holders))
         params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
-        self._effects.append(Propose(number, rc.name, params))
+        self._effects.append(model.Propose(number, rc.name, params))
 
     def run_again(self) -> None:
         self._run_again = True
@@ -368,16 +349,16 @@ class Core:
     def _next_grant(self) -> Grant:
         return Grant(self.term, self.number())
 
-    def _granted(self, arc: Arc, hold: Hold) -> Granted:
+    def _granted(self, arc: Arc, hold: Hold) -> model.Granted:
         end = None if arc.request.keep else hold.end
         rcs = tuple(sorted(arc.needs))
-        return Granted(arc.id, arc.request.client, hold.grant, rcs, hold.start, end)
+        return model.Granted(arc.id, arc.request.client, hold.grant, rcs, hold.start, end)
 
-    def _revocation(self, arc: Arc, hold: Hold, outcome: Outcome, reason: Reason, *, requeued: bool) -> HoldEnded:
+    def _revocation(self, arc: Arc, hold: Hold, outcome: Outcome, reason: Reason, *, requeued: bool) -> model.HoldEnded:
         self.number()
         rcs = tuple(sorted(arc.needs))
         by = reason.by[0].arc if reason.by else None
-        return HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
+        return model.HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
 
     def _set_wake(self) -> None:
         at = self._state.next_end()
@@ -387,4 +368,4 @@ class Core:
             at = self._state.now
         if at != self._wake or self._run_again:
             self._wake = at
-            self._effects.append(WakeAt(at))
+            self._effects.append(model.WakeAt(at))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 
 from zscout.keyexpr import check_need, is_pattern, matcher
 from zscout.scheduling.reason import Party, Reason
@@ -148,7 +148,7 @@ class Arc:
     """Whether it has waited for too long (`reservations.py`)."""
     bound: Mapping[Need, RcName] = field(default_factory=dict)
     """The RC that each pattern is bound to (`patterns.py`): while it runs, and for the time of a check. Empty
-    if there are none to be bound to."""
+    if there is none for some pattern."""
     owner: str = field(init=False)
     """Whose quota it counts against: its client's host."""
     id: ArcId = field(init=False)
@@ -163,16 +163,15 @@ class Arc:
     """By RC: what it holds, or would as it is bound."""
 
     def __post_init__(self) -> None:
-        self.id, self.priority = self.request.arc, self.request.priority
-        self.owner = self.request.client.partition("/")[0]
-        self.rank = (-self.priority, self.request.min_runtime, self.place, self.id)
-        self.party = Party(self.id, self.request.name, self.priority)
         self.needs = self.request.needs
+        self.take(self.request)
 
-    @property
-    def unbound(self) -> bool:
-        """Whether some pattern of its needs has no RC."""
-        return bool(self.patterns) and not self.bound
+    def take(self, request: ArcRequest) -> None:
+        """Takes this for its request: its own one, or that of another client with the same needs."""
+        self.request, self.id, self.priority = request, request.arc, request.priority
+        self.owner = request.client.partition("/")[0]
+        self.rank = (-self.priority, request.min_runtime, self.place, self.id)
+        self.party = Party(self.id, request.name, self.priority)
 
     def move_to(self, state: ArcState) -> None:
         """Raises ValueError for a move that is not in `TRANSITIONS`."""
@@ -321,21 +320,13 @@ class RecoveredHold:
             raise ValueError(f"what ARC {self.request.arc} holds for its patterns is not told, or told wrong")
 
 
-class RecoveredRequest(NamedTuple):
-    """A request that waited when an RCM took the lead; `since` as in `Requested`."""
-
-    request: ArcRequest
-    place: Place
-    since: Ns | None = None
-
-
 @dataclass(frozen=True, slots=True)
 class LeadTaken:
     """This RCM leads from now on, in `term`, over the holds and the queue that it recovered."""
 
     term: Term
     recovered_holds: tuple[RecoveredHold, ...] = ()
-    waiting: tuple[RecoveredRequest, ...] = ()
+    waiting: tuple[Requested, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

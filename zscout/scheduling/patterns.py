@@ -92,7 +92,7 @@ def bind_all(state: SchedulerState, reserved: Reservations | None = None) -> Non
         if Binder(state, reserved, claimed).bind(arc):
             claimed |= arc.mask & ~arc.named_mask
         else:
-            state.unbind(arc)
+            state.bind(arc, {})
 
 
 def no_match(state: SchedulerState, arc: Arc) -> Reason:

@@ -54,18 +54,10 @@ from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.model import Arc, ArcState, Rank, Rc
 from zscout.scheduling.patterns import Binder, no_match
 from zscout.scheduling.reason import SHOWN, Reason, ReasonCode, of_rcs
-from zscout.scheduling.reservations import ReservationConflict, Reservations
+from zscout.scheduling.reservations import Inadmissible, Reservations
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.votes import Answer, HolderSet
 from zscout.types import ArcId, Need, RcName
-
-
-@dataclass(frozen=True, slots=True)
-class Inadmissible:
-    """`rc` keeps the ARC out as long as its situation is this; `reason` says so."""
-
-    rc: Rc
-    reason: Reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,9 +208,7 @@ MAX_REPORTED: Final = 4
 """To how many of an RC's watchers a new holder is reported at once; for the others `Core.arc` has it. In a
 long queue every grant would else be reported to every ARC."""
 
-_Verdict: TypeAlias = (
-    Inadmissible | VotesNeeded | Admissible | ReservationConflict | Literal["off limits", "over quota"]
-)
+_Verdict: TypeAlias = Inadmissible | VotesNeeded | Admissible | Literal["off limits", "over quota"]
 
 
 class Priority(Strategy):
@@ -304,8 +294,8 @@ class Pass:
                 break
             without |= blamed
         if best is None:
-            self.state.unbind(arc)
-            self.index.make_ready(arc)
+            self.state.bind(arc, {})
+            self.index.put(arc, ArcState.READY)
             self.actions.wait(arc, no_match(self.state, arc))
             return
         self.state.bind(arc, best[0])
@@ -314,7 +304,7 @@ class Pass:
     def _blamed(self, arc: Arc, verdict: _Verdict) -> int:
         """Bits of those RCs of a binding that keep the ARC out, where others might not."""
         match verdict:
-            case Inadmissible(rc) | ReservationConflict(rc, _, None):
+            case Inadmissible(rc, _, None):
                 bits = rc.bit
             case "off limits":
                 bits = self.off_limits
@@ -343,22 +333,22 @@ class Pass:
 
     def _apply(self, arc: Arc, check: AdmissionCheck, verdict: _Verdict) -> None:
         match verdict:
-            case ReservationConflict(rc, _, proposal) if proposal is not None:
-                self.index.make_ready(arc)
+            case Inadmissible(rc, _, proposal) if proposal is not None:
+                self.index.put(arc, ArcState.READY)
                 self.actions.wait(arc, VOTING, settled=False)
                 self.actions.propose(rc, proposal)
-            case Inadmissible(rc, reason) | ReservationConflict(rc, reason):
+            case Inadmissible(rc, reason):
                 pattern = next((need for need, name in arc.bound.items() if name == rc.name), None)
                 if pattern is None:
                     self.index.watch(arc, rc)
                     self.actions.wait(arc, reason)
                 else:
                     # The ARC could do with another RC.
-                    self.index.make_ready(arc)
+                    self.index.put(arc, ArcState.READY)
                     self.actions.wait(arc, reason._replace(pattern=pattern))
             case "over quota":
                 # Whoever of its owner's ends may let it go: no RC shows that.
-                self.index.make_ready(arc)
+                self.index.put(arc, ArcState.READY)
                 owner, quota = arc.owner, self.state.policy.max_running_per_host
                 self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=owner, number=quota or 0))
             case "off limits":
@@ -368,9 +358,9 @@ class Pass:
                 one for one in proposals if one[0].name in self.votes.unresponsive
             ]:
                 if arc.patterns:
-                    self.index.make_ready(arc)
+                    self.index.put(arc, ArcState.READY)
                 else:
-                    self.index.park(arc, check.footprint())
+                    self.index.put(arc, ArcState.PARKED, check.footprint())
                 self.actions.wait(arc, of_rcs(ReasonCode.SILENT, [rc.name for rc, _ in unresponsive]))
                 for rc, holders in unresponsive:
                     self.actions.propose(rc, holders)
@@ -390,9 +380,9 @@ class Pass:
         footprint = check.footprint()
         if arc.patterns:
             # It is checked again whatever happens: another RC may do.
-            self.index.make_ready(arc)
+            self.index.put(arc, ArcState.READY)
         else:
-            self.index.defer(arc, state, footprint, check.masked_obstacles())
+            self.index.put(arc, state, footprint, check.masked_obstacles())
         self._put_off_limits(footprint, arc.rank)
 
     def _still_deferred(self, arc: Arc, footprint: int) -> bool:
@@ -439,7 +429,7 @@ class Pass:
                 self._call_next_watcher(rc, rank)
         for arc in [arc for arc in index.parked.values() if (arc.footprint or 0) & touched]:
             if rank is None or arc.rank > rank:
-                index.make_ready(arc)
+                index.put(arc, ArcState.READY)
                 heapq.heappush(self._heap, (arc.rank, 0, arc, None))
 
     def _call_next_watcher(self, rc: Rc, rank: Rank | None) -> None:
@@ -451,18 +441,15 @@ class Pass:
             heapq.heappush(self._heap, following)
 
     def _needs_check(self, rc: Rc, arc: Arc) -> bool:
-        """False ends it: `rc` has a holder again that is preempted for nobody from `arc` downwards."""
-        if not self._keeps_out(rc, arc):
+        """False ends it: `rc`, exclusive and not off limits, has a holder again that is preempted for nobody from
+        `arc` downwards."""
+        if rc.sharable or not rc.holders or rc.bit & self.off_limits:
+            return True
+        (holder,) = rc.holders.values()
+        if holder.preemptible_by(arc, self.state.now):
             return True
         if not self._reports_left[rc.bit]:
             del self._reports_left[rc.bit]
             return False
         self._reports_left[rc.bit] -= 1
         return True
-
-    def _keeps_out(self, rc: Rc, arc: Arc) -> bool:
-        """Whether `rc`, exclusive and not off limits, has a holder that is not preempted for `arc`."""
-        if rc.sharable or not rc.holders or rc.bit & self.off_limits:
-            return False
-        (holder,) = rc.holders.values()
-        return not holder.preemptible_by(arc, self.state.now)

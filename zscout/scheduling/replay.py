@@ -7,37 +7,24 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
+from zscout.scheduling import model
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    Effect,
-    Event,
-    Granted,
-    HoldEnded,
-    Outcome,
-    Propose,
-    RcJoined,
-    Released,
-    Requested,
-    Tick,
-    Vote,
-    WakeAt,
-)
 from zscout.scheduling.state import Strategy
 from zscout.scheduling.workload import Workload, excess
 from zscout.types import ArcId, Ns, RcName
 
 
 def play_instant(
-    core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], Vote]
-) -> Iterator[list[Effect]]:
+    core: Core, now: Ns, events: Iterable[model.Event], vote: Callable[[model.Propose], model.Vote]
+) -> Iterator[list[model.Effect]]:
     """One instant, with every vote and every further pass that it takes; yields the effects of each batch."""
     batch = list(events)
     while batch:
         effects = core.handle(now, *batch)
         yield effects
-        batch = [vote(effect) for effect in effects if isinstance(effect, Propose)]
-        if not batch and any(isinstance(effect, WakeAt) and effect.at == now for effect in effects):
-            batch = [Tick()]
+        batch = [vote(effect) for effect in effects if isinstance(effect, model.Propose)]
+        if not batch and any(isinstance(effect, model.WakeAt) and effect.at == now for effect in effects):
+            batch = [model.Tick()]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +34,7 @@ class HoldRecord:
     arc: ArcId
     start: Ns
     end: Ns
-    outcome: Outcome
+    outcome: model.Outcome
     rcs: tuple[RcName, ...]
 
 
@@ -59,7 +46,7 @@ class Replay:
     unserved: tuple[ArcId, ...]
 
 
-Watcher = Callable[[Ns, Core, list[Effect]], None]
+Watcher = Callable[[Ns, Core, list[model.Effect]], None]
 
 
 def replay(
@@ -76,29 +63,27 @@ def replay(
     capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
     runtime = {arrival.request.arc: arrival.request.min_runtime for arrival in workload.arrivals}
     arrivals = deque(sorted(workload.arrivals, key=lambda arrival: arrival.at))
-    running: dict[ArcId, Granted] = {}
+    running: dict[ArcId, model.Granted] = {}
     holds: list[HoldRecord] = []
 
-    def vote(asked: Propose) -> Vote:
+    def vote(asked: model.Propose) -> model.Vote:
         reason = excess(capacity[asked.rc], asked.holders.items())
-        return Vote(asked.proposal, accept=not reason, reason=reason)
+        return model.Vote(asked.proposal, accept=not reason, reason=reason)
 
-    def step(now: Ns, events: Iterable[Event]) -> None:
+    def step(now: Ns, events: Iterable[model.Event]) -> None:
         """One instant."""
         for effects in play_instant(core, now, events, vote):
             if watch is not None:
                 watch(now, core, effects)
             for effect in effects:
                 match effect:
-                    case Granted(arc=arc):
+                    case model.Granted(arc=arc):
                         running[arc] = effect
-                    case HoldEnded(arc=arc, outcome=outcome, rcs=rcs):
+                    case model.HoldEnded(arc=arc, outcome=outcome, rcs=rcs):
                         holds.append(HoldRecord(arc, running.pop(arc).start, now, outcome, rcs))
-                    case _:
-                        pass
 
     now: Ns = 0
-    step(now, [RcJoined(rc.name, rc.sharable) for rc in workload.rcs])
+    step(now, [model.RcJoined(rc.name, rc.sharable) for rc in workload.rcs])
     while arrivals or running:
         # Only an arrival or the end of a minimum runtime (a kept hold may be displaced from then on)
         # changes anything here; the quantum's ticks would not.
@@ -107,13 +92,13 @@ def replay(
         if arrivals:
             coming.append(arrivals[0].at)
         if not coming:
-            step(now, [Released(arc) for arc in sorted(running)])
+            step(now, [model.Released(arc) for arc in sorted(running)])
             continue
         now = min(coming)
-        events: list[Event] = []
+        events: list[model.Event] = []
         while arrivals and arrivals[0].at == now:
-            events.append(Requested(arrivals.popleft().request))
-        step(now, events or [Tick()])
-    served = {hold.arc for hold in holds if hold.outcome is Outcome.COMPLETED}
+            events.append(model.Requested(arrivals.popleft().request))
+        step(now, events or [model.Tick()])
+    served = {hold.arc for hold in holds if hold.outcome is model.Outcome.COMPLETED}
     holds.sort(key=lambda hold: (hold.start, hold.arc, hold.end))
     return Replay(tuple(holds), tuple(sorted(runtime.keys() - served)))

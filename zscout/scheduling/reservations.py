@@ -35,8 +35,8 @@ class Reservation(NamedTuple):
     start: Ns
 
 
-class ReservationConflict(NamedTuple):
-    """An ARC would be in the way of a reservation at `rc`, unless the vote on `proposal` says otherwise."""
+class Inadmissible(NamedTuple):
+    """`rc` keeps an ARC out as long as its situation is this, or until the vote on `proposal` says otherwise."""
 
     rc: Rc
     reason: Reason
@@ -131,7 +131,7 @@ class Reservations:
         state = self._state
         return arc.starving and bool(arc.mask & state.sharable) and self.due(arc) <= state.now
 
-    def conflict(self, arc: Arc) -> ReservationConflict | None:
+    def conflict(self, arc: Arc) -> Inadmissible | None:
         """What `arc` would be in the way of if it started now."""
         if not arc.mask & self.bits:
             return None
@@ -148,12 +148,12 @@ class Reservations:
                 continue
             reason = Reason(ReasonCode.RESERVED, (rc.name,), (blocking.arc.party,))
             if not rc.sharable:
-                return ReservationConflict(rc, reason)
+                return Inadmissible(rc, reason)
             together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
             if not self._votes.accepts(rc.name, together):
                 known = self._votes.known(rc.name, together)
                 is_open = known is None and rc.name not in self._votes.unresponsive
-                return ReservationConflict(rc, reason, together if is_open else None)
+                return Inadmissible(rc, reason, together if is_open else None)
         return None
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:

@@ -14,9 +14,9 @@ from operator import itemgetter
 from typing import Protocol
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName
-from zscout.keyexpr import is_pattern, matcher
+from zscout.keyexpr import matcher
 from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc
-from zscout.scheduling.reason import Party, Reason
+from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
 from zscout.types import ArcId, ClientId, Need, Ns, Params, RcName
 
@@ -96,25 +96,11 @@ class QueueIndex:
             insort(rc.watchers, arc.rank)
             self.watched |= rc.bit
 
-    def park(self, arc: Arc, footprint: int) -> None:
-        """Nothing but an RC that does not answer keeps `arc` out."""
+    def put(self, arc: Arc, state: ArcState, footprint: int | None = None, masked_obstacles: int = 0) -> None:
+        """`arc` waits in this state, which is not WATCHING. READY is without a footprint."""
         self._leave(arc)
-        arc.move_to(ArcState.PARKED)
-        self.parked[arc.id] = arc
-        arc.footprint = footprint
-
-    def make_ready(self, arc: Arc) -> None:
-        """The next pass checks `arc`, whatever happens."""
-        self._leave(arc)
-        arc.move_to(ArcState.READY)
-        self.ready[arc.id] = arc
-
-    def defer(self, arc: Arc, state: ArcState, footprint: int, masked_obstacles: int) -> None:
-        """The check of `arc` can't be decided yet; `state` (VOTING or DEFERRED) says why."""
-        if arc.id not in self.ready:
-            self._leave(arc)
-            self.ready[arc.id] = arc
         arc.move_to(state)
+        (self.parked if state is ArcState.PARKED else self.ready)[arc.id] = arc
         arc.footprint, arc.masked_obstacles = footprint, masked_obstacles
 
     def _leave(self, arc: Arc) -> None:
@@ -178,12 +164,12 @@ class SchedulerState:
         return found
 
     def bind(self, arc: Arc, bound: Mapping[Need, RcName]) -> None:
-        """Gives the patterns of an ARC that does not run these RCs, one for each."""
-        if arc.bound == bound:
+        """Gives the patterns of an ARC that does not run these RCs, one for each; none if some pattern has no RC."""
+        if arc.bound == bound and arc.rcs:
             return
-        wanted = arc.request.needs
+        wanted, unbound = arc.request.needs, () if bound else arc.patterns
         arc.bound = bound
-        arc.needs = {bound.get(need, need): params for need, params in wanted.items()}
+        arc.needs = {bound.get(need, need): params for need, params in wanted.items() if need not in unbound}
         arc.mask = arc.named_mask | self.mask(bound.values())
         arc.rcs = tuple(self.rcs_in(arc.mask))
 
@@ -202,14 +188,6 @@ class SchedulerState:
             for rc in self.matching(need):
                 bits |= rc.bit
         return bits
-
-    def unbind(self, arc: Arc) -> None:
-        """There is no RC for some pattern of the ARC."""
-        if arc.rcs and not arc.bound:
-            return
-        arc.bound, arc.mask = {}, arc.named_mask
-        arc.needs = {need: params for need, params in arc.request.needs.items() if not is_pattern(need)}
-        arc.rcs = tuple(self.rcs_in(arc.mask))
 
     def mask(self, names: Iterable[RcName]) -> int:
         mask, rcs = 0, self.rcs
@@ -301,10 +279,7 @@ class SchedulerState:
 
     def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
         self._forget_client(arc)
-        arc.request, arc.id = replace(arc.request, arc=name, client=client), name
-        arc.owner = client.partition("/")[0]
-        arc.rank = (*arc.rank[:3], name)
-        arc.party = Party(name, arc.request.name, arc.priority)
+        arc.take(replace(arc.request, arc=name, client=client))
 
     def start(self, arc: Arc, hold: Hold) -> None:
         self.dequeue(arc)

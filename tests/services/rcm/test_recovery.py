@@ -280,9 +280,9 @@ def test_a_hold_with_a_wrong_binding_is_left_out(
 
 def test_what_waits_keeps_place_and_parameters() -> None:
     place = Place(OLD, 9)
-    ((request, at, since),) = recover([], [client(asked(place=place, rate="0.1", waited=2.5))], NOW).waiting
-    assert (at, since) == (place, NOW - 2_500_000_000)
-    assert request.needs == {"robot/a": {}, "radio/b": {"rate": Fraction(1, 10)}}
+    (waits,) = recover([], [client(asked(place=place, rate="0.1", waited=2.5))], NOW).waiting
+    assert (waits.place, waits.since) == (place, NOW - 2_500_000_000)
+    assert waits.request.needs == {"robot/a": {}, "radio/b": {"rate": Fraction(1, 10)}}
 
 
 def test_requests_of_two_clients_may_share_an_id() -> None:

@@ -11,10 +11,11 @@ import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from decimal import Decimal
+from operator import attrgetter
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
-from zscout.scheduling.model import ArcRequest, RecoveredHold, RecoveredRequest
+from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
 from zscout.services.rcm.registry import arc_id, request_id
 from zscout.types import SECOND, Grant, Need, Ns, RcName
 
@@ -27,7 +28,7 @@ class RecoveredState:
 
     rcs: dict[str, RcState] = field(default_factory=dict)
     holds: list[RecoveredHold] = field(default_factory=list)
-    waiting: list[RecoveredRequest] = field(default_factory=list)
+    waiting: list[Requested] = field(default_factory=list)
 
     @property
     def requests(self) -> Iterator[ArcRequest]:
@@ -70,14 +71,14 @@ def recover(states: Iterable[RcState], clients: Iterable[ClientRequests], now: N
             if request.place is not None:
                 wanted = _request(arc, client, request.needs, request)
                 since = now - round(request.waited * SECOND)
-                result.waiting.append(RecoveredRequest(wanted, request.place, since))
+                result.waiting.append(Requested(wanted, request.place, since))
         except (BadName, ValueError) as error:
             log.warning("the request %s is not carried on: %s", arc, error)
     # A client that handed over a hold, and missed the answer, lists it as well: what the RCs hold counts.
     held_requests = {(held.place, request_id(held.request.arc)) for held in result.holds}
     result.waiting = sorted(
         (one for one in result.waiting if (one.place, request_id(one.request.arc)) not in held_requests),
-        key=lambda one: one.place,
+        key=attrgetter("place"),
     )
     return result
 
@@ -108,7 +109,7 @@ def _recover_hold(
         end = now + round(remaining * SECOND)
         result.holds.append(RecoveredHold(request, some.place, grant, end - request.min_runtime, end, some.bound))
     else:
-        result.waiting.append(RecoveredRequest(request, some.place))
+        result.waiting.append(Requested(request, some.place))
 
 
 def _patterns(holder: Holder) -> dict[RcName, Need]:

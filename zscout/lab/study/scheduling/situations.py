@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Arc, ArcStatus, LeadTaken, Propose, RcJoined, RecoveredHold, RecoveredRequest, Vote
+from zscout.scheduling.model import Arc, ArcStatus, LeadTaken, Propose, RcJoined, RecoveredHold, Requested, Vote
 from zscout.scheduling.replay import play_instant
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.workload import WorkloadRc, excess
@@ -70,7 +70,7 @@ class Situation:
 class _Before:
     now: Ns
     running: tuple[RecoveredHold, ...]
-    queued: tuple[RecoveredRequest, ...]
+    queued: tuple[Requested, ...]
     features: tuple[float, ...]
     within_reach: int
     """Bits of the exclusive RCs that a startable ARC needs."""
@@ -100,7 +100,7 @@ class Observer:
             for arc in state.running.values()
             if arc.hold is not None
         )
-        queued = tuple(RecoveredRequest(arc.request, arc.place) for arc in state.queued.values())
+        queued = tuple(Requested(arc.request, arc.place) for arc in state.queued.values())
         features, within_reach = _features(state)
         self._before = _Before(now, running, queued, features, within_reach)
 
