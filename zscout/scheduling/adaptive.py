@@ -22,18 +22,19 @@ In each pass the outcome is worth at least what that of `priority` is, among the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal
 
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling import priority
 from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups
 from zscout.scheduling.local_search import LocalSearch
+from zscout.scheduling.model import Rc
 from zscout.scheduling.packing import PackingItem, PackingProblem, numbers, pack
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.reservations import Reservations, reservations
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
-from zscout.types import ArcId, RcName
+from zscout.types import ArcId
 
 WORK: Final = 20_000
 """Steps of branch and bound, times items: some 3 ms."""
@@ -48,11 +49,6 @@ MAX_SLICES: Final = 48
 """Passes for which one group is searched at most, begun anew or not."""
 MAX_ROUNDS: Final = 16
 """Rounds of votes likewise."""
-
-_Asked: TypeAlias = Literal["yes", "no", "open"]
-YES: Final = "yes"
-NO: Final = "no"
-OPEN: Final = "open"
 
 SEARCHING: Final = Reason(ReasonCode.SEARCHING)
 
@@ -80,10 +76,13 @@ class _Search:
     steps: int = 0
     slices: int = 0
     rounds: int = 0
-    asked: list[tuple[RcName, HolderSet]] | None = None
+    asked: list[tuple[Rc, HolderSet]] | None = None
     """The last round."""
-    exhausted: bool = False
-    """The group has had its time: it is `priority`'s from now on."""
+
+    @property
+    def exhausted(self) -> bool:
+        """The group has had its time: it is `priority`'s from now on."""
+        return self.slices >= MAX_SLICES or self.rounds >= MAX_ROUNDS
 
     def fits(self, group: ConflictGroup) -> bool:
         return (
@@ -122,7 +121,7 @@ class Adaptive(Strategy):
             priority.run_pass(state, actions)
             return
         self._work, self._steps = WORK, SLICE
-        if self._unfinished and self._nothing_new(state) and self._continue():
+        if self._unfinished and self._nothing_new(state) and not any(map(self._advance, self._unfinished)):
             actions.run_again()
             return
         before, self._searches, self._unfinished = self._searches, {}, []
@@ -153,10 +152,6 @@ class Adaptive(Strategy):
         changed = index.freed or index.touched or votes.answered or votes.invalidated or votes.due(state.now)
         return not changed and self._seen == _situation(state)
 
-    def _continue(self) -> bool:
-        """Goes on with what is unfinished. False: something has come to its end."""
-        return not any(self._bounded(search).exhausted or self._advance(search) for search in self._unfinished)
-
     def _decide(self, group: ConflictGroup, before: dict[ArcId, _Search], actions: Actions) -> bool:
         """Takes the better set of a group, or leaves it to `priority`. False: it is off limits for now."""
         earlier = list({id(one): one for arc in group.arcs if (one := before.get(arc.id))}.values())
@@ -166,8 +161,8 @@ class Adaptive(Strategy):
                 return True
             if not search.begun and self._work > 0:
                 self._begin(search)
-            asked = self._ask(group, search, search.heuristic, actions) if search.inexact else YES
-            if asked == YES:
+            asked = self._ask(group, search, search.heuristic, actions) if search.inexact else "yes"
+            if asked == "yes":
                 if not self._advance(search):
                     for arc in group.arcs:
                         if arc.hold is None:
@@ -178,34 +173,35 @@ class Adaptive(Strategy):
                 if not search.gains:
                     return True
                 asked = self._ask(group, search, search.best, actions)
-            if asked == YES:
+            if asked == "yes":
                 self._report_gain(group, search)
                 group.take(search.best, actions)
                 return True
-            if asked == OPEN:
+            if asked == "open":
                 return False
             earlier = [search]
         return True
 
-    def _ask(self, group: ConflictGroup, search: _Search, chosen: int, actions: Actions) -> _Asked:
-        """Asks what is not known yet about a set. NO: a silent RC rules it out; that is barred now."""
+    def _ask(
+        self, group: ConflictGroup, search: _Search, chosen: int, actions: Actions
+    ) -> Literal["yes", "no", "open"]:
+        """Asks what is not known yet about a set. `no`: a silent RC rules it out; that is barred now."""
         proposals = group.missing_votes(chosen)
         if proposals == []:
-            return YES
-        sets = None if proposals is None else [(rc.name, holders) for rc, holders in proposals]
-        if sets is None or sets != search.asked:
+            return "yes"
+        if proposals is None or proposals != search.asked:
             search.rounds += 1
-            search.asked = sets
+            search.asked = proposals
         if proposals is None:
-            return NO
+            return "no"
         for rc, holders in proposals:
             actions.propose(rc, holders)
-        return OPEN
+        return "open"
 
     def _search(self, group: ConflictGroup, earlier: list[_Search]) -> _Search | None:
         """The search in this group, as far as it has come; None where nothing can be gained."""
         if len(earlier) == 1 and earlier[0].fits(group):
-            return self._bounded(earlier[0])
+            return earlier[0]
         problem = group.problem()
         heuristic = problem.complete()
         if problem.value(heuristic) >= problem.upper_bound_of_all():
@@ -218,18 +214,12 @@ class Adaptive(Strategy):
             search.steps = max(search.steps, one.steps)
             search.slices = max(search.slices, one.slices)
             search.rounds = max(search.rounds, one.rounds)
-            search.exhausted |= one.exhausted
-        return self._bounded(search)
-
-    def _bounded(self, search: _Search) -> _Search:
-        if not search.exhausted and (search.slices >= MAX_SLICES or search.rounds >= MAX_ROUNDS):
-            search.exhausted, search.local = True, None
         return search
 
     def _advance(self, search: _Search) -> bool:
         """Goes on with a search for as long as this pass has time. True: it is over."""
-        if not search.begun:
-            return False
+        if search.exhausted or not search.begun:
+            return search.exhausted
         local = search.local
         if local is None:
             return True

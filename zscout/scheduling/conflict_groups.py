@@ -119,10 +119,8 @@ class _Search:
     def _within_quota(self, arc: Arc) -> bool:
         quota_left = self.state.quota_left(arc)
         if quota_left is not None:
-            owner = arc.owner
-            self._started[owner] += 1
-            return self._started[owner] <= quota_left
-        return True
+            self._started[arc.owner] += 1
+        return quota_left is None or self._started[arc.owner] <= quota_left
 
     def _note_preemptible(self, arc: Arc) -> None:
         """Notes the running ARCs that might have to end for `arc`."""

@@ -61,8 +61,6 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
                         unserved.add(arc)
                     if preempting is not None and by == preempting and outcome is Outcome.PREEMPTED:
                         result.preempts.append(arc)
-                case _:
-                    pass
         # A kept hold goes on past its minimum runtime: what counts is when it becomes preemptible.
         for arc in [arc for arc, end in ends.items() if end <= now]:
             del ends[arc]

@@ -7,6 +7,7 @@ parameters are `Fraction`, so that sums are exact (0.1 + 0.2 is 0.3).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -178,6 +179,11 @@ class Arc:
         if state not in TRANSITIONS[self.state]:
             raise ValueError(f"ARC {self.id} is {self.state} and can't become {state}")
         self.state = state
+
+    def known_end(self, other: Arc | None = None) -> float:
+        """When its hold ends, or `other` may preempt it, by what is known now; infinite for what it keeps."""
+        kept = self.request.keep and (other is None or self.priority > other.priority)
+        return math.inf if self.hold is None or kept else self.hold.end
 
     def past_min_runtime(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may preempt it then."""

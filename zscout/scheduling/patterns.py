@@ -20,6 +20,7 @@ from zscout.scheduling.model import Arc, Rc
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import SchedulerState
+from zscout.types import Need
 
 
 class Fitness(IntEnum):
@@ -36,60 +37,48 @@ class Fitness(IntEnum):
     """Held by one that is not preempted for it, or it has refused."""
 
 
-class Binder:
-    """Finds bindings at one instant. `claimed`: bits of the RCs that others are bound to already."""
+def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None, *, without: int = 0, claimed: int = 0) -> bool:
+    """Binds `arc` to the best RCs there are but those of `without`; others are bound to those of `claimed` already (bit
+    masks). False: there is no such binding; the old one stays."""
+    taken = without | arc.named_mask
+    options: dict[Need, list[tuple[int, float, int, Rc]]] = {}
+    for need in arc.patterns:
+        matching = (rc for rc in state.matching(need) if rc.present and not rc.bit & taken)
+        options[need] = sorted((*_fitness(state, arc, rc, reserved, claimed), rc.bit, rc) for rc in matching)
+    for worst in Fitness:
+        allowed = {need: [rc for fitness, _, _, rc in found if fitness <= worst] for need, found in options.items()}
+        if all(allowed.values()) and (chosen := _distinct(allowed)) is not None:
+            state.bind(arc, {need: rc.name for need, rc in chosen.items()})
+            return True
+    return False
 
-    def __init__(self, state: SchedulerState, reserved: Reservations | None = None, claimed: int = 0) -> None:
-        self._state, self._votes, self._reserved, self._claimed = state, state.votes, reserved, claimed
 
-    def bind(self, arc: Arc, without: int = 0) -> bool:
-        """Binds `arc` to the best RCs there are but those of `without`, a bit mask. False: there is no such
-        binding; the old one stays."""
-        chosen = self._choose(arc, without)
-        if chosen is None:
-            return False
-        self._state.bind(arc, {need: rc.name for need, rc in chosen.items()})
-        return True
-
-    def _choose(self, arc: Arc, without: int) -> dict[str, Rc] | None:
-        taken = without | arc.named_mask
-        options: dict[str, list[tuple[tuple[int, float], Rc]]] = {}
-        for need in arc.patterns:
-            matching = (rc for rc in self._state.matching(need) if rc.present and not rc.bit & taken)
-            options[need] = sorted(((self._fitness(arc, rc), rc) for rc in matching), key=_by_fitness)
-            if not options[need]:
-                return None
-        for worst in Fitness:
-            allowed = {need: [rc for (fitness, _), rc in found if fitness <= worst] for need, found in options.items()}
-            if all(allowed.values()) and (chosen := _distinct(allowed)) is not None:
-                return chosen
-        return None
-
-    def _fitness(self, arc: Arc, rc: Rc) -> tuple[int, float]:
-        """How well `rc` would do, and what decides between equals."""
-        demand = float(rc.demand)
-        non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
-        if rc.sharable:
-            answer = self._votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
-            if answer is None and rc.name in self._votes.unresponsive:
-                return Fitness.RESERVED, demand
-            if answer is not None and not answer.accept:
-                return Fitness.HELD, demand
-            return Fitness.FREE, len(rc.holders) + (answer is None)
-        if non_preemptible:
-            return Fitness.HELD, max(0 if one.hold is None else one.hold.end for one in non_preemptible)
-        if self._reserved is not None and self._reserved.reserves(rc, arc):
-            return Fitness.RESERVED, demand
-        if rc.holders:
-            return Fitness.PREEMPTIBLE, max(one.priority for one in rc.holders.values())
-        return (Fitness.CLAIMED if rc.bit & self._claimed else Fitness.FREE), demand
+def _fitness(
+    state: SchedulerState, arc: Arc, rc: Rc, reserved: Reservations | None, claimed: int
+) -> tuple[Fitness, float]:
+    """How well `rc` would do, and what decides between equals."""
+    non_preemptible = rc.non_preemptible_holders(arc, state.now)
+    if rc.sharable:
+        answer = state.votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
+        if answer is None and rc.name in state.votes.unresponsive:
+            return Fitness.RESERVED, rc.demand
+        if answer is not None and not answer.accept:
+            return Fitness.HELD, rc.demand
+        return Fitness.FREE, len(rc.holders) + (answer is None)
+    if non_preemptible:
+        return Fitness.HELD, max(0 if one.hold is None else one.hold.end for one in non_preemptible)
+    if reserved is not None and reserved.reserves(rc, arc):
+        return Fitness.RESERVED, rc.demand
+    if rc.holders:
+        return Fitness.PREEMPTIBLE, max(one.priority for one in rc.holders.values())
+    return (Fitness.CLAIMED if rc.bit & claimed else Fitness.FREE), rc.demand
 
 
 def bind_all(state: SchedulerState, reserved: Reservations | None = None) -> None:
     """Binds all who wait by pattern, the best-ranked first, to different RCs as far as there are any."""
     claimed = 0
     for arc in sorted(state.by_pattern.values(), key=lambda arc: arc.rank):
-        if Binder(state, reserved, claimed).bind(arc):
+        if bind(state, arc, reserved, claimed=claimed):
             claimed |= arc.mask & ~arc.named_mask
         else:
             state.bind(arc, {})
@@ -103,16 +92,12 @@ def no_match(state: SchedulerState, arc: Arc) -> Reason:
     return of_rcs(ReasonCode.NO_MATCH, short)
 
 
-def _by_fitness(option: tuple[tuple[int, float], Rc]) -> tuple[tuple[int, float], int]:
-    return option[0], option[1].bit
-
-
-def _distinct(allowed: dict[str, list[Rc]]) -> dict[str, Rc] | None:
+def _distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
     """An RC of its own for each need, each the best that leaves one for the others; None: there is none."""
-    owner: dict[int, str] = {}
-    chosen: dict[str, Rc] = {}
+    owner: dict[int, Need] = {}
+    chosen: dict[Need, Rc] = {}
 
-    def place(need: str, seen: set[int]) -> bool:
+    def place(need: Need, seen: set[int]) -> bool:
         for rc in allowed[need]:
             if rc.bit in seen:
                 continue

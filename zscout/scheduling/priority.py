@@ -44,7 +44,6 @@ An ARC with patterns is always checked, unless an RC that it names keeps it out.
 from __future__ import annotations
 
 import heapq
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
@@ -52,7 +51,7 @@ from typing import Final, Literal, TypeAlias
 
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.model import Arc, ArcState, Rank, Rc
-from zscout.scheduling.patterns import Binder, no_match
+from zscout.scheduling.patterns import bind, no_match
 from zscout.scheduling.reason import SHOWN, Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible, Reservations
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
@@ -112,8 +111,7 @@ class AdmissionCheck:
         lasting: tuple[int, float, int] | None = None
         for number, (rc, holder) in enumerate(self.non_preemptible):
             if not off_limits or not rc.bit & off_limits:
-                end = math.inf if holder.request.keep or holder.hold is None else holder.hold.end
-                lasting = max(lasting or (holder.priority, -1.0, 0), (holder.priority, end, number))
+                lasting = max(lasting or (holder.priority, -1.0, 0), (holder.priority, holder.known_end(), number))
         if lasting is not None:
             shown = self.non_preemptible[:SHOWN]
             rcs, parties = tuple(rc.name for rc, _ in shown), tuple(holder.party for _, holder in shown)
@@ -280,10 +278,9 @@ class Pass:
 
     def _check_patterns(self, arc: Arc) -> None:
         """Tries one binding after the other, the best first, until one lets the ARC start or asks votes."""
-        binder = Binder(self.state, self.reserved)
         without, tried = 0, 0
         best: tuple[Mapping[Need, RcName], _Verdict] | None = None
-        while tried < MAX_BINDINGS and binder.bind(arc, without):
+        while tried < MAX_BINDINGS and bind(self.state, arc, self.reserved, without=without):
             tried += 1
             check = AdmissionCheck(self.state, arc)
             verdict = self._verdict(arc, check)

@@ -92,14 +92,12 @@ def _listed(reason: Reason, shown: Iterable[str] | None = None) -> str:
     return ", ".join(shown or reason.rcs) + more
 
 
-def _held(reason: Reason) -> str:
-    return "needs " + _listed(reason, [f"{rc} (held by {by})" for rc, by in zip(reason.rcs, reason.by, strict=True)])
-
-
 _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ReasonCode.ABSENT: lambda one: f"{_listed(one)} not on the mesh",
     ReasonCode.NO_MATCH: lambda one: f"no RC on the mesh is left for {_listed(one)}",
-    ReasonCode.HELD: _held,
+    ReasonCode.HELD: lambda one: (
+        "needs " + _listed(one, [f"{rc} (held by {by})" for rc, by in zip(one.rcs, one.by, strict=True)])
+    ),
     ReasonCode.VETOED: lambda one: f"{one.rcs[0]} refuses" + (f": {one.detail}" if one.detail else ""),
     ReasonCode.SILENT: lambda one: f"{_listed(one)} does not answer",
     ReasonCode.RESERVED: lambda one: (

@@ -102,9 +102,7 @@ class Reservations:
         """When its owner has room for `arc`."""
         if self._state.quota_left(arc) != 0:
             return self._state.now
-        owner = arc.owner
-        own = (one for one in self._state.running.values() if one.owner == owner)
-        return min(math.inf if one.hold is None or one.request.keep else one.hold.end for one in own)
+        return min(one.known_end() for one in self._state.running.values() if one.owner == arc.owner)
 
     def _free_from(self, rc: Rc, arc: Arc) -> float:
         """When `rc` has room for `arc` at the latest; infinite where that is not known."""
@@ -116,10 +114,7 @@ class Reservations:
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
             if rc.name in self._votes.unresponsive or (alone is not None and not alone.accept):
                 return math.inf
-        start: float = self._free.get(rc.bit, self._state.now)
-        for holder in non_preemptible:
-            start = max(start, _end(holder, arc))
-        return start
+        return max((self._free.get(rc.bit, self._state.now), *(holder.known_end(arc) for holder in non_preemptible)))
 
     def due(self, arc: Arc) -> Ns:
         """When its patience is over."""
@@ -176,10 +171,3 @@ class Reservations:
             if self.by_rc.get(bit) != earlier.by_rc.get(bit):
                 bits |= bit
         return bits
-
-
-def _end(holder: Arc, arc: Arc) -> float:
-    """When a holder is gone, or preemptible. What a higher priority keeps has no end that is known."""
-    if holder.hold is None or (holder.request.keep and holder.priority > arc.priority):
-        return math.inf
-    return holder.hold.end

@@ -116,13 +116,12 @@ def parse_workload(text: str, source: str) -> Workload:
     check_unique((rc.name for rc in file.rc), top / "rc", "name")
     check_unique((arc.name for arc in file.arc), top / "arc", "name")
     rcs = tuple(_rc(rc, (top / "rc").item(number, rc.name)) for number, rc in enumerate(file.rc))
-    arcs = (top / "arc").item
-    arrivals = tuple(_arrival(arc, arcs(number, arc.name)) for number, arc in enumerate(file.arc))
+    arrivals = tuple(_arrival(arc, (top / "arc").item(number, arc.name)) for number, arc in enumerate(file.arc))
     return Workload(rcs, arrivals)
 
 
 def _rc(rc: _Rc, where: Where) -> WorkloadRc:
-    _check_text(rc.name, where / "name")
+    _check_texts(where / "name", rc.name)
     if is_pattern(rc.name):
         raise (where / "name").bad(f"{quoted(rc.name)} is a pattern", "leave out the *; only needs may have it")
     if rc.capacity is None:
@@ -131,20 +130,20 @@ def _rc(rc: _Rc, where: Where) -> WorkloadRc:
         raise (where / "capacity").bad(
             "an exclusive RC has one holder and no capacity", "add sharable = true, or remove it"
         )
-    _check_texts(rc.capacity, where / "capacity")
+    _check_texts(where / "capacity", *rc.capacity)
     return WorkloadRc(rc.name, rc.sharable, amounts(rc.capacity, where / "capacity"))
 
 
 def _arrival(arc: _Arc, where: Where) -> Arrival:
-    _check_text(arc.name, where / "name")
+    _check_texts(where / "name", arc.name)
     at = seconds_to_ns(arc.at, where / "at")
     min_runtime = seconds_to_ns(arc.min_runtime, where / "min_runtime", low=Decimal("0.000000001"))
     if not arc.needs:
         raise (where / "needs").bad("an ARC needs at least one RC", "name one, with {} for no parameters")
     needs: dict[RcName, Params] = {}
     for rc, parameters in arc.needs.items():
-        _check_text(rc, where / "needs")
-        _check_texts(parameters, where / "needs" / rc)
+        _check_texts(where / "needs", rc)
+        _check_texts(where / "needs" / rc, *parameters)
         needs[rc] = amounts(parameters, where / "needs" / rc)
     try:
         return Arrival(at, ArcRequest(arc.name, arc.name, needs, arc.priority, min_runtime))
@@ -152,11 +151,7 @@ def _arrival(arc: _Arc, where: Where) -> Arrival:
         raise (where / "needs").bad(str(error), "see zscout request --help") from None
 
 
-def _check_texts(names: Iterable[str], where: Where) -> None:
+def _check_texts(where: Where, *names: str) -> None:
     for name in names:
-        _check_text(name, where)
-
-
-def _check_text(name: str, where: Where) -> None:
-    if not (0 < len(name) <= _MAX_NAME and name.isprintable()):
-        raise where.bad(f"{quoted(name)} is not a name", f"write 1 to {_MAX_NAME} printable characters")
+        if not (0 < len(name) <= _MAX_NAME and name.isprintable()):
+            raise where.bad(f"{quoted(name)} is not a name", f"write 1 to {_MAX_NAME} printable characters")
