@@ -13,7 +13,7 @@ from tests.thorough import times
 from zscout.messages import ComponentUse, LoadReport
 from zscout.placement import balancer as core
 from zscout.placement.balancer import SHOWN, Balancer
-from zscout.placement.model import DEFAULT_PROFILE, STALE, Profile, RankQuery
+from zscout.placement.model import STALE, Profile, RankQuery
 from zscout.types import METRICS, POLICIES, SECOND, Metric, Policy
 
 GIGABYTE = 1_000_000_000
@@ -59,7 +59,7 @@ def test_each_metric_names_the_host_that_a_person_would(
     metric: Metric, loads: dict[str, float], profile: Profile | None, best_first: str
 ) -> None:
     balancer = fleet(loads)
-    balancer.profiles["job"] = profile or DEFAULT_PROFILE
+    balancer.profiles["job"] = profile or Profile()
     ranking = balancer.rank(0, RankQuery("job", metric))
     assert " ".join(one.host for one in ranking.hosts) == best_first
     assert (ranking.metric, ranking.why) == (metric, "as asked")
@@ -161,7 +161,7 @@ def test_profiles_are_learnt_from_settled_components_and_heavy_ones_go_first() -
         balancer.placed(0, kind, kind, "fast")
         use = ComponentUse(kind, kind, 1, cpu, 100, served=0.5)
         balancer.reported(2 * SECOND, report("fast", 2 + (kind == "heavy"), 0.0, use, speed=4.0))
-        assert balancer.profile(kind) == DEFAULT_PROFILE
+        assert balancer.profile(kind) == Profile()
         balancer.reported(3 * SECOND, report("fast", 4 + (kind == "heavy"), 0.0, use, speed=4.0))
     # It had a processor for half of the time that it wanted one, of speed 4.
     assert balancer.profile("heavy") == Profile(0.5 / 0.5 * 4, 100, 1, 1)
@@ -197,7 +197,7 @@ def test_limits_hold_and_silent_hosts_make_room(monkeypatch: pytest.MonkeyPatch)
     assert set(balancer.reports) == {"a", "b"}
     for number in range(9):
         balancer.placed(0, f"c{number}", f"k{number}", "a")
-    assert balancer.outlook(0, "a", pending=True).load == 3 * DEFAULT_PROFILE.cpu
+    assert balancer.outlook(0, "a", pending=True).load == 3 * Profile().cpu
     uses = [ComponentUse(f"c{number}", f"k{number}", 1, 0.1, 1) for number in range(3)]
     balancer.reported(STALE, report("a", 2, 0.0, *uses))
     assert set(balancer.profiles) == {"k0"}

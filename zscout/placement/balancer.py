@@ -24,20 +24,7 @@ from random import Random
 from typing import Final, TypeAlias
 
 from zscout.messages import ComponentUse, LoadReport, RankedHost
-from zscout.placement.model import (
-    DEFAULT_PROFILE,
-    NO_REPORT,
-    SCORES,
-    STALE,
-    WORDS,
-    MetricLearner,
-    Observation,
-    Outlook,
-    Profile,
-    Ranking,
-    RankQuery,
-    learn_profile,
-)
+from zscout.placement.model import NO_REPORT, SCORES, STALE, WORDS, MetricLearner, Outlook, Profile, Ranking, RankQuery
 from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns
 
 LOAD_TIME: Final = 60 * SECOND
@@ -175,24 +162,20 @@ class Balancer:
         if now - one.at < SETTLED:
             return
         if len(self.profiles) < MAX_KINDS or one.kind in self.profiles:
-            self.profiles[one.kind] = learn_profile(self.profiles.get(one.kind), use, report.speed)
+            self.profiles[one.kind] = self.profile(one.kind).learn(use, report.speed)
         if not one.learnt and use.served is not None and one.scores:
             one.learnt = True
-            self.learner.add(Observation(one.scores, use.served * report.speed))
+            self.learner.seen.append((one.scores, use.served * report.speed))
 
     # Queries
 
     def profile(self, kind: Kind) -> Profile:
-        return self.profiles.get(kind, DEFAULT_PROFILE)
+        return self.profiles.get(kind) or Profile()
 
     def heaviest_first(self, components: Iterable[tuple[ComponentId, Kind]]) -> list[ComponentId]:
         """The order in which to place components together: the heavy ones while there is most room."""
-
-        def weight(one: tuple[ComponentId, Kind]) -> tuple[float, int, ComponentId]:
-            profile = self.profile(one[1])
-            return -profile.cpu, -profile.memory, one[0]
-
-        return [component for component, _ in sorted(components, key=weight)]
+        profiles = ((self.profile(kind), component) for component, kind in components)
+        return [name for _, _, name in sorted((-profile.cpu, -profile.memory, name) for profile, name in profiles)]
 
     def outlook(self, now: Ns, host: HostName, *, pending: bool) -> Outlook:
         """A host as reported, with what is pending there if `pending`. Raises KeyError."""
@@ -214,27 +197,19 @@ class Balancer:
             metric, why = self.learner.choose(self._rng)
         fit, left_out = self._fit(now, query)
         if query.policy == "randomized":
-            fit = {host: self._noisy(outlook) for host, outlook in sorted(fit.items())}
+            fit = {
+                host: replace(outlook, load=outlook.load + self._rng.random() * NOISE * outlook.report.cores)
+                for host, outlook in sorted(fit.items())
+            }
         profile = self.profile(query.kind)
-        scores = SCORES[metric](list(fit.values()), profile)
-        found = [(-score, host) for score, host in zip(scores, fit, strict=True)]
+        found = [(-score, host) for score, host in zip(SCORES[metric](list(fit.values()), profile), fit, strict=True)]
         named = len(found) if at_most is None else at_most
         if query.policy == "two_choices":
             best_first = self._two_choices(found)[:named]
         else:
             best_first = heapq.nsmallest(named, found)
-        words = WORDS[metric]
-        return Ranking(
-            tuple(RankedHost(host, -value, words(fit[host], profile)) for value, host in best_first),
-            metric,
-            why,
-            left_out,
-            more=len(found) - len(best_first),
-        )
-
-    def _noisy(self, outlook: Outlook) -> Outlook:
-        noise = self._rng.random() * NOISE * outlook.report.cores
-        return replace(outlook, load=outlook.load + noise)
+        hosts = tuple(RankedHost(host, -value, WORDS[metric](fit[host], profile)) for value, host in best_first)
+        return Ranking(hosts, metric, why, left_out, more=len(found) - len(best_first))
 
     def _two_choices(self, found: list[_Found]) -> list[_Found]:
         """The better of two that are drawn, then the other, then the rest."""

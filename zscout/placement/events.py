@@ -10,18 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from zscout.messages import (
-    ComponentView,
-    DrainHost,
-    Incarnation,
-    ListComponents,
-    MoveComponent,
-    Placement,
-    PlacementOperation,
-    StartComponent,
-    StopComponent,
-    UncordonHost,
-)
+from zscout import messages
+from zscout.messages import Incarnation, Placement
 from zscout.types import ComponentId, HostName, Ns
 
 
@@ -84,7 +74,7 @@ class ComponentsListed:
     `only`, that one."""
 
     host: HostName
-    components: Sequence[ComponentView]
+    components: Sequence[messages.ComponentView]
     only: ComponentId | None = None
 
 
@@ -111,9 +101,9 @@ class Inherited:
 
 
 PlacerEvent: TypeAlias = (
-    PlacementOperation
-    | DrainHost
-    | UncordonHost
+    messages.PlacementOperation
+    | messages.DrainHost
+    | messages.UncordonHost
     | StartAnswered
     | StopAnswered
     | MoveAnswered
@@ -135,7 +125,7 @@ class HostCommand:
     component is ComponentsListed with `only`, or none."""
 
     host: HostName
-    operation: StartComponent | StopComponent | MoveComponent | ListComponents
+    operation: messages.StartComponent | messages.StopComponent | messages.MoveComponent | messages.ListComponents
 
 
 @dataclass(frozen=True, slots=True)

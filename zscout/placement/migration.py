@@ -38,10 +38,10 @@ class Migrations:
 
     def request(self, component: ComponentId, to: HostName | None) -> None:
         state = self.state
-        record = state.get(component)
+        record = state.known(component)
         if record is None:
-            state.refuse(component, "unknown_component", f"there is no component {component}")
-        elif record.migration is not None:
+            return
+        if record.migration is not None:
             if to in (None, record.migration.to):
                 state.mark_changed(component, always=True)
             else:
@@ -75,7 +75,7 @@ class Migrations:
         record.migration = Migration(to, state.next_incarnation(record.component), why)
         record.reason, record.drain_reason = f"moving to {to}, {why}", ""
         state.component_arrives(_reservation(record), record.spec.kind, to)
-        state.start_standby(record, record.migration)
+        state.start(record, record.migration)
 
     # The target
 
@@ -217,7 +217,7 @@ class Migrations:
         if move.stage == "starting" and move.start_until is not None:
             self._target_silent(record, move, "it does not answer")
         elif move.stage == "starting":
-            self.state.start_standby(record, move)
+            self.state.start(record, move)
         elif move.stage == "handing_over" or move.tries < probes:
             self._probe(record, move)
         elif move.source == "ended":

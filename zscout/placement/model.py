@@ -36,13 +36,14 @@ LEAST: Final = 0.01
 
 
 class Profile(NamedTuple):
-    """What a kind of component is known to use: `cpu` in cores of speed 1.0, `memory` in bytes.
+    """What a kind of component is known to use, or taken to if it never ran: `cpu` in cores of speed 1.0, `memory` in
+    bytes.
 
     `threads`: it never wants more cores than that, however slow they are. A component that computes all the
     time wants one core on any host; one that keeps a pace wants less of a faster one."""
 
-    cpu: float
-    memory: int
+    cpu: float = 0.25
+    memory: int = 64_000_000
     samples: int = 0
     threads: int = 1
 
@@ -50,9 +51,19 @@ class Profile(NamedTuple):
         """Cores that it wants of a host of this speed. A kind that never ran counts the same on all."""
         return min(self.cpu / speed if self.samples else self.cpu, float(self.threads))
 
-
-DEFAULT_PROFILE: Final = Profile(cpu=0.25, memory=64_000_000)
-"""Of a kind that never ran."""
+    def learn(self, use: ComponentUse, speed: float) -> Profile:
+        """With one sample more; memory is the most that was seen, forgotten slowly."""
+        # What it wanted, not what a busy host gave it.
+        wanted = use.cpu / max(use.served, LEAST_SERVED) if use.served is not None else use.cpu
+        threads = max(1, math.ceil(round(wanted, 1)))
+        if not self.samples:
+            return Profile(wanted * speed, use.memory, 1, threads)
+        return Profile(
+            cpu=self.cpu + LEARN * (wanted * speed - self.cpu),
+            memory=max(use.memory, round(self.memory + LEARN / 10 * (use.memory - self.memory))),
+            samples=self.samples + 1,
+            threads=max(self.threads, threads),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,13 +140,6 @@ def rates(outlooks: Sequence[Outlook], profile: Profile) -> list[float]:
     return found
 
 
-def _composite_words(outlook: Outlook, profile: Profile) -> str:
-    return (
-        f"would run at {rate(outlook, profile):.2f}: speed {outlook.report.speed:.2f}, "
-        f"load {outlook.load_per_core:.2f} a core, {outlook.memory / MEGABYTE:,.0f} MB available"
-    )
-
-
 SCORES: Final[Mapping[Metric, Callable[[Sequence[Outlook], Profile], list[float]]]] = {
     "load_average": lambda outlooks, _: [-one.load_per_core for one in outlooks],
     "processor_speed": lambda outlooks, _: [one.report.speed for one in outlooks],
@@ -148,7 +152,10 @@ WORDS: Final[Mapping[Metric, Callable[[Outlook, Profile], str]]] = {
     "load_average": lambda outlook, _: f"load {outlook.load_per_core:.2f} a core",
     "processor_speed": lambda outlook, _: f"speed {outlook.report.speed:.2f}",
     "available_memory": lambda outlook, _: f"{outlook.memory / MEGABYTE:,.0f} MB available",
-    "composite": _composite_words,
+    "composite": lambda outlook, profile: (
+        f"would run at {rate(outlook, profile):.2f}: speed {outlook.report.speed:.2f}, "
+        f"load {outlook.load_per_core:.2f} a core, {outlook.memory / MEGABYTE:,.0f} MB available"
+    ),
 }
 """The same in words, for the hosts that are listed: they take longer than the scores."""
 
@@ -169,42 +176,13 @@ LEARN: Final = 0.2
 """Weight of the latest figure in a profile."""
 
 
-def learn_profile(known: Profile | None, use: ComponentUse, speed: float) -> Profile:
-    """A profile with one sample more; memory is the most that was seen, forgotten slowly."""
-    # What it wanted, not what a busy host gave it.
-    wanted = use.cpu / max(use.served, LEAST_SERVED) if use.served is not None else use.cpu
-    threads = max(1, math.ceil(round(wanted, 1)))
-    if known is None:
-        return Profile(wanted * speed, use.memory, 1, threads)
-    return Profile(
-        cpu=known.cpu + LEARN * (wanted * speed - known.cpu),
-        memory=max(use.memory, round(known.memory + LEARN / 10 * (use.memory - known.memory))),
-        samples=known.samples + 1,
-        threads=max(known.threads, threads),
-    )
-
-
-class Observation(NamedTuple):
-    """The metrics' scores of a host, and how fast a component then ran there (`rate`)."""
-
-    scores: Mapping[Metric, float]
-    rate: float
-
-
 class MetricLearner:
     """Chooses the metric for `auto`."""
 
     def __init__(self) -> None:
-        self.seen: deque[Observation] = deque(maxlen=REMEMBERED)
+        self.seen: deque[tuple[Mapping[Metric, float], float]] = deque(maxlen=REMEMBERED)
+        """The metrics' scores of a host, and how fast a component then ran there (`rate`)."""
         self._turn = 0
-
-    def add(self, observation: Observation) -> None:
-        self.seen.append(observation)
-
-    def agreement(self) -> dict[Metric, float]:
-        """How well each metric's scores agree with how components ran: 1 is best, 0 is not at all."""
-        rates = [one.rate for one in self.seen]
-        return {metric: spearman([one.scores[metric] for one in self.seen], rates) for metric in CHOICES}
 
     def choose(self, rng: Random) -> tuple[Metric, str]:
         """The metric for the next placement, and why."""
@@ -218,10 +196,11 @@ class MetricLearner:
         """The metric that agrees best, and why."""
         if len(self.seen) < ENOUGH:
             return DEFAULT, f"the default: {len(self.seen)} placements seen, {ENOUGH} tell enough"
-        found = self.agreement()
+        ran = [rate for _, rate in self.seen]
+        found = {metric: spearman([scores[metric] for scores, _ in self.seen], ran) for metric in CHOICES}
         best = max(CHOICES, key=lambda metric: found[metric] + AHEAD * (metric == DEFAULT))
         others = ", ".join(f"{metric} {found[metric]:.2f}" for metric in CHOICES if metric != best)
-        return best, (f"{best} agrees best with how {len(self.seen)} components ran: {found[best]:.2f} ({others})")
+        return best, f"{best} agrees best with how {len(self.seen)} components ran: {found[best]:.2f} ({others})"
 
 
 def spearman(one: Sequence[float], other: Sequence[float]) -> float:

@@ -21,21 +21,8 @@ from types import MappingProxyType
 
 from zscout.config.fleet import DEFAULT_PLACEMENT, PlacementPolicy
 from zscout.messages import DrainHost, EndComponent, MigrateComponent, PlaceComponent, Placement, UncordonHost
+from zscout.placement import events
 from zscout.placement.balancer import Balancer
-from zscout.placement.events import (
-    ComponentsListed,
-    HostJoined,
-    HostLost,
-    Inherited,
-    MoveAnswered,
-    PlacerEffect,
-    PlacerEvent,
-    PlacerWakeAt,
-    StartAnswered,
-    StopAnswered,
-    TokenAppeared,
-    TokenVanished,
-)
 from zscout.placement.lifecycle import Lifecycle
 from zscout.placement.migration import Migrations
 from zscout.placement.rebalancing import Rebalancer
@@ -66,11 +53,11 @@ class Placer:
     def cordoned(self) -> frozenset[HostName]:
         return frozenset(self._state.balancer.cordoned)
 
-    def handle(self, now: Ns, *events: PlacerEvent) -> list[PlacerEffect]:
+    def handle(self, now: Ns, *batch: events.PlacerEvent) -> list[events.PlacerEffect]:
         """Applies one instant's events, or only the time. Raises ValueError if `now` goes backwards."""
         state = self._state
         state.begin(now)
-        for event in events:
+        for event in batch:
             self._apply(event)
         while (due := state.timers.pop_due(now)) or state.to_place:
             for kind, name in due:
@@ -80,53 +67,48 @@ class Placer:
         at = state.timers.next()
         if at != self._wake:
             self._wake = at
-            effects.append(PlacerWakeAt(at))
+            effects.append(events.PlacerWakeAt(at))
         return effects
 
-    def _apply(self, event: PlacerEvent) -> None:
+    def _apply(self, event: events.PlacerEvent) -> None:
         match event:
             case PlaceComponent(component, spec):
                 self._lifecycle.place(component, spec)
             case EndComponent(component):
-                self._stop(component)
+                if (record := self._state.known(component)) is not None:
+                    self._migrations.cancel(record)
+                    self._lifecycle.stop(record)
             case MigrateComponent(component, to):
                 self._migrations.request(component, to)
             case DrainHost(host):
                 self._migrations.drain(host)
             case UncordonHost(host):
                 self._migrations.uncordon(host)
-            case StartAnswered():
+            case events.StartAnswered():
                 self._start_answered(event)
-            case StopAnswered():
-                self._stop_answered(event)
-            case MoveAnswered():
+            case events.StopAnswered(component, incarnation, _, done):
+                self._surplus.stop_answered(component, incarnation, done=done)
+                self._lifecycle.surplus_ended(component)
+            case events.MoveAnswered():
                 self._move_answered(event)
-            case TokenAppeared():
+            case events.TokenAppeared():
                 self._reconciler.appeared(event)
-            case TokenVanished():
+            case events.TokenVanished():
                 self._reconciler.vanished(event)
-            case ComponentsListed():
+            case events.ComponentsListed():
                 self._reconciler.listed(event)
-            case HostJoined(host):
+            case events.HostJoined(host):
                 self._reconciler.host_joined(host)
-            case HostLost(host):
+            case events.HostLost(host):
                 self._reconciler.host_lost(host)
-            case Inherited(components, cordoned):
+            case events.Inherited(components, cordoned):
                 self._state.balancer.cordoned |= cordoned
                 for status in components:
                     self._reconciler.inherited(status)
 
-    def _stop(self, component: ComponentId) -> None:
-        record = self._state.get(component)
-        if record is None:
-            self._state.refuse(component, "unknown_component", f"there is no component {component}")
-        else:
-            self._migrations.cancel(record)
-            self._lifecycle.stop(record)
-
     # Answers: those about an incarnation that no longer counts change nothing
 
-    def _start_answered(self, answer: StartAnswered) -> None:
+    def _start_answered(self, answer: events.StartAnswered) -> None:
         record = self._state.get(answer.component)
         may_run = answer.result in ("ok", "unknown")
         if record is None or record.state != "stopping" or record.incarnation != answer.incarnation:
@@ -142,11 +124,7 @@ class Placer:
         elif move is None and answering == (record.incarnation, record.host):
             self._lifecycle.start_answered(record, answer)
 
-    def _stop_answered(self, answer: StopAnswered) -> None:
-        self._surplus.stop_answered(answer.component, answer.incarnation, done=answer.done)
-        self._lifecycle.surplus_ended(answer.component)
-
-    def _move_answered(self, answer: MoveAnswered) -> None:
+    def _move_answered(self, answer: events.MoveAnswered) -> None:
         record = self._state.get(answer.component)
         if record is None or record.migration is None:
             return

@@ -11,19 +11,9 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Final, Literal, TypeAlias
 
+from zscout import messages
 from zscout.config.fleet import PlacementPolicy
-from zscout.messages import (
-    ComponentSpec,
-    ComponentState,
-    HowEnded,
-    Incarnation,
-    ListComponents,
-    MoveComponent,
-    Placement,
-    RankedHost,
-    StartComponent,
-    StopComponent,
-)
+from zscout.messages import ComponentSpec, ComponentState, HowEnded, Incarnation, Placement, RankedHost
 from zscout.placement.balancer import LOAD_TIME, Balancer, RankingCache
 from zscout.placement.events import ComponentChanged, HostCommand, PlacementRefused, PlacerEffect
 from zscout.placement.model import NO_REPORT, RankQuery
@@ -294,6 +284,12 @@ class PlacementState:
             self.mark_changed(component)
         return record
 
+    def known(self, component: ComponentId) -> ComponentRecord | None:
+        """As `get`; a request for one that there is not is refused."""
+        if component not in self.components:
+            self.refuse(component, "unknown_component", f"there is no component {component}")
+        return self.get(component)
+
     def add(
         self,
         component: ComponentId,
@@ -414,33 +410,28 @@ class PlacementState:
 
     # Effects
 
-    def start(self, record: ComponentRecord) -> None:
-        """Commands the start of the record's incarnation, for the first time or again."""
-        if record.host is not None and record.host in self.alive:
-            record.start_until = self.now + self.rules.start_timeout + START_SLACK
-            self.wake(record, record.start_until)
-            start = StartComponent(record.component, record.incarnation, record.spec)
-            self._commands.append(HostCommand(record.host, start))
-
-    def start_standby(self, record: ComponentRecord, move: Migration) -> None:
-        if move.to in self.alive:
-            move.start_until = self.now + self.rules.start_timeout + START_SLACK
-            self.wake_migration(record, move.start_until)
-            start = StartComponent(record.component, move.incarnation, record.spec, standby=True)
-            self._commands.append(HostCommand(move.to, start))
+    def start(self, record: ComponentRecord, move: Migration | None = None) -> None:
+        """Commands the start of the record's incarnation, or of the one that stands by in a move; for the first time or
+        again."""
+        one, host, timer = (record, record.host, self.wake) if move is None else (move, move.to, self.wake_migration)
+        if host is not None and host in self.alive:
+            one.start_until = self.now + self.rules.start_timeout + START_SLACK
+            timer(record, one.start_until)
+            start = messages.StartComponent(record.component, one.incarnation, record.spec, standby=move is not None)
+            self._commands.append(HostCommand(host, start))
 
     def hand_over(self, record: ComponentRecord, move: Migration) -> None:
         if record.host is not None:
-            order = MoveComponent(record.component, record.incarnation, move.to, move.incarnation)
+            order = messages.MoveComponent(record.component, record.incarnation, move.to, move.incarnation)
             self._commands.append(HostCommand(record.host, order))
 
     def stop(self, component: ComponentId, incarnation: Incarnation, host: HostName) -> None:
-        self._commands.append(HostCommand(host, StopComponent(component, incarnation)))
+        self._commands.append(HostCommand(host, messages.StopComponent(component, incarnation)))
 
     def probe(self, component: ComponentId, host: HostName | None) -> None:
         """Asks a host for this component."""
         if host is not None:
-            self._commands.append(HostCommand(host, ListComponents(component)))
+            self._commands.append(HostCommand(host, messages.ListComponents(component)))
 
     def refuse(self, subject: str, code: str, message: str) -> None:
         self._commands.append(PlacementRefused(subject, code, message))

@@ -10,7 +10,7 @@ from tests.thorough import times
 from zscout.lab.study.placement.scenarios import NET_SIZE, NETS, STAGGER
 from zscout.lab.study.placement.simulation import Machine, SimulatedJob, simulate
 from zscout.lab.study.placement.study import BASELINE, BATCHES, batch, figure, learn
-from zscout.placement.model import CHOICES, ENOUGH, MetricLearner, Observation, spearman
+from zscout.placement.model import CHOICES, ENOUGH, MetricLearner, spearman
 from zscout.types import POLICIES, SECOND, Metric, Policy
 
 SEEDS = range(100)
@@ -88,7 +88,7 @@ def test_auto_says_which_metric_it_believes_and_why() -> None:
     for number in range(ENOUGH):
         assert learner.judge() == ("composite", f"the default: {number} placements seen, {ENOUGH} tell enough")
         scores = {metric: float(number if metric == "available_memory" else -number) for metric in CHOICES}
-        learner.add(Observation(scores, number / 10))
+        learner.seen.append((scores, number / 10))
     metric, why = learner.judge()
     assert metric == "available_memory"
     assert why.startswith(f"available_memory agrees best with how {ENOUGH} components ran: 1.00")
