@@ -107,6 +107,20 @@ def test_a_closed_pipe_is_quiet() -> None:
     assert (process.returncode, errors) == (1, "")
 
 
+@pytest.mark.parametrize(("command", "code"), [("completion fish", 1), ("completion no-such-shell", 2), ("--help", 1)])
+def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
+    """As where a terminal window is closed and SIGHUP is ignored: all that is written to it fails with EIO."""
+    ours, theirs = os.openpty()
+    os.close(ours)
+    for streams in ({"stdout": theirs, "stderr": subprocess.PIPE}, {"stdout": theirs, "stderr": theirs}):
+        process = subprocess.Popen([*tools.COMMAND, *command.split()], **streams, text=True)
+        _, errors = process.communicate(timeout=HANG)
+        assert process.returncode == code
+        assert "Traceback" not in (errors or "")
+        assert "Exception ignored" not in (errors or "")
+    os.close(theirs)
+
+
 def test_completion_knows_the_commands_without_loading_them() -> None:
     script = zscout("completion", "bash")
     assert script.returncode == 0

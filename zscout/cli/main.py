@@ -10,12 +10,14 @@ Every error ends here as one line on stderr and an exit code:
 from __future__ import annotations
 
 import difflib
+import errno
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import click
 from click.shell_completion import CompletionItem
@@ -93,15 +95,16 @@ class LazyGroup(click.Group):
         try:
             code = super().main(args, "zscout", complete_var, standalone_mode=False, **extra)
             sys.stdout.flush()
-        except BrokenPipeError:
-            code = _pipe_closed()
         except (Exception, KeyboardInterrupt) as error:
             known = explain(error)
             if known is None:
                 raise
             code, line = known
             if line:
-                click.echo(line, err=True)
+                # Where nobody reads it, the code still tells.
+                with suppress(OSError):
+                    click.echo(line, err=True)
+        _drop_unwritten()
         if not standalone_mode:
             return code
         sys.exit(code if isinstance(code, int) else OK)
@@ -109,6 +112,8 @@ class LazyGroup(click.Group):
 
 def explain(error: BaseException) -> tuple[int, str] | None:
     """The exit code and the line for an error that people can mend; None: a bug, to be shown in full."""
+    if isinstance(error, OSError) and _nobody_reads(error):
+        return COULD_NOT, ""
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         return BAD_INPUT, error.format_message()
     if isinstance(error, click.UsageError):
@@ -150,10 +155,29 @@ def _line(text: str) -> str:
     return " ".join(clean(text).split())
 
 
-def _pipe_closed() -> int:
-    # Python flushes stdout once more at exit, and would complain.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return COULD_NOT
+def _nobody_reads(error: OSError) -> bool:
+    """Whether it came of our own output: its pipe was closed, or its terminal, while SIGHUP is ignored (nohup)."""
+    if error.errno != errno.EIO:
+        return isinstance(error, BrokenPipeError)
+    return any(map(_gone, (sys.stdout, sys.stderr)))
+
+
+def _gone(stream: IO[str]) -> bool:
+    """Whether it is a terminal that was closed; others have a size, or ENOTTY."""
+    try:
+        os.get_terminal_size(stream.fileno())
+    except OSError as error:
+        return error.errno == errno.EIO
+    return False
+
+
+def _drop_unwritten() -> None:
+    """What can't be written is dropped: Python tries again at exit, and would complain."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @click.group(
