@@ -44,8 +44,7 @@ class NodeFailed(Exception):
 
 async def run_node(node: Node, stop: asyncio.Event) -> None:
     """Runs a node until `stop`. Raises MeshError where it can't begin, NodeFailed where it can't go on."""
-    me = Sender(node.host, "node")
-    async with await ZenohMesh.open(node.fleet.name, me, node.fleet.mesh) as mesh:
+    async with await ZenohMesh.open(node.fleet.name, Sender(node.host, "node"), node.fleet.mesh) as mesh:
         await run_services(node, mesh, stop)
 
 
@@ -59,7 +58,10 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
         stop.set()
 
     async with AsyncExitStack() as stack:
-        await _refuse_twin(mesh)
+        # Two nodes of one name would answer each other's questions.
+        living = await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_TWIN)
+        if any(token.host == me.host for token in living):
+            raise MeshError(f"a node named {me.host} is on the mesh already; set another host under [node]")
         stall = StallWatch(mesh.now).start()
         stack.callback(stall.stop)
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
@@ -102,13 +104,6 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
         raise NodeFailed(f"a service failed: {failures[0]!r}; see the log") from failures[0]
 
 
-async def _refuse_twin(mesh: Mesh) -> None:
-    """Two nodes of one name would answer each other's questions."""
-    living = await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_TWIN)
-    if any(token.host == mesh.me.host for token in living):
-        raise MeshError(f"a node named {mesh.me.host} is on the mesh already; set another host under [node]")
-
-
 def _say_if_alone(mesh: Mesh) -> None:
     if mesh.links() == 0:
         log.warning(
@@ -143,12 +138,9 @@ def main(file: Path | None, log_level: str) -> None:
     try:
         node = load_node(file) if file is not None else default_node()
         uvloop.run(_main(node))
-    except BadInput as error:
+    except (BadInput, MeshError, NodeFailed) as error:
         click.echo(f"zscout-node: {error}", err=True)
-        sys.exit(2)
-    except (MeshError, NodeFailed) as error:
-        click.echo(f"zscout-node: {error}", err=True)
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, BadInput) else 1)
 
 
 if __name__ == "__main__":

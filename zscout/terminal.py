@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 NARROW: Final = 110
 """Columns of a terminal below which tables leave out what matters least."""
 MAX_TYPED: Final = 1_024
+KEYS: Final = re.compile(rb"\x1b[\[O].|.", re.DOTALL)
+"""The single keys of what was typed; an escape sequence is one key."""
 
 _JSON: Final = msgspec.json.Encoder(decimal_format="number")
 
@@ -226,7 +229,7 @@ def typed_keys(pressed: Callable[[bytes], None], ended: Callable[[], None]) -> I
         if not typed:
             loop.remove_reader(terminal)
             ended()
-        for key in keys_in(typed):
+        for key in KEYS.findall(typed):
             pressed(key)
 
     tty.setcbreak(terminal)
@@ -238,12 +241,3 @@ def typed_keys(pressed: Callable[[bytes], None], ended: Callable[[], None]) -> I
         # A terminal that is gone has no modes to be set back.
         with suppress(termios.error):
             termios.tcsetattr(terminal, termios.TCSADRAIN, before)
-
-
-def keys_in(typed: bytes) -> Iterator[bytes]:
-    """The single keys of what was typed; an escape sequence is one key."""
-    at = 0
-    while at < len(typed):
-        length = 3 if typed[at : at + 2] in (b"\x1b[", b"\x1bO") and len(typed) - at >= 3 else 1
-        yield typed[at : at + length]
-        at += length

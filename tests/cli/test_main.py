@@ -112,8 +112,8 @@ def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
     """As where a terminal window is closed and SIGHUP is ignored: all that is written to it fails with EIO."""
     ours, theirs = os.openpty()
     os.close(ours)
-    for streams in ({"stdout": theirs, "stderr": subprocess.PIPE}, {"stdout": theirs, "stderr": theirs}):
-        process = subprocess.Popen([*tools.COMMAND, *command.split()], **streams, text=True)
+    for stderr in (subprocess.PIPE, theirs):
+        process = subprocess.Popen([*tools.COMMAND, *command.split()], stdout=theirs, stderr=stderr, text=True)
         _, errors = process.communicate(timeout=HANG)
         assert process.returncode == code
         assert "Traceback" not in (errors or "")

@@ -46,8 +46,7 @@ class Failed(Exception):
 
     def __init__(self, line: str, exit_code: int | None = None) -> None:
         super().__init__(line)
-        if exit_code is not None:
-            self.exit_code = exit_code
+        self.exit_code = exit_code or self.exit_code
 
 
 class NobodyThere(Failed):
@@ -153,9 +152,7 @@ async def see_rcm(client: Client) -> None:
     with ExitStack() as stack:
         for role in (Role.RCM, Role.CANDIDATE):
             stack.callback(mesh.watch(mesh.keys.alive_any(role), on_token).close)
-        if await within(LOOK_FOR_RCM, seen):
-            return
-        if candidates and await within(LOOK_FOR_TAKEOVER - LOOK_FOR_RCM, seen):
+        if await within(LOOK_FOR_RCM, seen) or (candidates and await within(LOOK_FOR_TAKEOVER - LOOK_FOR_RCM, seen)):
             return
     fleet, links = client.fleet.name, mesh.links()
     if candidates:
@@ -181,13 +178,10 @@ async def state_of(client: Client, arc: str | None = None, *, forecast: bool = F
 
 async def within(seconds: float | None, event: asyncio.Event) -> bool:
     """Waits for an event, at most so long; returns whether it has come."""
-    with suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            await event.wait()
-    return event.is_set()
+    return await until(event.is_set, event, seconds)
 
 
-async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float) -> bool:
+async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float | None) -> bool:
     """Waits until `true()`, looked at whenever something has `changed`, at most so long; returns which."""
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):

@@ -128,7 +128,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     # Only a failing command pays for these imports, and most have made them already.
     from zscout.behaviors.client.client import CommandRefused, RequestRefused
     from zscout.behaviors.client.placer_client import PlacerSilent
-    from zscout.cli.common import Failed, Interrupted, NobodyThere
+    from zscout.cli.common import Failed, Interrupted
     from zscout.config.strict import BadInput
     from zscout.keyexpr import BadName
     from zscout.lab import LabError
@@ -143,7 +143,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         case BadInput() | BadName():
             return BAD_INPUT, words
         case PlacerSilent():
-            return NobodyThere.exit_code, words
+            return NOBODY, words
         case RequestRefused() | CommandRefused() | MeshError() | LabError():
             return COULD_NOT, words
     return None

@@ -22,7 +22,7 @@ from zscout.behaviors.teleop import Pilot, Teleop
 from zscout.cli.operator.drive import AXIS, BUTTON, FULL, INITIAL, PAD_EVENT, Hands, _Console, game_pad
 from zscout.config.strict import BadInput
 from zscout.mesh import clock
-from zscout.terminal import MAX_TYPED, keys_in, typed_keys
+from zscout.terminal import KEYS, MAX_TYPED, typed_keys
 from zscout.types import SECOND
 
 ZSCOUT = str(Path(sys.executable).with_name("zscout"))
@@ -53,7 +53,7 @@ async def comes_true(condition: Callable[[], bool]) -> None:
     ],
 )
 def test_keys_are_told_apart(typed: bytes, keys: list[bytes]) -> None:
-    assert list(keys_in(typed)) == keys
+    assert KEYS.findall(typed) == keys
 
 
 def test_keys_drive_stop_and_give_back() -> None:

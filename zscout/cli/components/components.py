@@ -45,14 +45,13 @@ async def components(name: str | None, kinds: bool, watch: bool, as_json: bool) 
       zscout components counter --json | jq -r .components[0].host
       zscout components --kinds
     """
-    if kinds and (name is not None or watch):
-        raise BadInput("--kinds lists what can be started; leave NAME and --watch out")
     if kinds:
+        if name is not None or watch:
+            raise BadInput("--kinds lists what can be started; leave NAME and --watch out")
         await _kinds(as_json=as_json)
         return
     async with AsyncExitStack() as stack:
-        client = await stack.enter_async_context(common.connected("components"))
-        listing = Listing(client, name)
+        listing = Listing(await stack.enter_async_context(common.connected("components")), name)
         placer = stack.enter_context(listing.placer)
         stack.enter_context(listing.fleet_view)
         await listing.find()
@@ -125,7 +124,12 @@ class Listing:
             styles.append(STYLES.get(one.state, ""))
         columns = ("NAME", "KIND", "STATE", "HOST", "UP", "RESTARTS", "MOVES", "CORES", "MEMORY", "WHY")
         table = Table("Components", columns, rows, styles, ("KIND", "RESTARTS", "MOVES"))
-        return Overview(self._headline(), [table])
+        running = self._running()
+        hosts = len({one.host for one in running})
+        on = f" on {terminal.many(hosts, 'host')}" if running else ""
+        cordoned = f"; cordoned: {', '.join(sorted(self.placer.cordoned))}" if self.placer.cordoned else ""
+        headline = f"Fleet {self.client.fleet.name}: {len(running)} of {len(self._all())} run{on}{cordoned}"
+        return Overview(headline, [table])
 
     def as_object(self) -> dict[str, Any]:
         """What `--json` prints: `cpu` in cores, `memory` in bytes, spans in seconds."""
@@ -136,13 +140,6 @@ class Listing:
             found.append(placement_object(one) | {"uptime": self._uptime(one), **used})
         cordoned = sorted(self.placer.cordoned)
         return {"fleet": self.client.fleet.name, "components": found, "cordoned": cordoned}
-
-    def _headline(self) -> str:
-        running = self._running()
-        hosts = len({one.host for one in running})
-        on = f" on {terminal.many(hosts, 'host')}" if running else ""
-        cordoned = f"; cordoned: {', '.join(sorted(self.placer.cordoned))}" if self.placer.cordoned else ""
-        return f"Fleet {self.client.fleet.name}: {len(running)} of {len(self._all())} run{on}{cordoned}"
 
     def _all(self) -> list[Placement]:
         return [one for _, one in sorted(self.placer.placements.items())]

@@ -31,9 +31,8 @@ UNKNOWN: Final = 3
 async def logs(name: str, follow: bool, lines: int | None, host: str | None) -> None:
     """Print the output of a component, of its running or its last incarnation.
 
-    Its host keeps the last 64 KiB of each, until zscout-node ends there. With --follow also what comes, on
-    whichever host it goes on; changes of host and its end are told on stderr. At a terminal control
-    characters are left out.
+    Its host keeps the last 64 KiB of each, until zscout-node ends there. With --follow also what comes, on whichever
+    host it goes on; changes of host and its end are told on stderr. At a terminal control characters are left out.
 
     \b
     Examples:

@@ -113,7 +113,8 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
 
         async with shown.within(timeout, late, cordoned):
             placer.take(*(await placer.request(DrainHost(host), Placements)).components)
-            while leaving := [one for one in _there(placer, host) if _leaves(one)]:
+            # What is not running yet is moved when it does.
+            while leaving := [one for one in _there(placer, host) if one.movable or one.state != "running"]:
                 shown.update(f"{host}: {_words(leaving)}")
                 await placer.wait_changed()
         stay = _there(placer, host)
@@ -152,11 +153,6 @@ def _there(placer: PlacerClient, host: str) -> list[Placement]:
     """What is on a host, or coming to it."""
     found = (one for _, one in sorted(placer.placements.items()))
     return [one for one in found if host in (one.host, one.to) and one.state not in OVER]
-
-
-def _leaves(one: Placement) -> bool:
-    """Whether it is to be waited for: what is not running yet is moved when it does."""
-    return one.movable or one.state != "running"
 
 
 def _words(some: Sequence[Placement]) -> str:

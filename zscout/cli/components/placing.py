@@ -107,7 +107,6 @@ def standing(placement: Placement) -> str:
 
 
 def unknown(name: str, known: Iterable[str]) -> common.Failed:
-    """What to raise where nobody knows a component of this name."""
     return common.unknown("component", name, known, "nor any other; start one: zscout start", "known")
 
 
@@ -146,5 +145,4 @@ host_argument = click.argument("host", type=common.NAME, shell_complete=completi
 
 
 def host_option(name: str, help: str, **more: Any) -> Callable[[F], F]:  # noqa: A002 - click's word
-    """An option that names a host."""
     return click.option(name, metavar="HOST", type=common.NAME, shell_complete=completion.hosts, help=help, **more)

@@ -133,10 +133,9 @@ async def start(
 ) -> None:
     """Have a component run on the best host of the fleet, and keep it running.
 
-    KIND is the name of what is installed on the hosts: zscout components --kinds lists them. The component
-    stays placed when this command ends, also by Ctrl-C or --timeout: it is started as soon as a host will do,
-    and elsewhere when its host dies, until zscout stop. Asked for again with the same settings, it is not
-    started twice.
+    KIND is the name of what is installed on the hosts: zscout components --kinds lists them. The component stays placed
+    when this command ends, also by Ctrl-C or --timeout: it is started as soon as a host will do, and elsewhere when its
+    host dies, until zscout stop. Asked for again with the same settings, it is not started twice.
 
     \b
     Exit code: 0 it runs, or has completed already; 1 it was refused or given up, or

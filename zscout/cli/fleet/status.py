@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import Any, Final
@@ -14,7 +14,7 @@ from msgspec import structs
 from zscout.cli import common
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.watching import Overview, show
-from zscout.keyexpr import Role, Token
+from zscout.keyexpr import Role
 from zscout.messages import Notice, RcmState, RcView
 from zscout.terminal import Table, many, span
 from zscout.types import SECOND, Ns
@@ -32,11 +32,10 @@ MAX_FIGURES_SHOWN: Final = 12
 async def status(watch: bool, every: bool, as_json: bool) -> None:
     """Show the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
 
-    The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are
-    shown even where they are not there; other hosts that died only with --watch. A device that says that
-    something is wrong with it is shown with its words, and counts as lost until it is well. --watch refreshes
-    once a second; in a pipe it prints a new block when something else than a load, a time or a figure has
-    changed. Exit code 3: no RCM.
+    The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
+    where they are not there; other hosts that died only with --watch. A device that says that something is wrong with
+    it is shown with its words, and counts as lost until it is well. --watch refreshes once a second; in a pipe it
+    prints a new block when something else than a load, a time or a figure has changed. Exit code 3: no RCM.
 
     \b
     Examples:
@@ -81,18 +80,12 @@ class Standing:
     def overview(self) -> Overview:
         fleet, links = self.fleet_view.client.fleet.name, many(self.fleet_view.mesh.links(), "link")
         headline = f"Fleet {fleet}: nobody leads; nothing is granted until a node does ({links})"
+        tables: list[Table] = []
         if self.state is not None:
             leader, term = self.state.host, self.state.term.counter
             headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
-        return Overview(headline, list(self._tables()), alarm=self.state is None)
-
-    def _tables(self) -> Iterator[Table]:
-        if self.state is not None:
-            yield self._rcs(self.state)
-            yield self._running(self.state)
-            yield _waiting(self.state)
-        yield self._hosts()
-        yield self._devices()
+            tables = [self._rcs(self.state), self._running(self.state), _waiting(self.state)]
+        return Overview(headline, [*tables, self._hosts(), self._devices()], alarm=self.state is None)
 
     def _homes(self) -> dict[str, str]:
         return {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
@@ -223,23 +216,17 @@ def _waiting(state: RcmState) -> Table:
 
 
 def _doing(host: Host) -> str:
-    counts = {role: sum(1 for token in host.tokens if token.role == role) for role in (Role.RC, Role.CLIENT)}
     parts = ["node"] if host.has(Role.NODE) else []
     parts += ["recorder"] if host.has(Role.RECORDER) else []
-    parts += [many(counts[Role.RC], "RC")] if counts[Role.RC] else []
-    components = host.components
-    # Each component is a client too, and is named below.
-    clients = counts[Role.CLIENT] - sum(1 for token in host.tokens if _of_component(token, components))
-    parts += [many(clients, "client")] if clients > 0 else []
+    rcs, components = sum(token.role == Role.RC for token in host.tokens), host.components
+    parts += [many(rcs, "RC")] if rcs else []
+    # Each component is a client too, `<component>.<incarnation>`, and is named below.
+    named = [token.name.rpartition(".") for token in host.tokens if token.role == Role.CLIENT]
+    clients = sum(not (number.isdigit() and component in components) for component, _, number in named)
+    parts += [many(clients, "client")] if clients else []
     parts += components[:MAX_NAMED]
     parts += [f"{len(components) - MAX_NAMED} more components"] if len(components) > MAX_NAMED else []
     return ", ".join(parts)
-
-
-def _of_component(token: Token, components: Sequence[str]) -> bool:
-    """Whether this is the client of one of these: `<component>.<incarnation>`."""
-    name, _, number = token.name.rpartition(".")
-    return token.role == Role.CLIENT and number.isdigit() and name in components
 
 
 def figures_text(figures: Mapping[str, float]) -> str:

@@ -1,12 +1,11 @@
-"""A line and tables as they stand now, shown once; or with `--watch` again and again: in place at a terminal,
-a block for each change in a pipe, or JSON lines."""
+"""A line and tables as they stand now, shown once; or with `--watch` again and again."""
 
 from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -16,7 +15,6 @@ from zscout.terminal import Table
 
 if TYPE_CHECKING:
     from rich.console import Group
-    from rich.text import Text
 
 EVERY: Final = 1.0
 """Seconds between two refreshes."""
@@ -49,20 +47,20 @@ class Overview:
                 terminal.print_line("")
                 table.print()
 
-    def picture(self, *after: Text) -> Group:
+    def picture(self, hint: str = "") -> Group:
         """For a terminal."""
         from rich.console import Group
         from rich.text import Text
 
-        headline = terminal.clean(self.headline)
-        parts: list[Any] = [Text(headline, style="bold red" if self.alarm else "bold")]
+        parts: list[Any] = [Text(terminal.clean(self.headline), style="bold red" if self.alarm else "bold")]
         for table in self.tables:
             if table.rows:
                 parts += [Text(""), table.picture(MAX_ROWS)]
             if len(table.rows) > MAX_ROWS:
-                more = f"... {len(table.rows) - MAX_ROWS} more rows: --json has all"
-                parts.append(Text(more, style="dim"))
-        return Group(*parts, *after)
+                parts.append(Text(f"... {len(table.rows) - MAX_ROWS} more rows: --json has all", style="dim"))
+        if hint:
+            parts.append(Text(hint, style="dim"))
+        return Group(*parts)
 
 
 class Displayed(Protocol):
@@ -78,61 +76,36 @@ class Displayed(Protocol):
 async def show(
     shown: Displayed, news: asyncio.Event, refresh: Callable[[], Awaitable[None]], *, watch: bool, as_json: bool
 ) -> None:
-    """Shows it once; with `watch` again as there is news and each second, after a `refresh`, until somebody
-    presses q."""
-    if not watch:
-        if as_json:
-            terminal.print_json(shown.as_object())
-        else:
-            shown.overview().print()
-        return
+    """Shows it once; with `watch` again as there is news and each second, after a `refresh`, until somebody presses q:
+    in place at a terminal, in a pipe as a block where something has changed that is not a load or a span of time."""
     stop = asyncio.Event()
+    printed: Any = None
 
     def end() -> None:
         stop.set()
         news.set()
 
-    with _display(as_json=as_json, end=end) as draw:
+    with ExitStack() as stack:
+        live = terminal.LiveLine(shown=watch and not as_json, stays=True)
+        if live.watched and sys.stdin.isatty():
+            stack.enter_context(terminal.typed_keys(lambda key: end() if key in (b"q", b"Q") else None, end))
+        stack.enter_context(live)
         while not stop.is_set():
-            draw(shown)
+            if as_json:
+                terminal.print_json(shown.as_object())
+            elif live.watched:
+                live.draw(shown.overview().picture("q or Ctrl-C ends"))
+            elif (now := lasting(shown.as_object())) != printed:
+                if printed is not None:
+                    terminal.print_line("")
+                shown.overview().print()
+                printed = now
+            if not watch:
+                return
             await common.within(EVERY, news)
             await common.within(HASTE, stop)
             news.clear()
             await refresh()
-
-
-@contextmanager
-def _display(*, as_json: bool, end: Callable[[], None]) -> Iterator[Callable[[Displayed], None]]:
-    """Gives what shows it each time; calls `end` when somebody presses q."""
-    if as_json:
-        yield lambda shown: terminal.print_json(shown.as_object())
-    elif not terminal.at_terminal():
-        yield _blocks()
-    else:
-        from rich.text import Text
-
-        hint = Text("q or Ctrl-C ends", style="dim")
-        with ExitStack() as stack:
-            if sys.stdin.isatty():
-                ends = (b"q", b"Q")
-                stack.enter_context(terminal.typed_keys(lambda key: end() if key in ends else None, end))
-            live = stack.enter_context(terminal.LiveLine(stays=True))
-            yield lambda shown: live.draw(shown.overview().picture(hint))
-
-
-def _blocks() -> Callable[[Displayed], None]:
-    """Prints a block where something has changed that is not a load or a span of time."""
-    last: Any = None
-
-    def draw(shown: Displayed) -> None:
-        nonlocal last
-        before, last = last, lasting(shown.as_object())
-        if before is not None and last != before:
-            terminal.print_line("")
-        if last != before:
-            shown.overview().print()
-
-    return draw
 
 
 def lasting(value: Any) -> Any:

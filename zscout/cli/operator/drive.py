@@ -95,14 +95,12 @@ async def drive(
 ) -> None:
     """Take ROBOT with radio, video channel and framegrabber, and drive it.
 
-    Asks at the fleet's operator priority, without a question: who holds them is preempted,
-    and goes on when you give back: with g or q, or when this terminal dies. The robot
-    stops whenever you let go of the keys. The picture is shown in the Rerun viewer; its
-    address is printed, for a host without a display.
+    Asks at the fleet's operator priority, without a question: who holds them is preempted, and goes on when you give
+    back: with g or q, or when this terminal dies. The robot stops whenever you let go of the keys. The picture is shown
+    in the Rerun viewer; its address is printed, for a host without a display.
 
-    Keys: arrows or w a s d drive, space stops, + and - change the speed, g gives the
-    robot back and the next key that drives takes it again, q ends. On a pad the left
-    stick drives, button 0 stops, button 1 gives back.
+    Keys: arrows or w a s d drive, space stops, + and - change the speed, g gives the robot back and the next key that
+    drives takes it again, q ends. On a pad the left stick drives, button 0 stops, button 1 gives back.
 
     \b
     Examples:
@@ -213,7 +211,6 @@ class _Console(terminal.LiveLine):
             self.event("free", f"{self._robot} is given back")
 
     def seen(self, at: int) -> None:
-        """A picture came."""
         self._pictures = [one for one in self._pictures if at - one < SECOND] + [at]
 
     async def keep_drawing(self, teleop: Teleop) -> None:
@@ -254,7 +251,6 @@ class Hands:
         return self.teleop.client.mesh.now() / SECOND
 
     def key(self, key: bytes) -> None:
-        """A key was typed."""
         if key in KEYS:
             self.pilot.press(self._now(), KEYS[key])
             self.teleop.take()
@@ -271,14 +267,12 @@ class Hands:
         self.teleop.wake()
 
     def moved(self, forward: float, right: float) -> None:
-        """The pad's stick was moved."""
         self.pilot.stick(self._now(), forward, right)
         if not self.pilot.wheels(self._now()).still:
             self.teleop.take()
         self.teleop.wake()
 
     def button(self, number: int) -> None:
-        """A button of the pad was pressed."""
         if number == 0:
             self.pilot.stop()
             self.teleop.wake()

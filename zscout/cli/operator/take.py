@@ -13,7 +13,7 @@ import click
 from zscout.behaviors.client.client import Client
 from zscout.cli import common
 from zscout.cli.common import Failed
-from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, Need, gather, hold_options
+from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.request import carry_out
 from zscout.cli.requests.waiting import contention_of, hold_json, hold_text
 from zscout.messages import HoldView, RcmState
@@ -23,19 +23,16 @@ MAX_ANSWER = 4_096
 
 
 @click.command(cls=CommandAfterDashes)
-@click.argument("needs", nargs=-1, required=True, type=Need(), metavar="NEED...")
 @click.option("-y", "--yes", is_flag=True, help="Don't ask.")
 @click.option("--no-keep", is_flag=True, help="Give back when the minimum runtime is over.")
 @hold_options
-@click.pass_context
 @common.runs
-async def take(ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any) -> int:
+async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
-    Says who will be preempted and asks, on stderr; without a terminal it needs
-    --yes. Then it waits, holds and runs a COMMAND as `zscout request` does, with the
-    same exit codes; 1 also where the question was not answered with y. A NEED is
-    written as there.
+    Says who will be preempted and asks, on stderr; without a terminal it needs --yes. Then it waits, holds and runs a
+    COMMAND as `zscout request` does, with the same exit codes; 1 also where the question was not answered with y. A
+    NEED is written as there.
 
     \b
     Examples:
@@ -44,7 +41,7 @@ async def take(ctx: click.Context, /, needs: Any, yes: bool, no_keep: bool, name
       zscout take 'robot/*' 'framegrabber/*' --no-keep --min-runtime 2m
     """
     priority = common.the_fleet().operator_priority
-    wanted = gather(ctx, needs, name, "operator", priority=priority, keep=not no_keep, **rest)
+    wanted = gather(needs, name, "operator", priority=priority, keep=not no_keep, **rest)
     async with common.connected("take") as client:
         await _agree(client, wanted, yes=yes)
         return await carry_out(client, wanted)
@@ -62,7 +59,6 @@ class TakeoverCost:
     absent: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """In words."""
         return [
             *(f"preempts {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends),
             *(f"may preempt {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end),
@@ -72,7 +68,6 @@ class TakeoverCost:
         ]
 
     def as_json(self) -> dict[str, Any]:
-        """The same for programs."""
         return {
             "preempts": list(map(hold_json, self.ends)),
             "may_preempt": list(map(hold_json, self.may_end)),

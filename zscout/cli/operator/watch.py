@@ -95,7 +95,13 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
         opened = open_source(source, report.say)
         stack.callback(opened.close)
         if record is not None:
-            report.recording = stack.enter_context(_recording(opened.name, record))
+            from zscout.cli.operator.picture_recording import WatchRecording
+            from zscout.services.recorder.timeline import TimelineError
+
+            try:
+                report.recording = stack.enter_context(WatchRecording(opened.name, record))
+            except TimelineError as error:
+                raise BadInput(f"--record: {error}") from None
         begun = True
         _watch(opened, report, lambda time: bool(ended_by) or (limit is not None and time > limit))
     report.summary()
@@ -183,16 +189,6 @@ class _WatchReport(LiveLine):
         line = f"{span(self.at)} watched, {many(self.pictures, 'picture')}; "
         line += f"{many(self._events, 'event')}, motion for {span(self._moving)}{share}"
         terminal.print_line(line, sys.stderr if self._json else sys.stdout)
-
-
-def _recording(title: str, file: Path) -> WatchRecording:
-    from zscout.cli.operator.picture_recording import WatchRecording
-    from zscout.services.recorder.timeline import TimelineError
-
-    try:
-        return WatchRecording(title, file)
-    except TimelineError as error:
-        raise BadInput(f"--record: {error}") from None
 
 
 def _as_json(event: Event) -> str:

@@ -53,11 +53,20 @@ async def why(arc: str, as_json: bool) -> None:
       zscout why survey
       zscout why 4caaac1a6451 --json | jq .arcs[0].story
     """
-    found = await _look(arc)
+    async with common.connected("why") as client:
+        state = await common.state_of(client, arc, forecast=True)
+        views: list[View] = [*state.holds, *state.queue]
+        same = [view for view in views if arc in (view.arc, view.id, _full(view))]
+        if not same and not state.story:
+            raise common.unknown("ARC", arc, [view.arc for view in views], "and none is open", "open", state.more)
+        found = [await _described(client, view, state) for view in same[:MAX_LISTED]]
+        if not same:
+            found = [{"arc": arc, "state": "ended", "story": list(map(structs.asdict, state.story))}]
     if as_json:
-        terminal.print_json(found)
+        more = max(0, len(same) - MAX_LISTED)
+        terminal.print_json({"fleet": client.fleet.name, "asked": arc, "arcs": found, "more": more})
         return
-    for number, one in enumerate(found["arcs"]):
+    for number, one in enumerate(found):
         if number:
             terminal.print_line("")
         _print(one)
@@ -169,45 +178,24 @@ async def _operate(client: Client, target: Target, word: str) -> Notice:
 # Its story
 
 
-async def _look(asked: str) -> dict[str, Any]:
-    """What `--json` prints. Raises NobodyThere, and Failed where there is no such ARC."""
-    async with common.connected("why") as client:
-        state = await common.state_of(client, asked, forecast=True)
-        views: list[View] = [*state.holds, *state.queue]
-        same = [view for view in views if asked in (view.arc, view.id, _full(view))]
-        if not same and not state.story:
-            names = [view.arc for view in views]
-            raise common.unknown("ARC", asked, names, "and none is open", "open", state.more)
-        arcs = [await _described(client, view, state) for view in same[:MAX_LISTED]]
-        if not same:
-            arcs = [{"arc": asked, "state": "ended", "story": list(map(structs.asdict, state.story))}]
-        more = max(0, len(same) - MAX_LISTED)
-        return {"fleet": client.fleet.name, "asked": asked, "arcs": arcs, "more": more}
-
-
 async def _described(client: Client, view: View, state: RcmState) -> dict[str, Any]:
-    """One open ARC, with its own story and not that of others of its name."""
+    """One open ARC, with its own story and not that of others of its name. Of a hold each `need` is what was asked
+    for, and `rc` what it has."""
     story = (await common.state_of(client, _full(view))).story
+    met = {rc: need for need, rc in view.bound.items()} if isinstance(view, HoldView) else {}
+    needs = []
+    for seen in contention_of(state, view.needs, _full(view)):
+        holders = [hold_json(hold) | {"rc": rc.rc, "params": hold.needs[rc.rc]} for rc in seen.rcs for hold in rc.holds]
+        need = {"need": met.get(seen.need, seen.need), "params": view.needs[seen.need], "holders": holders}
+        needs.append(seen.as_json() | need | {"health": await _health(client, seen)})
     described = structs.asdict(view) | {
         "state": "running" if isinstance(view, HoldView) else "queued",
-        "needs": [
-            _need(need, view) | {"health": await _health(client, need)}
-            for need in contention_of(state, view.needs, _full(view))
-        ],
+        "needs": needs,
         "story": list(map(structs.asdict, story)),
     }
     if isinstance(view, WaitView):
-        described["ahead"] = state.queue.index(view)
-        described["queued"] = len(state.queue) + state.more
+        described |= {"ahead": state.queue.index(view), "queued": len(state.queue) + state.more}
     return described
-
-
-def _need(seen: NeedContention, view: View) -> dict[str, Any]:
-    """One need; of a hold `need` is what was asked for, and `rc` what it has."""
-    met = {rc: need for need, rc in view.bound.items()} if isinstance(view, HoldView) else {}
-    holders = [hold_json(hold) | {"rc": rc.rc, "params": hold.needs[rc.rc]} for rc in seen.rcs for hold in rc.holds]
-    need, params = met.get(seen.need, seen.need), view.needs[seen.need]
-    return seen.as_json() | {"need": need, "params": params, "holders": holders}
 
 
 async def _health(client: Client, need: NeedContention) -> str | None:

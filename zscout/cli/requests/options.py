@@ -50,24 +50,6 @@ def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
     return click.option("--timeout", type=seconds, help=help)
 
 
-class Need(click.ParamType[tuple[str, dict[str, Decimal]]]):
-    """An RC or a pattern, and how it will be used."""
-
-    name = "need"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, dict[str, Decimal]]:
-        if isinstance(value, tuple):
-            return value
-        try:
-            return parse_need(str(value))
-        except BadInput as error:
-            if "/" not in str(value) and ctx is not None and not ctx.meta.get("command"):
-                raise BadInput(f"{error}; a command goes after --") from None
-            raise
-
-
 def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
     """An RC of one kind: `robot/scout33` or `scout33`, with `pattern` also `robot/*`. Raises BadInput."""
     rc = text if "/" in text else f"{kind}/{text}"
@@ -80,14 +62,16 @@ def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
     return rc
 
 
-def parse_need(text: str) -> tuple[str, dict[str, Decimal]]:
+def parse_need(text: str, _option: str = "") -> tuple[str, dict[str, Decimal]]:
     """`robot/scout33`, a pattern such as `framegrabber/*`, or with bandwidth parameters
     `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
     rc, colon, rest = text.partition(":")
     try:
         check_need(rc)
     except BadName as error:
-        raise BadInput(f"need {quoted(text)}: {error}") from None
+        context = click.get_current_context(silent=True)
+        no_dashes = "/" not in text and context is not None and not context.meta.get("command")
+        raise BadInput(f"need {quoted(text)}: {error}{'; a command goes after --' if no_dashes else ''}") from None
     params: dict[str, Decimal] = {}
     for part in rest.split(",") if colon else []:
         name, equals, number = part.partition("=")
@@ -178,8 +162,9 @@ class HoldOptions:
 
 
 def hold_options(command: F) -> F:
-    """The options of all commands that hold something."""
+    """The NEEDs and the options of all commands that hold something."""
     for option in (
+        click.argument("needs", nargs=-1, required=True, type=Parsed("need", parse_need), metavar="NEED..."),
         json_option("Print JSON lines, one for each event."),
         click.option("--again", is_flag=True, help="Wait and run the command again after a preemption."),
         click.option(
@@ -203,9 +188,9 @@ def hold_options(command: F) -> F:
     return command
 
 
-def gather(ctx: click.Context, needs: Any, name: str | None, default_name: str = "request", **rest: Any) -> HoldOptions:
+def gather(needs: Any, name: str | None, default_name: str = "request", **rest: Any) -> HoldOptions:
     """Checks what can be checked before anybody is asked. Raises BadInput, BadName, Failed."""
-    command: tuple[str, ...] = ctx.meta["command"]
+    command: tuple[str, ...] = click.get_current_context().meta["command"]
     if command:
         check_command(command)
         default_name = valid_name(Path(command[0]).name)

@@ -16,7 +16,7 @@ from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common
 from zscout.cli.common import Failed
-from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, Need, gather, hold_options
+from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.waiting import NeedContention, contention_of
 from zscout.messages import Foresight, RcmState
@@ -35,30 +35,23 @@ REFRESH: Final = 1.0
 
 
 @click.command(cls=CommandAfterDashes)
-@click.argument("needs", nargs=-1, required=True, type=Need(), metavar="NEED...")
 @click.option(
     "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Higher ones preempt lower ones."
 )
 @click.option("--keep", is_flag=True, help="Go on past the minimum runtime, until something else needs it.")
 @click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
 @hold_options
-@click.pass_context
 @common.runs
-async def request(
-    ctx: click.Context, /, needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, **rest: Any
-) -> int:
+async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, **rest: Any) -> int:
     """Wait until all of the devices are granted at once, then hold them.
 
-    A NEED is kind/name, and for a sharable device how it will be used:
-    radio/rf0:command_rate=5,other=1. With a * it is met by any one device whose
-    name matches: 'framegrabber/*' is any framegrabber, 'robot/scout$*' any robot
-    whose name begins so; twice the same is two of them. Quote it for the shell.
+    A NEED is kind/name, and for a sharable device how it will be used: radio/rf0:command_rate=5,other=1. With a * it is
+    met by any one device whose name matches: 'framegrabber/*' is any framegrabber, 'robot/scout$*' any robot whose name
+    begins so; twice the same is two of them. Quote it for the shell.
 
-    With a COMMAND, they are held while it
-    runs, for the minimum runtime at most (--keep: for longer), and given back
-    as soon as it ends. When its time is over or the grant is taken away, the
-    command's process group gets SIGTERM, and SIGKILL after the grace. Without
-    one, they are held until Ctrl-C or until the minimum runtime is over.
+    With a COMMAND, they are held while it runs, for the minimum runtime at most (--keep: for longer), and given back as
+    soon as it ends. When its time is over or the grant is taken away, the command's process group gets SIGTERM, and
+    SIGKILL after the grace. Without one, they are held until Ctrl-C or until the minimum runtime is over.
 
     \b
     The command finds in its environment:
@@ -88,7 +81,7 @@ async def request(
       zscout request robot/scout33 --json | jq .event
       zscout request robot/scout33 --priority 5 --dry-run
     """
-    wanted = gather(ctx, needs, name, priority=priority, keep=keep, **rest)
+    wanted = gather(needs, name, priority=priority, keep=keep, **rest)
     async with common.connected("request") as client:
         return await (_foresee(client, wanted) if dry_run else carry_out(client, wanted))
 
@@ -303,7 +296,7 @@ class Report(LiveLine):
                     self._state = await self._client.state()
                 if arc.state in ("asking", "queued"):
                     self._show_wait(arc)
-            await self._news_or_a_second()
+            await common.within(REFRESH if self.watched else None, self.changed)
 
     async def follow_hold(self, arc: OpenArc) -> None:
         """Shows how long a hold without a command goes on, until cancelled."""
@@ -312,7 +305,7 @@ class Report(LiveLine):
             left = (arc.end - self._mesh.now()) / SECOND
             rest = f"held for {span(self._since(arc))}, kept" if arc.keep else f"{span(left)} left"
             self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}; Ctrl-C gives back")
-            await self._news_or_a_second()
+            await common.within(REFRESH if self.watched else None, self.changed)
 
     def _show_wait(self, arc: OpenArc) -> None:
         now, start, starts_in = self._mesh.now(), "", None
@@ -322,8 +315,12 @@ class Report(LiveLine):
         if arc.state == "queued":
             start = "no start can be foretold" if starts_in is None else f"starts in {span(starts_in)}"
             if self._state is not None and self._looked is not None:
-                aged = _aged(self._state, (now - self._looked) / SECOND)
-                needs = contention_of(aged, arc.needs, f"{self._mesh.me}/{arc.id}")
+                # The state as it is now, if nothing has happened since that look.
+                past = (now - self._looked) / SECOND
+                holds = [
+                    replace(hold, held=hold.held + past, remaining=hold.remaining - past) for hold in self._state.holds
+                ]
+                needs = contention_of(replace(self._state, holds=holds), arc.needs, f"{self._mesh.me}/{arc.id}")
         # A sharable RC has holders who are in nobody's way, unless the reason names it. Two patterns may be
         # met by one RC: it is listed once.
         met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
@@ -348,18 +345,9 @@ class Report(LiveLine):
     def _since(self, arc: OpenArc) -> float:
         return (self._mesh.now() - arc.since) / SECOND
 
-    async def _news_or_a_second(self) -> None:
-        await common.within(REFRESH if self.watched else None, self.changed)
-
 
 def _how(arc: OpenArc) -> object:
     return arc.state, arc.reason, arc.ahead
-
-
-def _aged(state: RcmState, seconds: float) -> RcmState:
-    """The state as it is so much later, if nothing has happened."""
-    holds = [replace(hold, held=hold.held + seconds, remaining=hold.remaining - seconds) for hold in state.holds]
-    return replace(state, holds=holds)
 
 
 def _held_text(held: OpenArc | Held) -> str:

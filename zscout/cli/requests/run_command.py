@@ -23,6 +23,7 @@ import msgspec
 
 from zscout.behaviors import launch
 from zscout.cli.common import Failed, fleet_file
+from zscout.terminal import print_line
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.arc import Held
@@ -121,7 +122,9 @@ class RunningCommand:
         finally:
             self._signal(signal.SIGKILL)
         if self._foreign and not self._ended.done():
-            _note(f"{self._command[0]} runs as another user now and can't be ended: end it by hand")
+            print_line(
+                f"zscout: {self._command[0]} runs as another user now and can't be ended: end it by hand", sys.stderr
+            )
             return
         await asyncio.shield(self._ended)
 
@@ -182,7 +185,7 @@ class RunningCommand:
     def _note_suspension(self) -> None:
         if not self._noted:
             self._noted = True
-            _note("not suspended: what it holds would stand idle")
+            print_line("zscout: not suspended: what it holds would stand idle", sys.stderr)
 
 
 class _Terminal:
@@ -241,8 +244,3 @@ class _Terminal:
             pass
         finally:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTTOU})
-
-
-def _note(line: str) -> None:
-    sys.stderr.write(f"zscout: {line}\n")
-    sys.stderr.flush()

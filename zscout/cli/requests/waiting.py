@@ -40,12 +40,10 @@ class NeedContention:
 
     @property
     def rc(self) -> str | None:
-        """The RC that it names."""
         return None if is_pattern(self.need) else self.need
 
     @property
     def present(self) -> bool:
-        """Whether there is anything on the mesh that would meet it."""
         return any(rc.present for rc in self.rcs)
 
     @property
@@ -54,7 +52,6 @@ class NeedContention:
 
     @property
     def free(self) -> list[str]:
-        """The RCs that nobody else holds."""
         return [rc.rc for rc in self.rcs if rc.free]
 
     @property
