@@ -239,18 +239,14 @@ def speed(tries: int = TRIES) -> float:
     time. Takes a few of them, 2 ms a try; call it in a thread of its own."""
     best = math.inf
     for _ in range(tries):
-        best = min(best, _work())
+        # Processor time of this thread: what others take from it says nothing about the machine.
+        start = time.thread_time()
+        total = 0
+        for number in range(WORK):
+            total += number * number & 0xFF
+        best = min(best, max(time.thread_time() - start, 1e-9))
         time.sleep(PAUSE)
     return 1e-3 / best
-
-
-def _work() -> float:
-    # Processor time of this thread: what others take from it says nothing about the machine.
-    start = time.thread_time()
-    total = 0
-    for number in range(WORK):
-        total += number * number & 0xFF
-    return max(time.thread_time() - start, 1e-9)
 
 
 def _host_times() -> tuple[float, float]:

@@ -235,8 +235,7 @@ def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Deman
 def _runnable(proc: Path, pids: Iterable[int]) -> int:
     """Threads that run or wait for a processor at this moment, but for the one that asks."""
     mine = threading.get_native_id()
-    tasks = _tasks(proc, pids, "stat")
-    return sum(thread != mine and _fields(stat)[:1] == [b"R"] for thread, stat in tasks)
+    return sum(thread != mine and _fields(stat)[:1] == [b"R"] for thread, stat in _tasks(proc, pids, "stat"))
 
 
 def _names(folder: str) -> list[str]:

@@ -60,18 +60,15 @@ class LoadBalancer:
         read = 0
         for key, report in itertools.islice(self._reports.each(), AT_ONCE):
             read += 1
-            self._on_load(key, report)
+            # A report is believed of the host in whose key it stands.
+            try:
+                if key == self.mesh.keys.load(report.host) and report.host not in self._lost:
+                    self.core.reported(self.mesh.now(), report)
+            except ValueError as error:
+                log.debug("ignored a load report on %.200r: %s", key, error)
         if read < AT_ONCE:
             self._lost.clear()
         self._supervisor.call_later(0.0 if read == AT_ONCE else READ_EVERY, self._read)
-
-    def _on_load(self, key: str, report: LoadReport) -> None:
-        # A report is believed of the host in whose key it stands.
-        try:
-            if key == self.mesh.keys.load(report.host) and report.host not in self._lost:
-                self.core.reported(self.mesh.now(), report)
-        except ValueError as error:
-            log.debug("ignored a load report on %.200r: %s", key, error)
 
     def _on_reporter(self, token: Token, alive: bool) -> None:
         if alive:

@@ -9,14 +9,7 @@ import msgspec
 
 from zscout import messages
 from zscout.mesh import Mesh, Reply
-from zscout.placement.events import (
-    ComponentsListed,
-    HostCommand,
-    MoveAnswered,
-    PlacerEvent,
-    StartAnswered,
-    StopAnswered,
-)
+from zscout.placement import events
 from zscout.types import SECOND, HostName, Ns
 
 R = TypeVar("R")
@@ -32,7 +25,7 @@ class NodeClient:
     def __init__(self, mesh: Mesh, start_timeout: Ns) -> None:
         self.mesh, self._start_timeout = mesh, start_timeout / SECOND + ANSWER_SLACK
 
-    async def carry_out(self, command: HostCommand) -> PlacerEvent | None:
+    async def carry_out(self, command: events.HostCommand) -> events.PlacerEvent | None:
         """None: a list that was not answered."""
         match command.operation:
             case messages.StartComponent() as start:
@@ -45,10 +38,10 @@ class NodeClient:
                 reply = await self._ask(command.host, listing, messages.ComponentList, LIST_TIMEOUT)
                 if reply is None or reply.message is None:
                     return None
-                return ComponentsListed(command.host, reply.message.components, listing.component)
+                return events.ComponentsListed(command.host, reply.message.components, listing.component)
 
-    async def _start(self, host: HostName, start: messages.StartComponent) -> StartAnswered:
-        answered = partial(StartAnswered, start.component, start.incarnation, host)
+    async def _start(self, host: HostName, start: messages.StartComponent) -> events.StartAnswered:
+        answered = partial(events.StartAnswered, start.component, start.incarnation, host)
         reply = await self._ask(host, start, messages.ComponentView, self._start_timeout)
         if reply is None:
             return answered("unknown", f"{host} did not answer")
@@ -62,14 +55,14 @@ class NodeClient:
             return answered("failed", view.reason, view.tail[: messages.MAX_TAIL])
         return answered("unknown", f"it is still {view.phase}")
 
-    async def _stop(self, host: HostName, stop: messages.StopComponent) -> StopAnswered:
+    async def _stop(self, host: HostName, stop: messages.StopComponent) -> events.StopAnswered:
         reply = await self._ask(host, stop, messages.ComponentView, stop.grace + ANSWER_SLACK)
         gone = reply is not None and reply.problem is not None and reply.problem.code == "unknown_component"
         ended = reply is not None and reply.message is not None and reply.message.phase == "ended"
-        return StopAnswered(stop.component, stop.incarnation or 0, host, done=ended or gone)
+        return events.StopAnswered(stop.component, stop.incarnation or 0, host, done=ended or gone)
 
-    async def _move(self, host: HostName, move: messages.MoveComponent) -> MoveAnswered:
-        answered = partial(MoveAnswered, move.component, move.incarnation, host)
+    async def _move(self, host: HostName, move: messages.MoveComponent) -> events.MoveAnswered:
+        answered = partial(events.MoveAnswered, move.component, move.incarnation, host)
         reply = await self._ask(host, move, messages.Moved, move.patience + self._start_timeout)
         if reply is None:
             return answered("unknown", f"{host} did not answer")

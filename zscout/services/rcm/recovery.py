@@ -1,14 +1,13 @@
 """What is in force when a new RCM takes the lead, from the answers of RCs and clients. Pure.
 
-RCs know the holds, clients their requests and places. A hold is recovered if every RC of its gang is there
-and holds it under the same grant; a gang with an absent RC is broken, and queued again with its place. What a
-client that answers does not ask for any more is not carried on: it gave it up while nobody led.
-"""
+RCs know the holds, clients their requests and places. A hold is recovered if every RC of its gang is there and holds it
+under the same grant; a gang with an absent RC is broken, and queued again with its place. What a client that answers
+does not ask for any more is not carried on: it gave it up while nobody led."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from decimal import Decimal
 from operator import attrgetter
@@ -36,7 +35,7 @@ class RecoveredState:
         yield from (one.request for one in self.waiting)
 
 
-def recover(states: Iterable[RcState], clients: Iterable[ClientRequests], now: Ns) -> RecoveredState:
+def recover(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:
     """Combines the answers. What is malformed is left out and logged, and all else is recovered."""
     result = RecoveredState(rcs={state.rc: state for state in states})
     parts: dict[tuple[str, Grant], dict[RcName, Holder]] = {}
@@ -44,13 +43,8 @@ def recover(states: Iterable[RcState], clients: Iterable[ClientRequests], now: N
         for holder in state.holders:
             arc = arc_id(holder.client, holder.id)
             parts.setdefault((arc, holder.grant), {})[state.rc] = holder
-    asked: dict[str, tuple[str, OpenRequest]] = {}
-    answered: set[str] = set()
-    for answer in clients:
-        answered.add(answer.client)
-        for request in answer.requests:
-            asked[arc_id(answer.client, request.id)] = (answer.client, request)
-
+    asked = {arc_id(one.client, request.id): (one.client, request) for one in clients for request in one.requests}
+    answered = {one.client for one in clients}
     seen: set[str] = set()
     for (arc, grant), held in sorted(parts.items(), key=lambda item: item[0][1], reverse=True):
         if arc in seen:
@@ -105,8 +99,7 @@ def _recover_hold(
     request = _request(arc, some.client, needs, some)
     # The core ends a gang with an absent RC, and names what was lost; a present RC without it breaks it.
     if all(name in held or name not in result.rcs for name in some.rcs):
-        remaining = min(holder.remaining for holder in held.values())
-        end = now + round(remaining * SECOND)
+        end = now + round(min(holder.remaining for holder in held.values()) * SECOND)
         result.holds.append(RecoveredHold(request, some.place, grant, end - request.min_runtime, end, some.bound))
     else:
         result.waiting.append(Requested(request, some.place))
@@ -131,11 +124,10 @@ def _request(arc: str, client: str, needs: dict[str, Amounts], source: OpenReque
     check_name(source.arc, "arc")
     for need in needs:
         check_need(need)
-    wanted = {need: exact_amounts(params) for need, params in needs.items()}
     return ArcRequest(
         arc=arc,
         client=client,
-        needs=wanted,
+        needs={need: exact_amounts(params) for need, params in needs.items()},
         priority=source.priority,
         min_runtime=duration(Decimal(source.min_runtime), "min_runtime"),
         keep=source.keep,

@@ -1,8 +1,7 @@
 """The state of each request of one term: its name and history, and the notices that its client gets.
 
-Every change that is not the answer to an operation is published on the client's key; requests that ended are
-remembered for a while. What happened to each ARC is kept as text, for `zscout why`, and written to the log.
-"""
+Every change that is not the answer to an operation is published on the client's key; requests that ended are remembered
+for a while. What happened to each ARC is kept as text, for `zscout why`, and written to the log."""
 
 from __future__ import annotations
 
@@ -184,8 +183,8 @@ class RequestRegistry:
 
     def _close(self, effect: HoldEnded | Dropped) -> Notice:
         """How a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
-        details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome}
-        details["why"] = reason_info(effect.reason)
+        why = reason_info(effect.reason)
+        details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
         requeued = isinstance(effect, HoldEnded) and effect.requeued
         arc = self._core.arc(effect.arc)
         if isinstance(effect, HoldEnded):

@@ -1,8 +1,7 @@
 """Operations of clients: they become events of the core, and are answered once the core has decided.
 
-What arrives in one burst is one instant: one pass decides it and one publication has it. Operations on one
-ARC stay in their order.
-"""
+What arrives in one burst is one instant: one pass decides it and one publication has it. Operations on one ARC stay in
+their order."""
 
 from __future__ import annotations
 

@@ -60,13 +60,11 @@ def blueprint(
     """The layout: who holds what, what each ARC does and the loads on one time axis, events beside them; with
     components, also what runs on each host and what it uses.
 
-    `span`: begin and end of a run that is over, in seconds of the timeline. Without it the layout is live:
-    the window slides with the newest data and shows the last minute. `rc_rows`, `arc_rows` and `host_rows`
-    are the rows expected in the upper panes, which share the height accordingly. Without components
-    `host_rows` is 0; a pane of RCs or ARCs that would be empty beside them is left out. With `robots`, their
-    behaviors follow the ARCs, loads and hosts share a place, and floor and cameras are at the right, above
-    the events.
-    """
+    `span`: begin and end of a run that is over, in seconds of the timeline. Without it the layout is live: the window
+    slides with the newest data and shows the last minute. `rc_rows`, `arc_rows` and `host_rows` are the rows expected
+    in the upper panes, which share the height accordingly. Without components `host_rows` is 0; a pane of RCs or ARCs
+    that would be empty beside them is left out. With `robots`, their behaviors follow the ARCs, loads and hosts share a
+    place, and floor and cameras are at the right, above the events."""
     axis = rrb.archetypes.TimeAxis(view_range=_window(span))
     behavior_rows = LIVE_BEHAVIOR_ROWS if span is None and robots.behavior_rows else robots.behavior_rows
     lanes = {
@@ -113,8 +111,7 @@ def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout) -> r
 
     def curves(origin: str, name: str) -> rrb.View:
         # A legend of many would cover the curves.
-        legend = rrb.PlotLegend(visible=False)
-        return rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis, plot_legend=legend)
+        return rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis, plot_legend=rrb.PlotLegend(visible=False))
 
     events = rrb.TextLogView(
         origin="/events",
@@ -135,8 +132,7 @@ def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout) -> r
     if robots.floor is not None:
         width, height = robots.floor
         bounds = rrb.VisualBounds2D(x_range=[0, width], y_range=[0, height])
-        floor = rrb.Spatial2DView(origin="/floor", name=f"Floor   {FLOOR_WORDS}", visual_bounds=bounds)
-        panes.append((9, floor))
+        panes.append((9, rrb.Spatial2DView(origin="/floor", name=f"Floor   {FLOOR_WORDS}", visual_bounds=bounds)))
     if robots.cameras:
         views = [rrb.Spatial2DView(origin=entity, name=title) for entity, title in robots.cameras]
         rows = [

@@ -1,8 +1,4 @@
-"""Colours of a recording, RGBA.
-
-`OPERATOR` is kept for an operator's takeover and for what was preempted. Of robots green is hidden, amber not
-yet, yellow an alert.
-"""
+"""Colours of a recording, RGBA. Of robots green is hidden, amber not yet, yellow an alert."""
 
 from __future__ import annotations
 
@@ -11,7 +7,7 @@ from typing import Final
 import rerun as rr
 
 OPERATOR: Final = 0xFF1463FF
-"""RGBA of operator takeovers and preemptions."""
+"""RGBA of operator takeovers and preemptions, and of nothing else."""
 FAILED: Final = 0xFF3B1FFF
 """RGBA of what was given up."""
 PALETTE: Final[tuple[int, ...]] = (

@@ -217,8 +217,7 @@ class FloorPlan:
         self._draw(at, "people", walkers, [PERSON])
         # Names stand apart from the points: a text must be brighter.
         if len(robots) <= IN_FULL:
-            pairs = zip(names, looks, strict=True)
-            names = [f"{name} · {look.words}" if look.words else name for name, look in pairs]
+            names = [f"{name} · {look.words}" if look.words else name for name, look in zip(names, looks, strict=True)]
         texts = [*map(clean_text, names), *(clean_text(one.name, MAX_NAME) for one in people)]
         colours = [bright(colour) for colour in (*shades, *(PERSON for _ in people))]
         places = self._places([*spots, *walkers])

@@ -1,8 +1,7 @@
 """What surrounds a recorder: its process, its job, and the folder of its recordings.
 
-It is a process of its own, as Rerun is large and a node should stay small. Recordings are files named by
-fleet and local time, of which the newest are kept.
-"""
+It is a process of its own, as Rerun is large and a node should stay small. Recordings are files named by fleet and
+local time, of which the newest are kept."""
 
 from __future__ import annotations
 
@@ -114,8 +113,7 @@ class RecorderProcess:
     """A child that records until its standard input closes: it can't outlive this process."""
 
     def __init__(self, recorder: RecorderConfig, fleet: Fleet, host: str) -> None:
-        own = msgspec.structs.replace(fleet, mesh=beside(fleet.mesh))
-        self._job = encode_job(RecorderJob(recorder, own, host))
+        self._job = encode_job(RecorderJob(recorder, msgspec.structs.replace(fleet, mesh=beside(fleet.mesh)), host))
         self._child: asyncio.subprocess.Process | None = None
         # A node goes on without its recorder: what fails here is logged.
         self._supervisor = Supervisor("the recorder's process", lambda _: None)
@@ -168,11 +166,9 @@ class RecorderProcess:
         )
         assert child.stdin is not None  # noqa: S101
         assert child.stdout is not None  # noqa: S101
-        try:
+        with suppress(ConnectionError, ValueError):  # it ended before that: the code says more
             child.stdin.write(self._job)
             await child.stdin.drain()
             recording = msgspec.json.decode(await child.stdout.readline(), type=Recording)
             log.info("records to %s, live at %s", recording.file, recording.url)
-        except (ConnectionError, ValueError):
-            pass  # it ended before that: the code says more
         return await child.wait()

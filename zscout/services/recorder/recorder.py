@@ -72,7 +72,6 @@ class Recorder:
         self._hosts, self._robots = timeline.hosts, timeline.robots
         self._requests = RequestTracker(timeline, fleet.operator_priority)
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
-        self._leaders: set[Token] = set()
         self._declared: list[Declaration] = []
         self._wanted, self._placer_wanted = asyncio.Event(), asyncio.Event()
         self._fresher: set[str] | None = None
@@ -149,7 +148,6 @@ class Recorder:
         if not instances:
             del self._tokens[token.host, token.role, token.name]
         if token.role == Role.RCM:
-            (self._leaders.add if alive else self._leaders.discard)(token)
             if alive:
                 self._wanted.set()
                 self._placer_wanted.set()
@@ -183,7 +181,7 @@ class Recorder:
                 known = missed
                 self._placer_wanted.set()
             self._wanted.clear()
-            if not await self._read() and self._leaders:
+            if not await self._read() and any(role == Role.RCM for _, role, _ in self._tokens):
                 await asyncio.sleep(PAUSE)
                 self._wanted.set()
 
@@ -262,14 +260,9 @@ class Recorder:
                 self._asking = self._supervisor.spawn(self._ask_plan(sender))
 
     async def _ask_plan(self, sender: Sender) -> None:
-        key = self.mesh.keys.building_plan(sender)
+        key, ask, limit = self.mesh.keys.building_plan(sender), messages.PlanAsk(), messages.MAX_PLAN
         replies = await self.mesh.ask(
-            key,
-            messages.PlanAsk(),
-            messages.BuildingPlan,
-            timeout=READ_TIMEOUT,
-            enough=lambda _: True,
-            limit=messages.MAX_PLAN,
+            key, ask, messages.BuildingPlan, timeout=READ_TIMEOUT, enough=lambda _: True, limit=limit
         )
         for reply in replies:
             if reply.message is not None:

@@ -42,8 +42,7 @@ class Timeline(Drawing):
 
     `fleet` names the recording, together with the time of the start. `path`: the `.rrd` file, replaced if it is there,
     or None. `port`: the live server's TCP port on the IP address `bind`, 0 for a free one, or None for no server; one
-    of file and server there must be. Raises TimelineError if the port is taken or the file can't be written.
-    """
+    of file and server there must be. Raises TimelineError if the port is taken or the file can't be written."""
 
     def __init__(self, fleet: str, *, path: Path | None, bind: str = "127.0.0.1", port: int | None = None) -> None:
         start = datetime.now(UTC)
@@ -162,11 +161,10 @@ class Timeline(Drawing):
 
     def _colour(self, at: float, arc: str) -> int:
         """The ARC's colour."""
-        if arc not in self._arcs:
-            others = "ARC names: the others have no lane and no colour of their own"
-            if not self.room(at, self._arcs, MAX_ARCS, others):
-                return OTHER
-            self._arcs.add(arc)
+        others = "ARC names: the others have no lane and no colour of their own"
+        if arc not in self._arcs and not self.room(at, self._arcs, MAX_ARCS, others):
+            return OTHER
+        self._arcs.add(arc)
         return self._colour_of(arc)
 
     def _colour_of(self, name: str) -> int:
