@@ -108,10 +108,8 @@ class ControlGroups:
         listed by the group. Not for the event loop."""
         group = ComponentGroup(memory, cpu)
         name = f"{PREFIX}{os.getpid()}.{name}"
-        if memory:
-            group.memory_set = self._limit(group, "memory", name)
-        if cpu:
-            group.cpu_set = self._limit(group, "cpu", name)
+        group.memory_set = memory > 0 and self._limit(group, "memory", name)
+        group.cpu_set = cpu > 0 and self._limit(group, "cpu", name)
         return group
 
     def sweep(self) -> None:

@@ -16,18 +16,7 @@ from zscout.keyexpr import Role, Token, incarnation_of
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import ListComponents, Placement, Placements, PlacerOperation
-from zscout.placement.events import (
-    ComponentChanged,
-    HostCommand,
-    HostJoined,
-    HostLost,
-    Inherited,
-    PlacementRefused,
-    PlacerEvent,
-    PlacerWakeAt,
-    TokenAppeared,
-    TokenVanished,
-)
+from zscout.placement import events
 from zscout.placement.placer import Placer
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.placement.node_client import NodeClient
@@ -55,7 +44,7 @@ class ComponentPlacer:
         fleet: Fleet,
         term: Term,
         balancer: LoadBalancer,
-        inherited: Inherited,
+        inherited: events.Inherited,
         on_failure: Callable[[Exception], object],
     ) -> None:
         self.mesh, self.term = mesh, term
@@ -101,16 +90,16 @@ class ComponentPlacer:
         if alive:
             # A node that started anew has lost its components, though its old token may live on for a while.
             if instances:
-                self._feed(HostLost(host))
+                self._feed(events.HostLost(host))
             instances.add(token.instance)
-            self._feed(HostJoined(host))
+            self._feed(events.HostJoined(host))
             self._unlisted.add(host)
             self._supervisor.spawn(self._list_components(token))
             return
         instances.discard(token.instance)
         if not instances:
             del self._instances[host]
-            self._feed(HostLost(host))
+            self._feed(events.HostLost(host))
             self._listed(host)
 
     async def _list_components(self, node: Token) -> None:
@@ -118,7 +107,7 @@ class ComponentPlacer:
         for _ in range(LIST_TRIES):
             if node.instance not in self._instances.get(node.host, ()):
                 break
-            if await self._command(HostCommand(node.host, ListComponents())):
+            if await self._command(events.HostCommand(node.host, ListComponents())):
                 break
             await sleep(LIST_AGAIN)
         self._listed(node.host)
@@ -129,7 +118,7 @@ class ComponentPlacer:
             self._begin()
 
     def _on_component(self, token: Token, alive: bool) -> None:
-        event = TokenAppeared if alive else TokenVanished
+        event = events.TokenAppeared if alive else events.TokenVanished
         self._feed(event(token.name, incarnation_of(token.instance), token.host))
 
     def _begin(self) -> None:
@@ -141,17 +130,17 @@ class ComponentPlacer:
 
     # Events into the core, effects out of it
 
-    def _feed(self, *events: PlacerEvent) -> list[PlacementRefused]:
+    def _feed(self, *happened: events.PlacerEvent) -> list[events.PlacementRefused]:
         """Carries out what follows from events, or from the time; returns what the core refused."""
-        refusals: list[PlacementRefused] = []
+        refusals: list[events.PlacementRefused] = []
         changed: dict[str, Placement | None] = {}
-        for effect in self._core.handle(self.mesh.now(), *events):
+        for effect in self._core.handle(self.mesh.now(), *happened):
             match effect:
-                case PlacementRefused():
+                case events.PlacementRefused():
                     refusals.append(effect)
-                case ComponentChanged(component, placement):
+                case events.ComponentChanged(component, placement):
                     changed[component] = placement
-                case PlacerWakeAt(at):
+                case events.PlacerWakeAt(at):
                     self._wake_at(at)
                 case _:
                     self._supervisor.spawn(self._command(effect))
@@ -160,7 +149,7 @@ class ComponentPlacer:
             self._publish(changed, cordoned)
         return refusals
 
-    async def _command(self, command: HostCommand) -> bool:
+    async def _command(self, command: events.HostCommand) -> bool:
         """Whether anything came of it."""
         event = await self._nodes.carry_out(command)
         if event is not None:
