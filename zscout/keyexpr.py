@@ -158,6 +158,22 @@ class _Key:
         return f"{keys.base}/{self._suffix}"
 
 
+def _rc_key(suffix: str) -> Callable[[Keys, str], str]:
+    """A method of Keys: the key of an RC."""
+    return lambda self, rc: f"{self.base}/rc/{check_rc(rc)}/{suffix}"
+
+
+def _host_key(suffix: str) -> Callable[[Keys, str], str]:
+    return lambda self, host: f"{self.base}/host/{check_name(host, 'host')}/{suffix}"
+
+
+def _sender_key(prefix: str, suffix: str = "") -> Callable[[Keys, Sender], str]:
+    def key(self: Keys, sender: Sender) -> str:
+        return f"{self.base}/{prefix}/{_sender(sender)}{suffix}"
+
+    return key
+
+
 @dataclass(frozen=True, slots=True)
 class Keys:
     """The keys of one fleet. Arguments must be valid names; each method checks its own."""
@@ -181,6 +197,19 @@ class Keys:
     building_plan_any = _Key("building/*/*/plan")
     building_poses_any = _Key("building/*/*/poses")
 
+    schedule = _sender_key("rcm/schedule")
+    vote = _rc_key("vote")
+    command_any = _rc_key("command/*/*")
+    rc_state = _rc_key("state")
+    frame = _rc_key("frame")
+    load = _host_key("load")
+    component = _host_key("component")
+    notice = _sender_key("client", "/notice")
+    requests = _sender_key("client", "/requests")
+    behavior = _sender_key("client", "/behavior")
+    building_plan = _sender_key("building", "/plan")
+    building_poses = _sender_key("building", "/poses")
+
     def __post_init__(self) -> None:
         check_name(self.fleet, "fleet")
 
@@ -188,54 +217,8 @@ class Keys:
     def base(self) -> str:
         return f"{ROOT}/{self.fleet}"
 
-    # RCM
-
-    def schedule(self, sender: Sender) -> str:
-        return f"{self.base}/rcm/schedule/{_sender(sender)}"
-
-    # Resource controllers
-
-    def vote(self, rc: str) -> str:
-        return f"{self.base}/rc/{check_rc(rc)}/vote"
-
     def command(self, rc: str, sender: Sender) -> str:
         return f"{self.base}/rc/{check_rc(rc)}/command/{_sender(sender)}"
-
-    def command_any(self, rc: str) -> str:
-        return f"{self.base}/rc/{check_rc(rc)}/command/*/*"
-
-    def rc_state(self, rc: str) -> str:
-        return f"{self.base}/rc/{check_rc(rc)}/state"
-
-    def frame(self, rc: str) -> str:
-        return f"{self.base}/rc/{check_rc(rc)}/frame"
-
-    # Hosts
-
-    def load(self, host: str) -> str:
-        return f"{self.base}/host/{check_name(host, 'host')}/load"
-
-    def component(self, host: str) -> str:
-        return f"{self.base}/host/{check_name(host, 'host')}/component"
-
-    # Clients
-
-    def notice(self, client: Sender) -> str:
-        return f"{self.base}/client/{_sender(client)}/notice"
-
-    def requests(self, client: Sender) -> str:
-        return f"{self.base}/client/{_sender(client)}/requests"
-
-    def behavior(self, client: Sender) -> str:
-        return f"{self.base}/client/{_sender(client)}/behavior"
-
-    # Simulated buildings
-
-    def building_plan(self, client: Sender) -> str:
-        return f"{self.base}/building/{_sender(client)}/plan"
-
-    def building_poses(self, client: Sender) -> str:
-        return f"{self.base}/building/{_sender(client)}/poses"
 
     # Liveliness
 
@@ -254,31 +237,27 @@ class Keys:
 
     def sender_of(self, key: str) -> Sender:
         """The sender of a request or command, or the owner of the key of a client or a building."""
-        chunks = self._chunks(key)
-        match chunks:
-            case ["rcm", "schedule", host, client] | ["rc", _, _, "command", host, client]:
-                pass
-            case ["client", host, client, "notice" | "requests" | "behavior"]:
-                pass
-            case ["building", host, client, "plan" | "poses"]:
-                pass
-            case _:
-                raise BadName(f"{key[:200]!r} does not name its sender")
-        return Sender(check_name(host, "host"), check_name(client, "client"))
+        match self._chunks(key):
+            case (
+                ["rcm", "schedule", host, client]
+                | ["rc", _, _, "command", host, client]
+                | ["client", host, client, "notice" | "requests" | "behavior"]
+                | ["building", host, client, "plan" | "poses"]
+            ):
+                return Sender(check_name(host, "host"), check_name(client, "client"))
+        raise BadName(f"{key[:200]!r} does not name its sender")
 
     def rc_of(self, key: str) -> str:
         match self._chunks(key):
             case ["rc", kind, name, *_]:
                 return check_rc(f"{kind}/{name}")
-            case _:
-                raise BadName(f"{key[:200]!r} is not the key of an RC")
+        raise BadName(f"{key[:200]!r} is not the key of an RC")
 
     def host_of(self, key: str) -> str:
         match self._chunks(key):
             case ["host", host, *_]:
                 return check_name(host, "host")
-            case _:
-                raise BadName(f"{key[:200]!r} is not the key of a host")
+        raise BadName(f"{key[:200]!r} is not the key of a host")
 
     def token_of(self, key: str) -> Token:
         match self._chunks(key):

@@ -210,17 +210,15 @@ def _scheduling(table: FleetTable, limits: RcmLimits, at: Where) -> SchedulingPo
 
 
 def _check_timing(timing: Timing, lease: float, at: Where) -> None:
-    # A takeover begins when the old RCM's lease is over; no hold may end while the new one asks what stands.
-    takeover = round(lease * SECOND) + timing.rebuild
-    _check_above(timing.hold_lease, takeover, "mesh.lease + timing.rebuild", at / "hold_lease")
-    # One lost heartbeat ends nothing.
-    _check_above(timing.hold_lease, 2 * timing.heartbeat, "2 * timing.heartbeat", at / "hold_lease")
-
-
-def _check_above(value: Ns, bound: Ns, meaning: str, where: Where) -> None:
-    if value <= bound:
-        limit = f"{bound / SECOND:g}"
-        raise where.bad(f"is {value / SECOND:g} s", f"write more than {meaning}, which is {limit} s")
+    for bound, meaning in (
+        # A takeover begins when the old RCM's lease is over; no hold may end while the new one asks what stands.
+        (round(lease * SECOND) + timing.rebuild, "mesh.lease + timing.rebuild"),
+        # One lost heartbeat ends nothing.
+        (2 * timing.heartbeat, "2 * timing.heartbeat"),
+    ):
+        if timing.hold_lease <= bound:
+            remedy = f"write more than {meaning}, which is {bound / SECOND:g} s"
+            raise (at / "hold_lease").bad(f"is {timing.hold_lease / SECOND:g} s", remedy)
 
 
 # Endpoints and addresses, checked before Zenoh sees them

@@ -8,7 +8,6 @@ in the buffers of the system there is a packet or two, and a halt sent now goes 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import random
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -24,10 +23,10 @@ from zscout.drivers.serial_line import CLOSE_TIMEOUT, DEPTH, SerialLine
 from zscout.drivers.transmit_queue import TransmitQueue
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused, Supervisor
+from zscout.mesh.supervision import done_within
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
 from zscout.types import SECOND, Grant, Place
 
-COUNTED: Final = ("packets", "bytes", "repeats", "halts")
 RECENT: Final = 64
 """Packets over which the longest wait is measured."""
 OPENING: Final = 1.0
@@ -58,7 +57,7 @@ class RadioDriver(Driver):
         self._outstanding = 0
         self._timer: asyncio.TimerHandle | None = None
         self._losses = 0
-        self._counts = Counter(dict.fromkeys(COUNTED, 0))
+        self._counts = Counter(packets=0, bytes=0, repeats=0, halts=0)
         self._waits: deque[Fraction] = deque(maxlen=RECENT)
 
     async def open(self, rc: RcHandle) -> None:
@@ -66,17 +65,14 @@ class RadioDriver(Driver):
         # Of its own: halts still go out after the RC has closed that of its other work.
         self._supervisor = Supervisor(f"the line of {rc.name}", rc.supervisor.fail)
         self._line = SerialLine(self._port, self._baud, up=self._line_up, down=self._line_down, wrote=self._line_wrote)
-        try:
-            await asyncio.wait_for(self._known.wait(), OPENING)
-        except TimeoutError:
+        if not await done_within(OPENING, self._known.wait()):
             rc.fail(self._down)
 
     async def close(self) -> None:
         """Halts that are not out yet still go out, if the line works."""
         if not self._down and self._air.urgent:
             self._quiet.clear()
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._quiet.wait(), CLOSE_TIMEOUT)
+            await done_within(CLOSE_TIMEOUT, self._quiet.wait())
         await self._supervisor.close()
         await self._line.stop()
 
@@ -210,7 +206,7 @@ class RadioDriver(Driver):
         self._pump()
 
     def figures(self) -> Figures:
-        counts = {name: float(self._counts[name]) for name in COUNTED}
+        counts = {name: float(count) for name, count in self._counts.items()}
         waits = {name: float(getattr(self._air, name)) for name in ("replaced", "dropped", "waiting")}
         worst = max(self._waits, default=Fraction(0))
         longest = round(float(worst / SECOND * 1000), 1)

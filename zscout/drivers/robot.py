@@ -26,6 +26,7 @@ from zscout.drivers.commands import (
 )
 from zscout.drivers.driver import Driver, RcDirectory, RcHandle
 from zscout.mesh import Declaration, Refused, Reply
+from zscout.mesh.supervision import done_within
 from zscout.messages import Command, Done, Figures, Holder, RcState
 from zscout.types import SECOND, Grant, Ns
 
@@ -39,7 +40,6 @@ PAUSES: Final = (0.05, 2.0)
 MAX_WAITING: Final = 16
 RECENT: Final = 64
 """Answers of the radio over which the latency is measured."""
-COUNTED: Final = ("commands", "refused", "halts", "dead_man_stops")
 
 
 @dataclass(slots=True)
@@ -80,7 +80,7 @@ class RobotDriver(Driver):
         self._wake = asyncio.Event()
         self._queued = asyncio.Event()
         self._declared: list[Declaration] = []
-        self._counts = Counter(dict.fromkeys(COUNTED, 0))
+        self._counts = Counter(commands=0, refused=0, halts=0, dead_man_stops=0)
         self._latencies: deque[float] = deque(maxlen=RECENT)
 
     async def open(self, rc: RcHandle) -> None:
@@ -248,11 +248,7 @@ class RobotDriver(Driver):
                 self._rc.recover()
                 pause = PAUSES[0]
                 continue
-            try:
-                # Not wait_for, which loses a cancellation that coincides with the event.
-                async with asyncio.timeout(pause):
-                    await self._wake.wait()
-            except TimeoutError:
+            if not await done_within(pause, self._wake.wait()):
                 pause = min(2 * pause, PAUSES[1])
 
     def _on_directory_change(self) -> None:
@@ -268,7 +264,7 @@ class RobotDriver(Driver):
 
     def figures(self) -> Figures:
         latency = round(1000 * statistics.median(self._latencies), 2) if self._latencies else 0.0
-        return {name: float(self._counts[name]) for name in COUNTED} | {"latency_ms": latency}
+        return {name: float(count) for name, count in self._counts.items()} | {"latency_ms": latency}
 
 
 def _after(result: Any) -> float:

@@ -11,6 +11,7 @@ import functools
 import logging
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self
 
@@ -107,15 +108,12 @@ class FrameWatch:
 
     async def next(self, timeout: float) -> Frame | None:
         """The newest frame, once there is one; None if none came within `timeout` seconds."""
-        try:
+        with suppress(TimeoutError):
             async with asyncio.timeout(timeout):
-                while True:
-                    frame = self.take()
-                    if frame is not None:
-                        return frame
+                while (frame := self.take()) is None:
                     await self._arrived.wait()
-        except TimeoutError:
-            return None
+                return frame
+        return None
 
     def __enter__(self) -> Self:
         return self
