@@ -1,8 +1,7 @@
 """The key space: every key expression of zscout is built and parsed here, and nowhere else.
 
-All keys lie under `zscout/<fleet>`. The sender of a request stands in its key, so that access control can
-check it; a receiver reads it from there and refuses wildcards in its place.
-"""
+All keys lie under `zscout/<fleet>`. The sender of a request stands in its key, so that access control can check it; a
+receiver reads it from there and refuses wildcards in its place."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Units, amounts and identities that all rooms share.
 
-Times are whole nanoseconds (`Ns`) on one clock of the caller's choice. Bandwidth parameters are `Fraction`,
-so that sums are exact (0.1 + 0.2 is 0.3).
-"""
+Times are whole nanoseconds (`Ns`) on one clock of the caller's choice. Bandwidth parameters are `Fraction`, so that
+sums are exact (0.1 + 0.2 is 0.3)."""
 
 from __future__ import annotations
 

@@ -182,30 +182,20 @@ def _fleet(file: FleetFile, top: Where) -> Fleet:
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")
     _check_timing(file.timing, mesh.lease, top / "timing")
-    return Fleet(
-        name=table.name,
-        candidates=table.candidates,
-        strategy=table.strategy,
-        scheduling=_scheduling(table, file.limits, at),
-        mesh=mesh,
-        limits=file.limits,
-        timing=file.timing,
-        placement=file.placement,
-    )
-
-
-def _scheduling(table: FleetTable, limits: RcmLimits, at: Where) -> SchedulingPolicy:
     if table.promise != "equals" and (table.strategy != "adaptive" or not table.patience):
         raise (at / "promise").bad(
             f'is "{table.promise}", but only "adaptive" with some patience promises anything',
             'write strategy = "adaptive" and a patience above 0, or promise = "equals"',
         )
-    return SchedulingPolicy(
+    scheduling = SchedulingPolicy(
         preempt=table.preempt,
         operator_priority=table.operator_priority,
         patience=table.patience or None,
         promise=table.promise,
-        max_running_per_host=limits.max_running_per_host or None,
+        max_running_per_host=file.limits.max_running_per_host or None,
+    )
+    return Fleet(
+        table.name, table.candidates, table.strategy, scheduling, mesh, file.limits, file.timing, file.placement
     )
 
 
@@ -226,21 +216,17 @@ def _check_timing(timing: Timing, lease: float, at: Where) -> None:
 
 def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: str, at: Where) -> None:
     """Refuses endpoints and interfaces that Zenoh would not understand. Raises BadInput."""
+    remedy = f'write protocol/host:port, as in "tcp/127.0.0.1:7447"; protocols: {", ".join(_PROTOCOLS)}'
     for name, endpoints, lowest_port in (("listen", listen, 0), ("connect", connect, 1)):
         for number, endpoint in enumerate(endpoints):
-            _check_endpoint(endpoint, (at / name).item(number), lowest_port=lowest_port)
+            where, found = (at / name).item(number), _ENDPOINT.fullmatch(endpoint)
+            if not found or found["protocol"] not in _PROTOCOLS or not _is_host(found["host"]):
+                raise where.bad(f"{quoted(endpoint)} is not an endpoint", remedy)
+            if not lowest_port <= int(found["port"]) <= 65_535:
+                raise where.bad(f"{quoted(endpoint)} has no valid port", f"write one from {lowest_port} to 65535")
         check_unique(endpoints, at / name)
     if not _INTERFACE.fullmatch(interface):
         raise (at / "interface").bad(f"{quoted(interface)} names no interface", 'write "auto", or as in "eth0"')
-
-
-def _check_endpoint(endpoint: str, where: Where, *, lowest_port: int) -> None:
-    found = _ENDPOINT.fullmatch(endpoint)
-    if not found or found["protocol"] not in _PROTOCOLS or not _is_host(found["host"]):
-        remedy = f'write protocol/host:port, as in "tcp/127.0.0.1:7447"; protocols: {", ".join(_PROTOCOLS)}'
-        raise where.bad(f"{quoted(endpoint)} is not an endpoint", remedy)
-    if not lowest_port <= int(found["port"]) <= 65_535:
-        raise where.bad(f"{quoted(endpoint)} has no valid port", f"write one from {lowest_port} to 65535")
 
 
 def check_multicast(address: str, where: Where) -> None:

@@ -4,9 +4,8 @@ Every error is a `BadInput` of the form `FILE: KEY.PATH: what is wrong; remedy`.
 items of a list are counted from 0, and the item's own name follows in brackets where it has one:
 `lab.toml: rc[2].driver (robot/scout33): is the text "fast"; write "exclusive" or "capacity"`.
 
-msgspec converts, but it names no keys of a table (`$.needs[...]`), hints at no unknown key, takes a text for
-a Decimal and makes 1e400 infinite. So the data is checked here first, along the same types.
-"""
+msgspec converts, but it names no keys of a table (`$.needs[...]`), hints at no unknown key, takes a text for a Decimal
+and makes 1e400 infinite. So the data is checked here first, along the same types."""
 
 from __future__ import annotations
 
@@ -272,10 +271,10 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
             table = _expect(dict, value, where, "a table")
             return _checked_struct(_tagged(structs, table, where), table, where)
         case inspect.UnionType(types=kinds):  # else only X | None: absent in TOML, or X
-            one = next(kind for kind in kinds if not isinstance(kind, inspect.NoneType))
-            return _checked(one, value, where)
+            return _checked(next(kind for kind in kinds if not isinstance(kind, inspect.NoneType)), value, where)
         case inspect.StructType():
-            return _checked_struct(kind, _expect(dict, value, where, f"a table, under [{where.key}]"), where)
+            wanted = "a table" if where.key.endswith("]") else f"a table, under [{where.key}]"
+            return _checked_struct(kind, _expect(dict, value, where, wanted), where)
         case inspect.DictType(value_type=of):
             table = _expect(dict, value, where, "a table")
             _check_count(len(table), kind.max_length, where)
@@ -284,12 +283,10 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
             tables = isinstance(of, inspect.StructType | inspect.UnionType)
             items = _expect(list, value, where, f"tables, each under [[{where.key}]]" if tables else "a list")
             _check_count(len(items), kind.max_length, where)
-            found = []
-            for number, inner in enumerate(items):
-                place = where.item(number, inner.get("name") if isinstance(inner, dict) else None)
-                inner = _expect(dict, inner, place, "a table") if tables else inner
-                found.append(_checked(of, inner, place))
-            return found
+            return [
+                _checked(of, inner, where.item(number, inner.get("name") if isinstance(inner, dict) else None))
+                for number, inner in enumerate(items)
+            ]
         case _:
             _check_leaf(kind, value, where)
     return value

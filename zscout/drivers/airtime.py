@@ -20,8 +20,7 @@ The second half is that this is within `bound`. `U` has room for one halt for ea
 every holder, so what is accepted is accepted of every part. A holder that joins while the line is busy begins
 with an empty bucket, so the sums hold across changes of holders, too.
 
-The promise is suspended while more than `U` bytes of halts and stops come at once: they go first even so.
-"""
+The promise is suspended while more than `U` bytes of halts and stops come at once: they go first even so."""
 
 from __future__ import annotations
 

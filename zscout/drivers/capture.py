@@ -1,9 +1,8 @@
 """The newest picture of any source that OpenCV can open: a device, a file, or a URL.
 
-OpenCV hands out pictures in order, however old they are: a reader that is too slow falls behind without end.
-So a thread of its own reads all of them and keeps only the newest. It opens its source again whenever that
-fails, and describes its state in words.
-"""
+OpenCV hands out pictures in order, however old they are: a reader that is too slow falls behind without end. So a
+thread of its own reads all of them and keeps only the newest. It opens its source again whenever that fails, and
+describes its state in words."""
 
 from __future__ import annotations
 
@@ -48,9 +47,8 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """One picture. `number` counts from 1 and goes on when the source is opened again; `time` is when it was
-    read, in seconds of this host's own clock; `picture` is uint8, (height, width) or (height, width, 3) BGR.
-    """
+    """One picture. `number` counts from 1 and goes on when the source is opened again; `time` is when it was read, in
+    seconds of this host's own clock; `picture` is uint8, (height, width) or (height, width, 3) BGR."""
 
     number: int
     time: float
@@ -62,8 +60,7 @@ class Capture:
 
     `source` is a device (`/dev/video0`, or its number), a URL (`http://`, `rtsp://`, ...) or else a file, which is read
     at its own rate, and from its start again when it ends. `open_timeout` and `read_timeout` are seconds; a source that
-    gives no picture for `read_timeout` is opened again. All attributes may be read from any thread.
-    """
+    gives no picture for `read_timeout` is opened again. All attributes may be read from any thread."""
 
     def __init__(self, source: str, *, open_timeout: float = 2.0, read_timeout: float = 1.5) -> None:
         self.source = source

@@ -94,8 +94,8 @@ def robot_command(do: Mapping[str, Any]) -> RobotCommand:
 def _read(do: Mapping[str, Any], kind: Any, names: tuple[str, ...]) -> Any:
     name = do.get("name")
     if name not in names:
-        known = ", ".join(names)
-        raise Refused("unknown_command", f"this device does not know {str(name)[:64]!r}; it knows {known}")
+        what = f"this device does not know {str(name)[:64]!r}; it knows {', '.join(names)}"
+        raise Refused("unknown_command", what)
     try:
         return msgspec.convert(do, kind)
     except msgspec.ValidationError as error:

@@ -44,8 +44,7 @@ class RcHandle(Protocol):
 class Driver:
     """What a device does. The defaults are those of an exclusive device without commands of its own.
 
-    Everything runs in the node's event loop, one call at a time; nothing may block.
-    """
+    Everything runs in the node's event loop, one call at a time; nothing may block."""
 
     sharable = False
     """Whether it takes several holders, by its vote."""

@@ -1,10 +1,9 @@
 """A framegrabber: pictures of an OpenCV source, published as JPEG while it is held and has subscribers.
 
-It is tuned to the video RC that is in the gang of its holder. Three things happen side by side: a capture
-reads the source (`capture.py`), a pump encodes and publishes in a thread of its own, and the event loop
-supervises both: a framegrabber that has no picture for LOST_AFTER while it is held reports itself lost,
-goes on trying, and is back with the first picture.
-"""
+It is tuned to the video RC that is in the gang of its holder. Three things happen side by side: a capture reads the
+source (`capture.py`), a pump encodes and publishes in a thread of its own, and the event loop supervises both: a
+framegrabber that has no picture for LOST_AFTER while it is held reports itself lost, goes on trying, and is back with
+the first picture."""
 
 from __future__ import annotations
 
@@ -60,8 +59,7 @@ class FramegrabberDriver(Driver):
     """`sources` are what `Capture` takes, by the video RC that each shows; {"": source} where there is only
     one, whatever it shows. At most `rate` frames a second are published, with JPEG `quality` 1..100.
 
-    Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state).
-    """
+    Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state)."""
 
     _rc: RcHandle
     _publisher: FramePublisher
@@ -297,9 +295,8 @@ class FramePump:
     """Publishes the pictures of a capture that are read from now on, until it is stopped; in a thread of its
     own. `head` is what the heads of frames have in common; their numbers go on from its number.
 
-    At most `rate` frames a second, with JPEG `quality` 1..100, and only while somebody subscribes: otherwise
-    nothing is even encoded.
-    """
+    At most `rate` frames a second, with JPEG `quality` 1..100, and only while somebody subscribes: otherwise nothing is
+    even encoded."""
 
     def __init__(
         self,

@@ -5,9 +5,8 @@ A packet is a sync byte, the length of its body, the body (robot, number, operat
 
     5A | length | robot | number | operation | arguments ... | crc high | crc low
 
-The radio goes one way, without acknowledgements. So a drive command carries its own end (`lasts`), and other
-packets are sent several times under the same number.
-"""
+The radio goes one way, without acknowledgements. So a drive command carries its own end (`lasts`), and other packets
+are sent several times under the same number."""
 
 from __future__ import annotations
 

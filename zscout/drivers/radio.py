@@ -1,9 +1,8 @@
 """A radio: one serial line that several ARCs share, each for as many packets a second as it asked for.
 
-Nobody acknowledges on this radio, so an answer means that a packet is in the queue, and gives the time until
-it will be out. What goes out is handed to the line no sooner than the line can carry it (`transmit_queue`):
-in the buffers of the system there is a packet or two, and a halt sent now goes out now.
-"""
+Nobody acknowledges on this radio, so an answer means that a packet is in the queue, and gives the time until it will be
+out. What goes out is handed to the line no sooner than the line can carry it (`transmit_queue`): in the buffers of the
+system there is a packet or two, and a halt sent now goes out now."""
 
 from __future__ import annotations
 
@@ -165,8 +164,7 @@ class RadioDriver(Driver):
         if self._down:
             return
         while self._outstanding < DEPTH:
-            now = self._rc.mesh.now()
-            outgoing = self._air.next(now, self._is_in_force)
+            outgoing = self._air.next(self._rc.mesh.now(), self._is_in_force)
             if outgoing is None:
                 break
             data = encode(outgoing.packet)
@@ -208,6 +206,5 @@ class RadioDriver(Driver):
     def figures(self) -> Figures:
         counts = {name: float(count) for name, count in self._counts.items()}
         waits = {name: float(getattr(self._air, name)) for name in ("replaced", "dropped", "waiting")}
-        worst = max(self._waits, default=Fraction(0))
-        longest = round(float(worst / SECOND * 1000), 1)
+        longest = round(float(max(self._waits, default=Fraction(0)) / SECOND * 1000), 1)
         return counts | waits | {"longest_wait_ms": longest, "unplugged": float(self._losses)}

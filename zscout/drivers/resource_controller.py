@@ -1,8 +1,7 @@
 """A resource controller (RC) on the mesh: the part that every driver shares.
 
 A driver (`driver.py`) controls its device; `ResourceController` owns the keys, checks every command against the hold in
-force when it is carried out, votes, and puts the device into its safe state when its holder is gone.
-"""
+force when it is carried out, votes, and puts the device into its safe state when its holder is gone."""
 
 from __future__ import annotations
 
@@ -12,25 +11,12 @@ from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeAlias
 
+from zscout import messages
 from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.supervision import StallWatch
-from zscout.messages import (
-    Ballot,
-    Command,
-    Done,
-    EndedHold,
-    Grants,
-    Problem,
-    Proposal,
-    RcAsk,
-    RcmState,
-    RcState,
-    StateAsk,
-    absurd,
-)
 from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
@@ -48,15 +34,14 @@ EARLY_PER_HOST = 16
 FIGURES_PERIOD = 1.0
 """Seconds between two publications of changed figures."""
 
-CommandQuery: TypeAlias = IncomingQuery[Command]
+CommandQuery: TypeAlias = IncomingQuery[messages.Command]
 
 
 class WorkQueue:
     """What an RC has to carry out: changes of holders first, so that a safe state waits for no command.
 
-    A command under a grant that the RC does not know yet is set aside, outside the queue, until the RC knows
-    more; then it goes before all other commands, so that none of the same grant overtakes it.
-    """
+    A command under a grant that the RC does not know yet is set aside, outside the queue, until the RC knows more; then
+    it goes before all other commands, so that none of the same grant overtakes it."""
 
     def __init__(self) -> None:
         self._changes: deque[HoldChange] = deque()
@@ -144,20 +129,20 @@ class ResourceController:
     async def start(self) -> None:
         """Starts empty, and obeys nothing before it has subscribed and then read `rcm/state`."""
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
-        self._state = mesh.publisher(keys.rc_state(self.name), RcState)
+        self._state = mesh.publisher(keys.rc_state(self.name), messages.RcState)
         self._declared.append(mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)))
-        self._declared.append(mesh.subscribe(keys.grants, Grants, guard(self._on_grants)))
+        self._declared.append(mesh.subscribe(keys.grants, messages.Grants, guard(self._on_grants)))
         await asyncio.wait({self._read_state()})
         if self.directory is not None:
             self._declared.append(self.directory.watch())
         await self.driver.open(self)
         self.supervisor.spawn(self._worker())
         self.supervisor.spawn(self._publish_figures())
-        self._declared.append(mesh.serve(keys.rc_state(self.name), RcAsk, self._on_state_query))
+        self._declared.append(mesh.serve(keys.rc_state(self.name), messages.RcAsk, self._on_state_query))
         if self.driver.sharable:
-            self._declared.append(mesh.serve(keys.vote(self.name), Proposal, self._on_proposal))
+            self._declared.append(mesh.serve(keys.vote(self.name), messages.Proposal, self._on_proposal))
         command = keys.command_any(self.name)
-        self._declared.append(mesh.serve(command, Command, self._on_command, depth=COMMAND_QUEUE))
+        self._declared.append(mesh.serve(command, messages.Command, self._on_command, depth=COMMAND_QUEUE))
         self._declared.append(mesh.alive(Token(mesh.me.host, Role.RC, self.name, self.instance)))
 
     async def stop(self) -> None:
@@ -194,7 +179,7 @@ class ResourceController:
         self.health = "ok"
         self.publish()
 
-    def publish(self, ended: list[EndedHold] | None = None) -> None:
+    def publish(self, ended: list[messages.EndedHold] | None = None) -> None:
         self._state.put(self._rc_state(ended or []))
 
     # What the RCM sends
@@ -202,19 +187,19 @@ class ResourceController:
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
 
-    def _on_grants(self, _key: str, grants: Grants) -> None:
+    def _on_grants(self, _key: str, grants: messages.Grants) -> None:
         self._apply(self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable))
         if self._missed:
             self._read_state()
 
-    def _on_state_query(self, query: IncomingQuery[RcAsk]) -> None:
+    def _on_state_query(self, query: IncomingQuery[messages.RcAsk]) -> None:
         promise = query.message.promise
         if promise is not None and not self.holds.promise(promise):
             raise Refused("old_term", f"{self.name} obeys term {self.holds.term.counter}", self.holds.term)
         query.answer(self._rc_state([]))
 
-    def _rc_state(self, ended: list[EndedHold]) -> RcState:
-        return RcState(
+    def _rc_state(self, ended: list[messages.EndedHold]) -> messages.RcState:
+        return messages.RcState(
             rc=self.name,
             host=self.mesh.me.host,
             instance=self.instance,
@@ -236,13 +221,13 @@ class ResourceController:
         silence = self.mesh.now() - self.holds.last_contact
         return bool(self._leaders) and silence < self.holds.hold_lease // 2
 
-    def _on_proposal(self, query: IncomingQuery[Proposal]) -> None:
+    def _on_proposal(self, query: IncomingQuery[messages.Proposal]) -> None:
         proposal = query.message
         try:
             reason = self.driver.vote(proposal.holders)
         except ValueError as error:
             raise Refused("bad_request", str(error)) from None
-        query.answer(Ballot(proposal=proposal.proposal, accept=not reason, reason=reason))
+        query.answer(messages.Ballot(proposal=proposal.proposal, accept=not reason, reason=reason))
 
     # Commands
 
@@ -282,12 +267,12 @@ class ResourceController:
             raise Refused(problem.code, problem.message, problem.term)
         warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
         if command.do.get("name") == "confirm":
-            return Done(warming=warming)
+            return messages.Done(warming=warming)
         if warming and not self.driver.usable_cold(command.do):
             raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
         return await self.driver.command(self.holds.held[command.grant].holder, command.do)
 
-    def _refusal(self, query: CommandQuery) -> Problem | None:
+    def _refusal(self, query: CommandQuery) -> messages.Problem | None:
         """Why a command is not obeyed under its grant; None: it is, or has none."""
         grant, sender = query.message.grant, self.mesh.keys.sender_of(query.key)
         if grant is None:
@@ -310,7 +295,7 @@ class ResourceController:
             if isinstance(result, asyncio.Future):
                 self.supervisor.spawn(self._answer(query, result))
             else:
-                query.answer(result if isinstance(result, Done) else Done(result=result))
+                query.answer(result if isinstance(result, messages.Done) else messages.Done(result=result))
         except Refused as refused:
             query.refuse(refused.problem)
         except Exception:
@@ -359,11 +344,11 @@ class ResourceController:
 
     async def _read(self) -> None:
         for _ in range(REREADS):
-            key, ask = self.mesh.keys.rcm_state, StateAsk(holds_only=True)
-            replies = await self.mesh.ask(key, ask, RcmState, timeout=REREAD_TIMEOUT, enough=self._is_current)
+            key, ask = self.mesh.keys.rcm_state, messages.StateAsk(holds_only=True)
+            replies = await self.mesh.ask(key, ask, messages.RcmState, timeout=REREAD_TIMEOUT, enough=self._is_current)
             # One absurd answer must not hide the true one.
             answers = (reply.message for reply in replies if reply.message is not None)
-            states = [state for state in answers if not absurd(state.term, self.holds.term)]
+            states = [state for state in answers if not messages.absurd(state.term, self.holds.term)]
             if not states:
                 break
             newest = max(states, key=lambda state: (state.term, state.seq))
@@ -378,7 +363,7 @@ class ResourceController:
             if problem := self._refusal(query):
                 query.refuse(problem)
 
-    def _is_current(self, reply: Reply[RcmState]) -> bool:
+    def _is_current(self, reply: Reply[messages.RcmState]) -> bool:
         """Whether no other answer is needed: this one is of an RCM that is obeyed already."""
         state, holds = reply.message, self.holds
         return state is not None and state.term == holds.term and state.seq >= holds.seq

@@ -1,8 +1,7 @@
 """A robot that is driven through a radio, and stopped whenever nobody drives it.
 
-The robot receives packets and sends none. So it counts as there once its radio has taken a halt for it, and
-as lost while its radio can't.
-"""
+The robot receives packets and sends none. So it counts as there once its radio has taken a halt for it, and as lost
+while its radio can't."""
 
 from __future__ import annotations
 

@@ -40,10 +40,9 @@ _NUMBER: Final = re.compile(r"(?:\[Errno |\()(\d+)[],]")
 class SerialLine:
     """A line, until `stop`. `port` is anything that pyserial's `serial_for_url` takes.
 
-    Called in the event loop: `up()` when the line is open; `down(why)` when it can't be used, once for each
-    reason in a row; `wrote()` when the system has taken a packet. At most DEPTH packets are handed to the
-    thread at a time; the caller hands over no more than the line carries (`transmit_queue`).
-    """
+    Called in the event loop: `up()` when the line is open; `down(why)` when it can't be used, once for each reason in a
+    row; `wrote()` when the system has taken a packet. At most DEPTH packets are handed to the thread at a time; the
+    caller hands over no more than the line carries (`transmit_queue`)."""
 
     def __init__(
         self, port: str, baud: int, *, up: Callable[[], None], down: Callable[[str], None], wrote: Callable[[], None]
@@ -103,12 +102,9 @@ class SerialLine:
         looked = clock.now()
         try:
             while not (self._stopping.is_set() and self._queue.empty()):
-                try:
-                    data = self._queue.get(timeout=IDLE if not self._stopping.is_set() else 0)
-                    port.write(data)
+                with contextlib.suppress(queue.Empty):
+                    port.write(self._queue.get(timeout=0 if self._stopping.is_set() else IDLE))
                     self._call(self._wrote)
-                except queue.Empty:
-                    pass
                 if clock.now() - looked >= IDLE * 1e9:
                     looked = clock.now()
                     if port.in_waiting:

@@ -4,11 +4,10 @@ First halts and stops, at once; then repeats, as far as the reserve reaches; the
 each holder's through its token bucket (`airtime`), first come first served. A drive packet that waits is
 replaced by the holder's next one for the same robot: the newest command is the true one.
 
-Stop, camera and halt packets go out several times, since nobody acknowledges. A repeat has the number of its
-original, so that the robot obeys once. Where something else went to the robot in between, it gets a number of
-its own: it then repeats what still applies. What a newer packet has overtaken is not repeated: after a drive
-command nothing of a halt is left but "transmitter off".
-"""
+Stop, camera and halt packets go out several times, since nobody acknowledges. A repeat has the number of its original,
+so that the robot obeys once. Where something else went to the robot in between, it gets a number of its own: it then
+repeats what still applies. What a newer packet has overtaken is not repeated: after a drive command nothing of a halt
+is left but "transmitter off"."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """The mesh as asyncio sees it: typed queries, queryables, publications, liveliness.
 
-A query that finds its queue full is answered "busy"; a publication that does is counted as missed.
-"""
+A query that finds its queue full is answered "busy"; a publication that does is counted as missed."""
 
 from __future__ import annotations
 

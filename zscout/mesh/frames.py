@@ -1,8 +1,7 @@
 """Frames on the mesh: large, many, and only the newest is of use.
 
-They are apart from the messages: a publisher knows whether there are subscribers, a frame that can't be sent
-at once is dropped, and a subscriber slower than the frames misses those in between, never the newest.
-"""
+They are apart from the messages: a publisher knows whether there are subscribers, a frame that can't be sent at once is
+dropped, and a subscriber slower than the frames misses those in between, never the newest."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """A process's place on the mesh: JSON messages over a transport, and one event loop for all handlers.
 
-What arrives on Zenoh's threads goes through one bounded inbox into the event loop, in the order in which it
-came, with one wake-up for a burst. Handlers are plain functions that run there and must not block.
-"""
+What arrives on Zenoh's threads goes through one bounded inbox into the event loop, in the order in which it came, with
+one wake-up for a burst. Handlers are plain functions that run there and must not block."""
 
 from __future__ import annotations
 
@@ -293,8 +292,7 @@ class Mesh:
     def publisher(self, key: str, kind: type, *, data: bool = False) -> Publisher:
         """A publisher for control messages, which block rather than get lost; with `data` they are dropped
         rather than wait, and yield to control."""
-        quality = Quality.DATA if data else Quality.CONTROL
-        return Publisher(self._transport.publisher(key, kind, quality))
+        return Publisher(self._transport.publisher(key, kind, Quality.DATA if data else Quality.CONTROL))
 
     def put(self, key: str, message: msgspec.Struct) -> None:
         """Publishes one control message without a declaration: for keys of which there are many."""

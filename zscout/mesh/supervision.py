@@ -36,8 +36,7 @@ class Supervisor:
 
     The first of them that raises is logged with its traceback, `on_failure(error)` is called, once, and all others are
     cancelled. Failures after that, of tasks that are being cancelled, are logged only. A supervisor that failed or was
-    cancelled runs nothing any more: a service that starts again takes a new one.
-    """
+    cancelled runs nothing any more: a service that starts again takes a new one."""
 
     def __init__(self, name: str, on_failure: Callable[[Exception], object]) -> None:
         self.name = name

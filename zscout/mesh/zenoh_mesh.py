@@ -138,12 +138,10 @@ class ZenohTransport(Transport):
             raise MeshError(f"{key} can't be asked: {error}") from None
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
-        callback = _direct(lambda query: on_query(ZenohQuery(query)))
-        return _undeclare(self._session.declare_queryable(key, callback))
+        return _undeclare(self._session.declare_queryable(key, _direct(lambda query: on_query(ZenohQuery(query)))))
 
     def publisher(self, key: str, kind: type | None, quality: Quality) -> TransportPublisher:
-        options = QUALITIES[quality]
-        return ZenohPublisher(self._session.declare_publisher(key, encoding=_encoding(kind), **options))
+        return ZenohPublisher(self._session.declare_publisher(key, encoding=_encoding(kind), **QUALITIES[quality]))
 
     def put(self, key: str, payload: bytes, kind: type) -> None:
         try:

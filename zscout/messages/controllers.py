@@ -40,9 +40,8 @@ class Ballot(Message, frozen=True):
 class Command(Message, frozen=True):
     """An action `do` under `grant`, to be refused once it has waited longer than `ttl` seconds.
 
-    `do` has the action in `name`; the rest is the driver's. Every RC knows `confirm`. Without a grant only
-    what stops a robot is done, by a radio, for the node of that robot's RC.
-    """
+    `do` has the action in `name`; the rest is the driver's. Every RC knows `confirm`. Without a grant only what stops a
+    robot is done, by a radio, for the node of that robot's RC."""
 
     do: dict[str, Any]
     grant: Grant | None = None

@@ -113,8 +113,7 @@ class ReasonInfo(Message, frozen=True):
 class Notice(_ArcParty, frozen=True):
     """The state of one request: the answer to an operation, and published to its client at each change.
 
-    Of two notices about one request the one with the greater `(term, step)` is the newer.
-    """
+    Of two notices about one request the one with the greater `(term, step)` is the newer."""
 
     state: State
     term: Term
@@ -177,9 +176,8 @@ class Revocation(_ArcParty, frozen=True):
 class Grants(Message, frozen=True):
     """A publication of the leading RCM. For each RC touched, all its holders from now on.
 
-    `prev` is the seq of the publication before: a receiver whose last one was another has missed some.
-    Without `rcs` and `revoked` it is a heartbeat; one comes at least every `every` seconds.
-    """
+    `prev` is the seq of the publication before: a receiver whose last one was another has missed some. Without `rcs`
+    and `revoked` it is a heartbeat; one comes at least every `every` seconds."""
 
     term: Term
     seq: int
