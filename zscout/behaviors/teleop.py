@@ -8,8 +8,8 @@ teleop.take()                       # and give_back(); press keys at teleop.pilo
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable, Coroutine
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
 
@@ -17,6 +17,7 @@ from zscout.behaviors.client.arc import Held, Revoked, hold
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
+from zscout.mesh.supervision import done_within
 from zscout.types import SECOND, Ns
 
 PERIOD: Final = 0.05
@@ -91,11 +92,9 @@ class Pilot:
 
     def press(self, now: float, way: Way) -> None:
         """A key that drives, pressed or repeated."""
-        last = self._ways.get(way)
-        repeated = last is not None and now - last[0] <= REPEATS
-        until = now + (NEXT if repeated else FIRST)
+        came, drives_until = self._ways.get(way, (-math.inf, now))
         # A repetition never cuts short what the press gave.
-        self._ways[way] = (now, max(until, last[1]) if last is not None else until)
+        self._ways[way] = (now, max(drives_until, now + (NEXT if now - came <= REPEATS else FIRST)))
         opposite: dict[Way, Way] = {"forward": "back", "back": "forward", "left": "right", "right": "left"}
         self._ways.pop(opposite[way], None)
 
@@ -117,19 +116,19 @@ class Pilot:
         """What is wanted now; ask often."""
         self._ways = {way: times for way, times in self._ways.items() if now < times[1]}
         if self._ways:
+            # Two keys at once drive a curve.
             left = sum(WHEELS[way][0] for way in self._ways)
             right = sum(WHEELS[way][1] for way in self._ways)
-            # Two keys at once drive a curve; neither wheel above what was asked for.
-            most = max(1.0, abs(left), abs(right))
             lasts = max(until for _, until in self._ways.values()) - now
-            return Wheels(self.speed * left / most, self.speed * right / most, lasts)
-        if self._stick is not None:
-            at, forward, across = self._stick
-            if now - at < STICK_TIMEOUT and (forward or across):
-                left, right = forward + TURN * across, forward - TURN * across
-                most = max(1.0, abs(left), abs(right))
-                return Wheels(self.speed * left / most, self.speed * right / most, STICK_TIMEOUT - (now - at))
-        return STOP
+        else:
+            at, forward, across = self._stick or (now, 0.0, 0.0)
+            lasts = STICK_TIMEOUT - (now - at)
+            if lasts <= 0 or not (forward or across):
+                return STOP
+            left, right = forward + TURN * across, forward - TURN * across
+        # Neither wheel turns faster than was asked for.
+        most = max(1.0, abs(left), abs(right))
+        return Wheels(self.speed * left / most, self.speed * right / most, lasts)
 
 
 class Teleop:
@@ -238,9 +237,7 @@ class Teleop:
             await self._steer(robot)
             while True:
                 await robot.camera(True)
-                with suppress(TimeoutError):
-                    async with asyncio.timeout(PERIOD):
-                        await self._wake.wait()
+                await done_within(PERIOD, self._wake.wait())
                 await self._steer(robot)
 
     async def _steer(self, robot: HeldRobot) -> None:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from msgspec.structs import replace
@@ -37,26 +38,18 @@ MAX_PATH: Final = 200
 MAX_WORD: Final = 64
 
 
+@dataclass(frozen=True, slots=True)
 class BehaviorContext:
     """What a tree of behaviors runs on."""
 
-    def __init__(
-        self,
-        client: Client,
-        safe_point: Callable[[], Awaitable[None]],
-        publish: Callable[[BehaviorSaid], None],
-        *,
-        speed: float = 1.0,
-        name: str = "",
-    ) -> None:
-        self.client = client
-        self.safe_point = safe_point
-        """Await it wherever the state of the whole tree is sound: the tree may be moved to another host."""
-        self.publish = publish
-        self.name = name
-        """Of the component that the tree runs as, if it is one."""
-        self.speed = speed
-        """How many seconds of the robots' world pass in one of ours: 1, but for a simulated one."""
+    client: Client
+    safe_point: Callable[[], Awaitable[None]]
+    """Await it wherever the state of the whole tree is sound: the tree may be moved to another host."""
+    publish: Callable[[BehaviorSaid], None]
+    speed: float = 1.0
+    """How many seconds of the robots' world pass in one of ours: 1, but for a simulated one."""
+    name: str = ""
+    """Of the component that the tree runs as, if it is one."""
 
 
 class Behavior:

@@ -100,7 +100,6 @@ class Client(MovableClient):
         finally:
             for declared in reversed(self._declared):
                 declared.close()
-            self._rcm.stop()
             await self.mesh.close()
 
     def _failed(self, error: Exception) -> None:
@@ -234,7 +233,7 @@ class Client(MovableClient):
 
     def watch(self, watcher: Callable[[OpenArc], None]) -> None:
         """Calls `watcher(arc)` whenever there is news of any of this client's requests."""
-        self._store.watch(watcher)
+        self._store.watchers.append(watcher)
 
     # Operators' questions
 

@@ -52,17 +52,14 @@ class RcmLink:
         self._stall = StallWatch(mesh.now)
 
     def start(self) -> list[Declaration]:
-        self._stall.start()
         keys, mesh = self.mesh.keys, self.mesh
         self._published = mesh.poll_latest(keys.grants, _TermOnly)
         return [
             mesh.serve(keys.requests(mesh.me), RcAsk, self._on_requests),
             self._published,
             mesh.watch(keys.alive_any(Role.RCM), self._on_leader),
+            Declaration(self._stall.start().stop),
         ]
-
-    def stop(self) -> None:
-        self._stall.stop()
 
     # Who leads
 

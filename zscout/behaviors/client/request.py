@@ -237,7 +237,8 @@ class RequestStore:
         """Not set while the client is paused."""
         self.resumed.set()
         self._news: dict[str, asyncio.Event] = {}
-        self._watchers: list[Callable[[OpenArc], None]] = []
+        self.watchers: list[Callable[[OpenArc], None]] = []
+        """Each is called with whatever there is news of."""
 
     @property
     def open(self) -> list[OpenArc]:
@@ -262,15 +263,12 @@ class RequestStore:
         self.expected.pop(arc.id, None)
         self._news.pop(arc.id, None)
 
-    def watch(self, watcher: Callable[[OpenArc], None]) -> None:
-        self._watchers.append(watcher)
-
     def notify(self, arc: OpenArc) -> None:
         """Wakes all who wait for news of `arc`."""
         event = self._news.get(arc.id)
         if event is not None:
             event.set()
-        for watcher in self._watchers:
+        for watcher in self.watchers:
             watcher(arc)
 
     async def changed(self, arc: OpenArc) -> None:

@@ -1,22 +1,4 @@
-"""What the author of a component writes, and what a component is given.
-
-    class Survey(Component):
-        def __init__(self, params):            # of the spec; raise ValueError("one line") for bad ones
-            self.done = 0
-
-        async def run(self, context):            # to return is to complete, to raise is to fail
-            async for attempt in holds(context.client, "survey", {"robot/scout33": {}}, min_runtime=60):
-                async with attempt as held:
-                    while True:
-                        await held.command("robot/scout33", {"name": "echo", "value": self.done})
-                        self.done += 1
-                        await context.safe_point()
-
-        def checkpoint(self):                  # both of these: it can be moved to another host
-            return str(self.done).encode()
-
-        def restore(self, state):
-            self.done = int(state)
+"""What the author of a component writes, and what a component is given: docs/components.md shows one.
 
 It is found by its entry point of the group `zscout.components`.
 """
@@ -155,8 +137,6 @@ def load_kind(kind: str, where: str) -> type[Component]:
     for attribute in attributes.partition("[")[0].strip().split("."):
         found = getattr(found, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Component)):
-        raise BadKind(
-            f"kind {kind}: {where} is no subclass of zscout.behaviors.components.component.Component; "
-            f"mend the entry point in the group {GROUP}"
-        )
+        base = "zscout.behaviors.components.component.Component"
+        raise BadKind(f"kind {kind}: {where} is no subclass of {base}; mend the entry point in the group {GROUP}")
     return found

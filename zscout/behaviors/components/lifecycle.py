@@ -5,20 +5,13 @@ from __future__ import annotations
 import asyncio
 import traceback
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from contextlib import closing
 from typing import Final
 
 from zscout import messages
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.components.channel import (
-    PATIENCE,
-    ComponentJob,
-    ComponentReport,
-    EndReport,
-    Order,
-    OrderAnswer,
-    PhaseReport,
-)
+from zscout.behaviors.components import channel
+from zscout.behaviors.components.channel import ComponentJob, EndReport, Order, OrderAnswer, PhaseReport
 from zscout.behaviors.components.component import (
     BadKind,
     Component,
@@ -31,7 +24,7 @@ from zscout.behaviors.components.migration import NotMoved, OutgoingMove, state_
 from zscout.behaviors.components.processes import limit_allocations
 from zscout.keyexpr import BadName, Role, Token, incarnation_of, matcher, new_instance
 from zscout.mesh import Declaration, MeshError
-from zscout.mesh.supervision import Supervisor
+from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import MAX_ERROR, MoveComponent, Problem, RestoreComponent
 
 STAND_BY: Final = 30.0
@@ -49,7 +42,7 @@ SUPERSEDED: Final = 0.5
 class ComponentLifecycle:
     """Runs the component of `job`. `report` sends one to the node, waited for or not."""
 
-    def __init__(self, job: ComponentJob, report: Callable[[ComponentReport], asyncio.Future[None]]) -> None:
+    def __init__(self, job: ComponentJob, report: Callable[[channel.ComponentReport], asyncio.Future[None]]) -> None:
         self._job, self._report = job, report
         self._story: asyncio.Task[EndReport] | None = None
         self._wanted: EndReport | None = None
@@ -90,7 +83,9 @@ class ComponentLifecycle:
             if self._wanted is None or not isinstance(error, asyncio.CancelledError):
                 traceback.print_exception(error)
             ends = self._wanted or EndReport("failed", _words(error))
-        await self._close(ends)
+        await self._supervisor.close()
+        if self._client is not None:
+            await done_within(SUPERSEDED if ends.how == "superseded" else CLOSE, self._client.close())
         return ends
 
     def order(self, order: Order) -> None:
@@ -134,8 +129,7 @@ class ComponentLifecycle:
         except (BadKind, MeshError) as error:
             return EndReport("failed", str(error))
         movable = is_movable(made)
-        watch = client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)
-        try:
+        with closing(client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)):
             if job.start.standby:
                 await _finds(client, Role.RCM, [lambda _: True], LINKED)
                 await self._report(PhaseReport("standby", movable))
@@ -144,8 +138,6 @@ class ComponentLifecycle:
                 if not await _first(STAND_BY, *called, self._restored) or not await _first(STAND_BY, *called):
                     return EndReport("stopped", f"it stood by for {STAND_BY:g} s and nothing was handed to it")
             return await self._perform(client, made, movable)
-        finally:
-            watch.close()
 
     def _load(self) -> type[Component]:
         try:
@@ -190,14 +182,6 @@ class ComponentLifecycle:
             token.close()
         return self._wanted or EndReport("completed")
 
-    async def _close(self, ends: EndReport) -> None:
-        await self._supervisor.close()
-        if self._client is None:
-            return
-        with suppress(TimeoutError):
-            async with asyncio.timeout(SUPERSEDED if ends.how == "superseded" else CLOSE):
-                await self._client.close()
-
     # Orders that are answered
 
     async def _or_decline(self, number: int, carried_out: Awaitable[None]) -> None:
@@ -219,8 +203,8 @@ class ComponentLifecycle:
     async def _take_checkpoint(self, number: int) -> None:
         component, _ = self._movable()
         async with self._holding:
-            if not await self._gate.hold(PATIENCE):
-                raise NotMoved("not_safe", f"it came to no safe point within {PATIENCE:g} s")
+            if not await self._gate.hold(channel.PATIENCE):
+                raise NotMoved("not_safe", f"it came to no safe point within {channel.PATIENCE:g} s")
             try:
                 state = state_of(component)
             finally:
@@ -275,13 +259,10 @@ class ComponentLifecycle:
         if self._move is not None and incarnation == self._move.incarnation:
             self._move.successor_runs.set()
         elif incarnation > self._job.start.incarnation:
-            self._superseded(incarnation, token.host)
-
-    def _superseded(self, incarnation: int, host: str) -> None:
-        ends = EndReport("superseded", f"incarnation {incarnation} runs on {host}")
-        self._away = self._away or ends
-        self.end(ends)
-        asyncio.get_running_loop().call_later(SUPERSEDED, self._left.set)
+            ends = EndReport("superseded", f"incarnation {incarnation} runs on {token.host}")
+            self._away = self._away or ends
+            self.end(ends)
+            asyncio.get_running_loop().call_later(SUPERSEDED, self._left.set)
 
 
 async def _finds(client: Client, role: str, names: list[Callable[[str], bool]], timeout: float) -> bool:
@@ -293,11 +274,8 @@ async def _finds(client: Client, role: str, names: list[Callable[[str], bool]], 
         if not missing:
             found.set()
 
-    watch = client.mesh.watch(client.mesh.keys.alive_any(role), on_token)
-    try:
-        return not missing or await _first(timeout, found)
-    finally:
-        watch.close()
+    with closing(client.mesh.watch(client.mesh.keys.alive_any(role), on_token)):
+        return not missing or await done_within(timeout, found.wait())
 
 
 async def _first(timeout: float, *events: asyncio.Event) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import closing
 from typing import Annotated, Any, Final
 
 from msgspec import Meta, Struct, structs
@@ -54,9 +55,6 @@ class SharedParams(Struct, kw_only=True):
                 raise (PARAMS / kind).bad(f"{quoted(need)} is no {kind}", remedy)
         return RobotNeeds(robot, self.radio, self.video, self.framegrabber, self.command_rate)
 
-    def slots(self) -> Slots:
-        return Slots(self.hide_priority, self.watch_priority, self.hide_slot, self.watch_slot)
-
 
 class RobotParams(SharedParams):
     """Parameters of `place_robot`. `above`: the path of the behavior that it belongs to."""
@@ -101,20 +99,17 @@ class TreeComponent(Component):
     speed: float
 
     async def run(self, context: ComponentContext) -> None:
-        publisher = StatusPublisher(context.client)
-        printer = StatusPrinter()
+        printer, client = StatusPrinter(), context.client
 
         def publish(status: BehaviorSaid) -> None:
             publisher(status)
             printer(status)
 
-        tree = BehaviorContext(context.client, context.safe_point, publish, speed=self.speed, name=context.component)
-        try:
+        tree = BehaviorContext(client, context.safe_point, publish, speed=self.speed, name=context.component)
+        with closing(StatusPublisher(client)) as publisher:
             async with supervised(context.component) as supervisor:
                 supervisor.spawn(publisher.keep_publishing())
                 await self.root.perform(tree)
-        finally:
-            publisher.close()
 
     def checkpoint(self) -> bytes:
         return json.dumps(self.root.checkpoint()).encode()
@@ -132,11 +127,9 @@ class StatusPrinter:
     def __call__(self, status: BehaviorSaid) -> None:
         # "dark place 1.3 m ahead" is no news after "dark place 1.4 m ahead".
         detail = re.sub(r"[0-9.]+", "", status.detail) if status.robot else status.detail
-        news = status.doing, detail
-        if news == self._last.get(status.path, ("", "")) and not status.alert:
-            return
+        news, before = (status.doing, detail), self._last.get(status.path, ("", ""))
         self._last[status.path] = news
-        if status.doing:
+        if status.doing and (status.alert or news != before):
             words = "ALERT" if status.alert else status.doing
             print(f"{status.path} {words}" + (f": {status.detail}" if status.detail else ""))  # noqa: T201
 
@@ -147,7 +140,8 @@ class PlaceRobotComponent(TreeComponent):
     def __init__(self, params: dict[str, Any]) -> None:
         wanted = read_params(params, RobotParams)
         self.speed = wanted.speed
-        self.root = PlaceRobot(wanted.robot.partition("/")[2], wanted.needs(wanted.robot), wanted.slots())
+        slots = Slots(wanted.hide_priority, wanted.watch_priority, wanted.hide_slot, wanted.watch_slot)
+        self.root = PlaceRobot(wanted.robot.partition("/")[2], wanted.needs(wanted.robot), slots)
         self.root.above = wanted.above
 
 
@@ -163,6 +157,5 @@ class PlaceSensorNetComponent(TreeComponent):
         self.root = PlaceSensorNet(net.name, robots, self._spec_for)
 
     def _spec_for(self, robot: str, path: str) -> ComponentSpec:
-        return ComponentSpec(
-            kind="place_robot", params={**self._shared, "robot": robot, "above": path}, restart="always"
-        )
+        params = {**self._shared, "robot": robot, "above": path}
+        return ComponentSpec(kind="place_robot", params=params, restart="always")

@@ -111,8 +111,8 @@ class RobotTask(Behavior):
         place, scout = self.place, self.place.scout
         priority, slot = place.slots.of(self.task)
         state = await context.client.state()
-        rcs = [rc.rc for rc in state.rcs if rc.present] if state is not None else []
-        channels = (rc for rc in rcs if rc.startswith("video/"))
+        rcs = state.rcs if state is not None else []
+        channels = [rc.rc for rc in rcs if rc.present and rc.rc.startswith("video/")]
         video = scout.blindness.choose(place.now(context), channels)
         self.report("wait", "for its turn", robot=place.needs.robot)
         async for attempt in holds(
