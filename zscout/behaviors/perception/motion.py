@@ -270,19 +270,18 @@ class EventTracker:
             if seen.boxes and self.current is None and not recent:
                 self._first = time, seen.boxes
             return ended
-        if self.current is None:
+        event = self.current
+        if event is None:
             # What is certain only now began with the sighting that it confirms.
             start, boxes = self._first if self._first is not None and recent else (time, ())
-            frames = 1 if boxes else 0
-            self.current = Event(start, time, time, seen.boxes, around((*boxes, *seen.boxes)), frames)
+            event = Event(start, time, time, seen.boxes, around((*boxes, *seen.boxes)), 1 if boxes else 0)
             self._most, self._first = -1, None
-        area = sum(box.width * box.height for box in seen.boxes)
-        if area > self._most:
-            self._most = area
-            self.current = self.current._replace(peak=time, boxes=seen.boxes)
-        self.current = self.current._replace(
-            end=time, area=around((self.current.area, *seen.boxes)), frames=self.current.frames + 1
-        )
+        covered = sum(box.width * box.height for box in seen.boxes)
+        if covered > self._most:
+            self._most = covered
+            event = event._replace(peak=time, boxes=seen.boxes)
+        area = around((event.area, *seen.boxes))
+        self.current = event._replace(end=time, area=area, frames=event.frames + 1)
         return ended
 
     def quiet(self, time: float) -> Event | None:

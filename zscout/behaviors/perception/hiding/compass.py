@@ -80,14 +80,12 @@ def floor_strip(picture: Picture) -> Strip:
 
 def _by_angle(rows: NDArray[np.uint8]) -> NDArray[np.float32]:
     bands = cv2.resize(rows, (COLUMNS, BANDS), interpolation=cv2.INTER_AREA).astype(np.float32)
-    result: NDArray[np.float32] = bands[:, _LEFT] * (1 - _SHARE) + bands[:, _LEFT + 1] * _SHARE
-    return result
+    return np.asarray(bands[:, _LEFT] * (1 - _SHARE) + bands[:, _LEFT + 1] * _SHARE, np.float32)
 
 
 def _off_the_mean(levels: NDArray[Any], around: tuple[int, int]) -> Strip:
     off = levels - cv2.blur(levels, around, borderType=cv2.BORDER_REFLECT)
-    result: Strip = np.rint(np.clip(off * SCALE, -127, 127)).astype(np.int8)
-    return result
+    return np.asarray(np.rint(np.clip(off * SCALE, -127, 127)), np.int8)
 
 
 def turned(old: Strip, new: Strip, expected: float = 0.0, spread: float = math.radians(40)) -> Turn:
@@ -111,7 +109,5 @@ def turned(old: Strip, new: Strip, expected: float = 0.0, spread: float = math.r
 def _ends(strip: NDArray[np.float32], shifts: NDArray[np.intp]) -> NDArray[np.float64]:
     """Energy of the part of a strip that a shift leaves in the picture: from `shift` on, or up to its end."""
     running = np.concatenate(([0.0], np.cumsum((strip**2).sum(axis=0), dtype=np.float64)))
-    result: NDArray[np.float64] = np.where(
-        shifts >= 0, running[-1] - running[np.maximum(shifts, 0)], running[COLUMNS + np.minimum(shifts, 0)]
-    )
-    return result
+    from_shift, to_end = running[-1] - running[np.maximum(shifts, 0)], running[COLUMNS + np.minimum(shifts, 0)]
+    return np.asarray(np.where(shifts >= 0, from_shift, to_end), np.float64)

@@ -45,9 +45,9 @@ PHASES: Final[dict[Phase, PhaseCode]] = {
     "enter": PhaseCode(phases.enter, phases.begin_enter, True, phases.enter_stuck),
     "face": PhaseCode(phases.face, phases.begin_face),
     "settle": PhaseCode(phases.settle),
-    "back": PhaseCode(phases.back, phases.begin_back),
+    "back": PhaseCode(phases.back),
     "dodge": PhaseCode(phases.dodge),
-    "leave": PhaseCode(phases.leave, phases.begin_leave, True),
+    "leave": PhaseCode(phases.leave, cruises=True),
     "hidden": PhaseCode(phases.hidden),
     "check": PhaseCode(phases.check, phases.begin_check),
 }
@@ -94,9 +94,8 @@ class Hider:
             return self._blind(how)
         robot.interval += 0.2 * (min(1.0, robot.clock - robot.last_good) - robot.interval)
         robot.last_good, robot.spoiled_since = robot.clock, None
-        act = self._decide(passed, picture)
         robot.print = crc
-        return act
+        return self._decide(passed, picture)
 
     def _decide(self, passed: float, picture: Picture) -> WheelCommand:
         robot, phase = self._robot, PHASES[self._robot.phase]

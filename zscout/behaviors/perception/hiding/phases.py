@@ -92,13 +92,14 @@ def scan(robot: HidingState, view: View) -> Step:
     if abs(robot.turned) < FULL_TURN and robot.hops < MOST_HOPS:
         degrees, seen = math.degrees(abs(robot.turned)), len(robot.sightings)
         return robot.hop(HOP, f"looks around, {degrees:.0f} degrees, {seen} dark seen")
-    if sheltered(robot.openings):
+    share, roof = shelter(robot.openings)
+    if roof and share <= DARKISH:
+        # It is beneath something already, if maybe not deep enough in.
         robot.faces = 1
         return to_light(robot)
-    target = best(robot)
+    target = robot.target = best(robot)
     if target is None:
         return "roam"
-    robot.target = target
     robot.goal, robot.next_phase = target.heading, "approach"
     left = math.degrees(wrapped(target.heading - robot.heading))
     side = "left" if left > 0 else "right"
@@ -120,14 +121,14 @@ def worth(sighting: Sighting, memory: HidingState) -> float:
 
 def best(memory: HidingState) -> Sighting | None:
     """The most promising sighting of the scan; one seen in several pictures counts more."""
-    chosen, most = None, 0.04 / (1 + memory.scans)
-    for sighting in memory.sightings:
+
+    def value(sighting: Sighting) -> float:
         near = 0.3 + 0.15 * sighting.distance
         again = sum(distance(other, sighting) < near for other in memory.sightings)
-        value = worth(sighting, memory) * (1.3 if again > 1 else 1.0)
-        if value > most:
-            chosen, most = sighting, value
-    return chosen
+        return worth(sighting, memory) * (1.3 if again > 1 else 1.0)
+
+    chosen = max(memory.sightings, key=value, default=None)
+    return chosen if chosen is not None and value(chosen) > 0.04 / (1 + memory.scans) else None
 
 
 def aim(robot: HidingState, _: View) -> Step:
@@ -189,13 +190,10 @@ def stuck(robot: HidingState, _: View) -> Step:
     return "back"
 
 
-def begin_back(robot: HidingState) -> None:
-    robot.bumps += 1
-
-
 def back(robot: HidingState, _: View) -> Step:
     """Backs off from what it pushed against, then turns aside."""
     if robot.hops == 0:
+        robot.bumps += 1
         return robot.step_straight(-0.14, f"{robot.note or 'bumped'}: backs off")
     if robot.target is None and robot.blocked and len(robot.blocked) <= MOST_BLOCKED:
         robot.next_phase = "scan"
@@ -231,13 +229,9 @@ def side_of(robot: HidingState, view: View) -> int:
     return 1 if robot.bumps % 2 else -1
 
 
-def begin_leave(robot: HidingState) -> None:
-    robot.left_to_go = 0.6
-
-
 def leave(robot: HidingState, _: View) -> Step:
     """Out of a place that is no hiding place, towards the light."""
-    if robot.cruised(robot.left_to_go):
+    if robot.cruised(0.6):
         return "scan"
     return robot.cruise(robot.pace, 0.0, f"{robot.note}: leaves")
 
@@ -350,12 +344,6 @@ def shelter(openings: list[Opening]) -> tuple[float, bool]:
     lit = max(one.outside for one in openings)
     near, above = np.percentile([(one.near, one.above) for one in openings], 75, axis=0).tolist()
     return near / max(lit, 1e-4), above <= ROOFED * lit
-
-
-def sheltered(openings: list[Opening]) -> bool:
-    """Whether this is beneath something, if maybe not deep enough in."""
-    share, roof = shelter(openings)
-    return share <= DARKISH and roof
 
 
 def lightest(openings: list[Opening]) -> Opening:

@@ -60,20 +60,16 @@ BRIGHTER: Final = 4.0
 Phase = Literal[
     "scan", "aim", "roam", "approach", "enter", "face", "settle", "back", "dodge", "leave", "hidden", "check"
 ]
-WORDS: Final[dict[Phase, str]] = {
-    "scan": "search",
-    "aim": "search",
-    "roam": "search",
-    "approach": "approach",
-    "enter": "enter",
-    "face": "turn",
-    "settle": "turn",
-    "back": "unstick",
-    "dodge": "unstick",
-    "leave": "unstick",
-    "hidden": "hidden",
-    "check": "hidden",
+PHASES_OF: Final[dict[str, tuple[Phase, ...]]] = {
+    "search": ("scan", "aim", "roam"),
+    "approach": ("approach",),
+    "enter": ("enter",),
+    "turn": ("face", "settle"),
+    "unstick": ("back", "dodge", "leave"),
+    "hidden": ("hidden", "check"),
 }
+"""By the words that people see."""
+WORDS: Final = {phase: word for word, phases in PHASES_OF.items() for phase in phases}
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,8 +303,7 @@ class HidingState(msgspec.Struct):
         turn = turned(unpack(self.anchor), strip, self.expected)
         still = moved <= 1.6 * self.noise + 0.4
         # A turn that has come as far as it was to go needs no second look.
-        done = over >= LAGS and self.expected and turn.likeness >= 0.5
-        done = done and abs(turn.angle / self.expected - 1) < 0.2
+        done = over >= LAGS and self.expected and turn.likeness >= 0.5 and abs(turn.angle / self.expected - 1) < 0.2
         if not still and not done and over < SETTLED:
             return False
         if moved <= 3 * self.noise + 0.5:
