@@ -1,6 +1,6 @@
 """A mesh in memory: many processes' places on one event loop, on a network that fails to order.
 
-What it does like Zenoh is what `tests/mesh/test_mesh.py` tests on both. Links behave like TCP with a lease:
+What it does like Zenoh is what `tests/mesh/both_meshes.py` lets tests try on both. Links behave like TCP with a lease:
 what is sent arrives in order; over a link that is cut, or to or from a frozen process, it waits; after
 `lease` seconds of that both sides give the link up, and see each other's tokens die, until it works again."""
 
