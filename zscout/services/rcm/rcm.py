@@ -295,7 +295,6 @@ def _of(arc: ArcStatus) -> dict[str, Any]:
 
 
 def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Holder]:
-    """All holders of an RC."""
     return [
         messages.Holder(
             **_of(arc),

@@ -120,7 +120,6 @@ class FloorPlan:
         self._others: set[Sender] = set()
 
     def poses(self, at: float, sender: Sender, poses: BuildingPoses) -> None:
-        """Who is where in a building."""
         building = self._building
         if building is not None and building.sender != sender and at - building.seen_at <= SILENCE:
             if sender not in self._others and len(self._others) < MAX_OTHERS:
@@ -157,7 +156,6 @@ class FloorPlan:
         return building.sender
 
     def plan(self, at: float, sender: Sender, plan: BuildingPlan) -> None:
-        """A building's plan."""
         building = self._building
         if building is None or building.sender != sender or building.planned:
             return

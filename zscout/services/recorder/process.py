@@ -57,7 +57,6 @@ class Recording(msgspec.Struct, frozen=True):
 
 
 def encode_job(job: RecorderJob) -> bytes:
-    """The job as a recorder reads it."""
     return msgspec.json.encode(job, enc_hook=str) + b"\n"
 
 

@@ -167,7 +167,6 @@ class RobotTracker:
     # Behaviors
 
     def behavior(self, at: float, sender: Sender, report: BehaviorSaid) -> None:
-        """What a behavior reports, as it comes."""
         if self._limiter.offer(at, sender, report):
             self._take(at, sender, report)
 
@@ -222,7 +221,6 @@ class RobotTracker:
     # Cameras
 
     def frame(self, at: float, camera: str, head: FrameHead, jpeg: bytes) -> None:
-        """A picture of the framegrabber `camera`."""
         seen = self._cameras.get(camera)
         if seen is None:
             if len(self._cameras) >= MAX_FOLLOWED:

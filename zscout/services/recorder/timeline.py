@@ -160,7 +160,6 @@ class Timeline(Drawing):
         )
 
     def _colour(self, at: float, arc: str) -> int:
-        """The ARC's colour."""
         others = "ARC names: the others have no lane and no colour of their own"
         if arc not in self._arcs and not self.room(at, self._arcs, MAX_ARCS, others):
             return OTHER
