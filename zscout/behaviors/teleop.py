@@ -157,8 +157,6 @@ class Teleop:
         self._wake = asyncio.Event()
         self._asked_at: Ns = 0
         self._name = f"operator-{needs.robot.partition('/')[2]}"
-        self._arc: OpenArc | None = None
-        """Of the last hold."""
 
     def take(self) -> None:
         """The robot is wanted from now on."""
@@ -207,7 +205,7 @@ class Teleop:
 
     def _successor(self) -> str:
         """The ARC that has the robot now, by the last notice of our ARC."""
-        ending = self._arc.ending if self._arc is not None else None
+        ending = self.held.arc.ending if self.held is not None else None
         return ending.by or ending.reason if ending is not None else ""
 
     def _on_notice(self, arc: OpenArc) -> None:
@@ -227,11 +225,9 @@ class Teleop:
             raise results[0]
 
     async def _drive(self) -> None:
-        async with hold(
-            self.client, self._name, self.needs.needs(), priority=self.priority, min_runtime=1.0, keep=True
-        ) as held:
+        async with hold(self.client, self._name, self.needs.needs(), priority=self.priority, keep=True) as held:
             robot = self.robot = HeldRobot(held, self.needs)
-            self.held, self._arc = held, held.arc
+            self.held = held
             self._set_state("driving", "")
             # The wheels go first: whoever takes over in a hurry does not wait for the camera.
             await self._steer(robot)

@@ -141,16 +141,8 @@ class Client(MovableClient):
         wanted = amounts(needs)
         if (expected := await self._claim(check_name(name, "arc"), wanted)) is not None:
             return expected
-        arc = OpenArc(
-            id=new_instance(),
-            name=name,
-            needs=wanted,
-            priority=priority,
-            min_runtime=Decimal(str(min_runtime)),
-            keep=keep,
-            estimate=estimate,
-            since=self.mesh.now(),
-        )
+        seconds, now = Decimal(str(min_runtime)), self.mesh.now()
+        arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, since=now)
         self._store.add(arc)
         try:
             await self._rcm.submit(arc)

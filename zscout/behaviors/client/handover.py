@@ -191,13 +191,12 @@ class MovableClient:
             operation = HandOver(id=first.id, to=str(to), others=[arc.id for arc in others])
             self._rcm.leader_came.clear()
             reply = await self._rcm.query(operation)
-            notice = reply.message if reply is not None else None
+            notice, problem = (reply.message, reply.problem) if reply is not None else (None, None)
             if notice is not None and self._rcm.accept(notice.term):
                 # An RCM that came in between answers for the first alone: it may not know of the others.
                 for arc in arcs if notice.term == term else [first]:
                     self._store.move(arc, notice)
                 continue
-            problem = reply.problem if reply is not None else None
             if problem is not None and problem.code == "not_running":
                 # It is over, or an RCM that has just taken the lead does not know it: this settles which.
                 await self._rcm.ask(first)

@@ -67,11 +67,9 @@ class PlacerClient:
     async def request(self, operation: PlacerOperation, kind: type[R]) -> R:
         """Repeats the operation, which must be idempotent, until a placer answers. Raises RequestRefused,
         PlacerSilent."""
-        return await self._until(
-            lambda: self._ask(operation, kind),
-            f"the component placer of fleet {self.mesh.keys.fleet} did not answer for "
-            f"{self._timeout:.0f} s; see zscout status, and the log of zscout-node where it leads",
-        )
+        silent = f"the component placer of fleet {self.mesh.keys.fleet} did not answer for {self._timeout:.0f} s"
+        remedy = "see zscout status, and the log of zscout-node where it leads"
+        return await self._until(lambda: self._ask(operation, kind), f"{silent}; {remedy}")
 
     async def request_once(self, operation: PlacementOperation, done: Callable[[Placement], bool]) -> Placement:
         """Does not repeat the operation where `done(placement)` says that it was done though its answer is
@@ -127,12 +125,9 @@ class PlacerClient:
 
     async def _ask(self, operation: PlacerOperation, kind: type[R]) -> R | None:
         """One query; None: no answer, or the placer can't answer now. Raises RequestRefused."""
+        timeout = TIMEOUT + (operation.wait if isinstance(operation, PlacementOperation) else 0.0)
         replies = await self.mesh.ask(
-            self.mesh.keys.placer,
-            operation,
-            kind,
-            timeout=TIMEOUT + (operation.wait if isinstance(operation, PlacementOperation) else 0.0),
-            enough=lambda reply: reply.message is not None,
+            self.mesh.keys.placer, operation, kind, timeout=timeout, enough=lambda reply: reply.message is not None
         )
         for reply in replies:
             if reply.message is not None:

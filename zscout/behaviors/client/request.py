@@ -87,19 +87,11 @@ class OpenArc:
         """What another client will hand over. Raises BadName."""
         for need in request.needs:
             check_need(need)
-        return cls(
-            id=check_name(request.id, "id"),
-            name=check_name(request.arc, "arc"),
-            needs=request.needs,
-            priority=request.priority,
-            min_runtime=request.min_runtime,
-            keep=request.keep,
-            state="expected",
-            reason="another client is to hand it over",
-            place=request.place,
-            since=now,
-            waits_since=now - round(request.waited * SECOND),
-        )
+        id_, name = check_name(request.id, "id"), check_name(request.arc, "arc")
+        arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, place=request.place)
+        arc.state, arc.reason = "expected", "another client is to hand it over"
+        arc.since, arc.waits_since = now, now - round(request.waited * SECOND)
+        return arc
 
     @property
     def open(self) -> bool:

@@ -12,6 +12,7 @@ import select
 import signal
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -31,7 +32,8 @@ def kill_family(tag: str, *, spare: int = 0) -> int:
     killed: dict[int, int] = {}
     try:
         for _ in range(ROUNDS):
-            found = {pid: _kill(pid, wanted) for pid in _processes() if pid != spare and pid not in killed}
+            pids = [int(name) for name in os.listdir("/proc") if name.isascii() and name.isdigit()]  # noqa: PTH208
+            found = {pid: _kill(pid, wanted) for pid in pids if pid != spare and pid not in killed}
             new = {pid: handle for pid, handle in found.items() if handle is not None}
             if not new:
                 break
@@ -43,10 +45,6 @@ def kill_family(tag: str, *, spare: int = 0) -> int:
     return len(killed)
 
 
-def _processes() -> list[int]:
-    return [int(name) for name in os.listdir("/proc") if name.isascii() and name.isdigit()]  # noqa: PTH208
-
-
 def _kill(pid: int, wanted: bytes) -> int | None:
     """Kills `pid` if it is one of the family; returns a descriptor of it then."""
     try:
@@ -54,13 +52,10 @@ def _kill(pid: int, wanted: bytes) -> int | None:
         handle = os.pidfd_open(pid)
     except OSError:
         return None
-    try:
-        with Path(f"/proc/{pid}/environ").open("rb") as file:
-            if wanted in file.read(MAX_ENVIRONMENT).split(b"\0"):
-                signal.pidfd_send_signal(handle, signal.SIGKILL)
-                return handle
-    except OSError:
-        pass
+    with suppress(OSError), Path(f"/proc/{pid}/environ").open("rb") as file:
+        if wanted in file.read(MAX_ENVIRONMENT).split(b"\0"):
+            signal.pidfd_send_signal(handle, signal.SIGKILL)
+            return handle
     os.close(handle)
     return None
 
@@ -84,18 +79,10 @@ def limit_allocations(limit: int) -> None:
     if limit <= 0:
         return
     # Stacks and arenas that are reserved and not used count as data: only what is added from here on matters.
-    reserved, used = _status("VmData"), _status("VmRSS")
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    reserved, used = (int(status[size].split()[0]) * 1024 for size in ("VmData", "VmRSS"))
     ceiling = reserved + max(0, limit - used)
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard != resource.RLIM_INFINITY:
         ceiling = min(ceiling, hard)
     resource.setrlimit(resource.RLIMIT_DATA, (ceiling, ceiling))
-
-
-def _status(name: str) -> int:
-    """A size in /proc/self/status, in bytes."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        key, _, value = line.partition(":")
-        if key == name:
-            return int(value.split()[0]) * 1024
-    return 0

@@ -53,15 +53,10 @@ class Counter(Component):
     async def run(self, context: ComponentContext) -> None:
         while self.rc is None:
             await self._step(context)
+        terms: dict[str, Any] = {"priority": int(self.params.priority), "min_runtime": self.params.min_runtime}
         while True:
             try:
-                async for attempt in holds(
-                    context.client,
-                    context.component,
-                    {self.rc: {}},
-                    priority=int(self.params.priority),
-                    min_runtime=self.params.min_runtime,
-                ):
+                async for attempt in holds(context.client, context.component, {self.rc: {}}, **terms):
                     async with attempt as held:
                         while True:
                             await self._step(context, held)

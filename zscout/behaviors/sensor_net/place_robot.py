@@ -115,14 +115,9 @@ class RobotTask(Behavior):
         channels = [rc.rc for rc in rcs if rc.present and rc.rc.startswith("video/")]
         video = scout.blindness.choose(place.now(context), channels)
         self.report("wait", "for its turn", robot=place.needs.robot)
-        async for attempt in holds(
-            context.client,
-            f"{place.name}-{self.task}",
-            place.needs.needs(video=video),
-            priority=priority,
-            min_runtime=round(slot / context.speed, 3),
-            keep=True,
-        ):
+        name, needs = f"{place.name}-{self.task}", place.needs.needs(video=video)
+        seconds = round(slot / context.speed, 3)
+        async for attempt in holds(context.client, name, needs, priority=priority, min_runtime=seconds, keep=True):
             async with attempt as held:
                 channel = held.rc(video or place.needs.video)
                 # It may be about to be moved: nothing changes before that is over.
@@ -164,14 +159,7 @@ class RobotTask(Behavior):
         if step.blind:
             raise CameraBlind(f"no picture on {robot.video} for {NO_PICTURE_TIMEOUT:g} s")
         await robot.drive(step.left, step.right, step.lasts)
-        self.report(
-            step.doing,
-            step.detail,
-            robot=robot.robot,
-            camera=robot.framegrabber if step.boxes or step.quiet else "",
-            alert=step.alert,
-            boxes=[
-                (round(x * across), round(y * down), round(w * across), round(h * down)) for x, y, w, h in step.boxes
-            ],
-        )
+        camera = robot.framegrabber if step.boxes or step.quiet else ""
+        boxes = [(round(x * across), round(y * down), round(w * across), round(h * down)) for x, y, w, h in step.boxes]
+        self.report(step.doing, step.detail, robot=robot.robot, camera=camera, alert=step.alert, boxes=boxes)
         return not step.over

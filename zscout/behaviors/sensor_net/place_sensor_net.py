@@ -64,7 +64,8 @@ class PlaceSensorNet(Behavior):
         finally:
             for one in declared:
                 one.close()
-            await self._end_all()
+            active = [name for name, robot in self._components.items() if self.net.members[robot].standing == "active"]
+            await done_within(STOPPING, asyncio.gather(*(self._stop(name) for name in active)))
 
     def _report_progress(self) -> None:
         net = self.net
@@ -114,11 +115,6 @@ class PlaceSensorNet(Behavior):
             self._placed.discard(component)
             with suppress(RequestRefused):
                 await PlacerClient(self._mesh).stop(component)
-
-    async def _end_all(self) -> None:
-        members = self.net.members
-        active = [name for name, robot in self._components.items() if members[robot].standing == "active"]
-        await done_within(STOPPING, asyncio.gather(*(self._stop(name) for name in active)))
 
     def _now(self) -> float:
         return self._clock.read(self._mesh.now())

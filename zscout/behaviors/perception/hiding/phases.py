@@ -11,20 +11,13 @@ import msgspec
 import numpy as np
 
 from zscout.behaviors.perception.darkness import DarkPlace, View
-from zscout.behaviors.perception.hiding.state import (
-    FULL_TURN,
-    HOP,
-    MAX_SIGHTINGS,
-    HidingState,
-    Opening,
-    Sighting,
-    Spot,
-    Step,
-    distance,
-    wrapped,
-)
+from zscout.behaviors.perception.hiding.state import HidingState, Opening, Sighting, Spot, Step, distance, wrapped
 from zscout.behaviors.perception.lens import COLUMNS
 
+MAX_SIGHTINGS: Final = 120
+HOP: Final = math.radians(36)
+FULL_TURN: Final = math.tau - math.radians(20)
+"""Radians of hops that show all sides."""
 MOST_HOPS: Final = 24
 """Of a scan: turns that the picture does not show do not count for ever."""
 AIMED: Final = math.radians(7)

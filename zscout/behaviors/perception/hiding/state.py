@@ -26,7 +26,6 @@ from zscout.behaviors.perception.lens import COLUMNS, Picture
 
 MAX_CHECKPOINT: Final = 64_000
 """Bytes; a hider's own is below 20,000."""
-MAX_SIGHTINGS: Final = 120
 MAX_BAD: Final = 24
 FORM: Final = 1
 """Of the checkpoint; one of another form is refused."""
@@ -38,10 +37,7 @@ TOP_SPIN: Final = 2 * TOP_SPEED / WHEEL_BASE
 """Radians per second with the wheels at full speed against each other."""
 STRAIGHT: Final = 0.7
 """Share of top speed of a straight step."""
-HOP: Final = math.radians(36)
 LONGEST_HOP: Final = math.radians(44)
-FULL_TURN: Final = math.tau - math.radians(20)
-"""Radians of hops that show all sides."""
 SETTLES: Final = 0.15
 """Seconds after a hop before its picture may count: the motors' lag."""
 LAGS: Final = 0.33
