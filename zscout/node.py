@@ -66,16 +66,10 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
         stack.callback(stall.stop)
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
         stack.callback(token.close)
+        lease = node.fleet.timing.hold_lease / SECOND
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
-            rc = ResourceController(
-                mesh,
-                spec.name,
-                driver_for(spec),
-                hold_lease=node.fleet.timing.hold_lease / SECOND,
-                stall=stall,
-                on_failure=fail,
-            )
+            rc = ResourceController(mesh, spec.name, driver_for(spec), hold_lease=lease, stall=stall, on_failure=fail)
             await rc.start()
             stack.push_async_callback(rc.stop)
             log.info("runs %s (%s)", spec.name, type(spec).__struct_config__.tag)

@@ -127,9 +127,8 @@ def the_fleet() -> Fleet:
 
 @asynccontextmanager
 async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = True) -> AsyncIterator[Client]:
-    """A client named `<role>-<random>` on the mesh of `fleet` (default: `the_fleet()`), closed at the end.
-
-    Raises MeshError, BadInput, and with `need_rcm` NobodyThere where no RCM is seen in time."""
+    """A client named `<role>-<random>` on the mesh of `fleet` (default: `the_fleet()`), closed at the end. Raises
+    MeshError, BadInput, and with `need_rcm` NobodyThere where no RCM is seen in time."""
     from zscout.behaviors.client.client import Client
 
     async with await Client.connect(f"{role}-{new_instance()}", fleet=fleet or the_fleet()) as client:

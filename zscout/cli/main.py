@@ -205,11 +205,8 @@ def main(ctx: click.Context, fleet: Path | None, verbose: bool) -> None:
     """
     import logging
 
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.ERROR,
-        format="%(asctime)s %(levelname)s %(message)s",
-        stream=sys.stderr,
-    )
+    level = logging.INFO if verbose else logging.ERROR
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     ctx.obj = fleet
 
 

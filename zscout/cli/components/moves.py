@@ -10,26 +10,14 @@ from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
-from zscout.cli.components.placing import (
-    OVER,
-    Progress,
-    component_argument,
-    host_argument,
-    host_option,
-    out_of_work,
-    placement_object,
-    placer_of,
-    placing,
-    standing,
-    unknown,
-)
+from zscout.cli.components import placing
 from zscout.cli.requests.options import timeout_option
 from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
 
 
 @click.command()
-@component_argument
-@host_option("--to", "Where to. Default: the best other host.")
+@placing.component_argument
+@placing.host_option("--to", "Where to. Default: the best other host.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def migrate(name: str, to: str | None, as_json: bool) -> None:
@@ -43,24 +31,24 @@ async def migrate(name: str, to: str | None, as_json: bool) -> None:
       zscout migrate counter
       zscout migrate counter --to bellows --json | jq .dead
     """
-    async with placing("migrate", as_json=as_json) as (shown, placer):
+    async with placing.connected("migrate", as_json=as_json) as (shown, placer):
         before = placer.placements.get(name)
         if before is None:
-            raise unknown(name, placer.placements)
+            raise placing.unknown(name, placer.placements)
         interrupted = f"{name} is moved all the same; zscout components tells how that goes"
         async with shown.within(None, str, interrupted):
             after = await _moved(placer, shown, before, to)
     moved = after.moves > before.moves
     if as_json:
         dead = after.dead if moved else None
-        terminal.print_json(placement_object(after) | {"from": before.host, "dead": dead})
+        terminal.print_json(placing.placement_object(after) | {"from": before.host, "dead": dead})
     if after.host == before.host:
         shown.say(f"{name} is on {after.host} already")
     else:
-        shown.say(f"{name} went from {before.host} to {after.host}{out_of_work(after) if moved else ''}")
+        shown.say(f"{name} went from {before.host} to {after.host}{placing.out_of_work(after) if moved else ''}")
 
 
-async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: str | None) -> Placement:
+async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placement, to: str | None) -> Placement:
     """Moves it, and shows how it goes. Raises Failed where it did not come to that."""
     name = before.component
 
@@ -74,8 +62,8 @@ async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: s
     except RequestRefused as refused:
         raise common.Failed(f"{name} was not moved: {refused}") from None
     if begun(record):
-        while record.state not in ("running", *OVER):
-            shown.update(f"{name} {standing(record)}")
+        while record.state not in ("running", *placing.OVER):
+            shown.update(f"{name} {placing.standing(record)}")
             await placer.wait_changed()
             record = placer.placements.get(name, record)
         if record.state == "running":
@@ -84,11 +72,11 @@ async def _moved(placer: PlacerClient, shown: Progress, before: Placement, to: s
             raise common.Failed(f"{name} was not moved, it goes on on {record.host}: {record.reason}")
     elif to == record.host:
         return record
-    raise common.Failed(f"{name} was not moved: it {standing(record)}")
+    raise common.Failed(f"{name} was not moved: it {placing.standing(record)}")
 
 
 @click.command()
-@host_argument
+@placing.host_argument
 @timeout_option("Wait at most so long until it is empty, then exit with 1.")
 @common.json_option("Print one JSON object.")
 @common.runs
@@ -104,7 +92,7 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
       zscout drain anvil --timeout 2m
     """
     cordoned = f"{host} stays cordoned; to use it again: zscout uncordon {host}"
-    async with placing("drain", as_json=as_json) as (shown, placer):
+    async with placing.connected("drain", as_json=as_json) as (shown, placer):
         at_first = {one.component for one in _there(placer, host)}
 
         def late() -> str:
@@ -121,17 +109,17 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
         records = [one for name in sorted(at_first) if (one := placer.placements.get(name)) is not None]
         moved = [one for one in records if one.host not in (host, None) and one.state == "running"]
     if as_json:
-        went, stays = ([placement_object(one) for one in some] for some in (moved, stay))
+        went, stays = ([placing.placement_object(one) for one in some] for some in (moved, stay))
         terminal.print_json({"host": host, "moved": went, "stay": stays})
     for one in moved:
-        shown.say(f"{one.component} went to {one.host}{out_of_work(one)}")
+        shown.say(f"{one.component} went to {one.host}{placing.out_of_work(one)}")
     if stay:
         raise common.Failed(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
     shown.say(f"{host} is empty; {cordoned}")
 
 
 @click.command()
-@host_argument
+@placing.host_argument
 @common.json_option("Print one JSON object.")
 @common.runs
 async def uncordon(host: str, as_json: bool) -> None:
@@ -142,9 +130,9 @@ async def uncordon(host: str, as_json: bool) -> None:
       zscout uncordon anvil
     """
     async with common.connected("uncordon") as client:
-        uncordoned = await placer_of(client).request(UncordonHost(host), Placements)
+        uncordoned = await placing.placer_of(client).request(UncordonHost(host), Placements)
     if as_json:
-        terminal.print_json({"host": host, "components": list(map(placement_object, uncordoned.components))})
+        terminal.print_json({"host": host, "components": list(map(placing.placement_object, uncordoned.components))})
     else:
         terminal.print_line(f"{host} is used again")
 
@@ -152,7 +140,7 @@ async def uncordon(host: str, as_json: bool) -> None:
 def _there(placer: PlacerClient, host: str) -> list[Placement]:
     """What is on a host, or coming to it."""
     found = (one for _, one in sorted(placer.placements.items()))
-    return [one for one in found if host in (one.host, one.to) and one.state not in OVER]
+    return [one for one in found if host in (one.host, one.to) and one.state not in placing.OVER]
 
 
 def _words(some: Sequence[Placement]) -> str:
@@ -160,5 +148,5 @@ def _words(some: Sequence[Placement]) -> str:
     for one in some:
         why = one.reason or ("" if one.movable else "it can't be moved")
         stays = "stays" + (f" ({why})" if why else "")
-        words.append(f"{one.component} {stays if one.state == 'running' else standing(one)}")
+        words.append(f"{one.component} {stays if one.state == 'running' else placing.standing(one)}")
     return ", ".join(words)

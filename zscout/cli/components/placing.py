@@ -34,7 +34,7 @@ def placer_of(client: Client, only: Collection[str] | None = None) -> PlacerClie
 
 
 @asynccontextmanager
-async def placing(
+async def connected(
     command: str, only: Collection[str] | None = None, *, as_json: bool
 ) -> AsyncIterator[tuple[Progress, PlacerClient]]:
     """Progress and placer of one command, which knows how all components stand, or those in `only`. Raises
@@ -46,8 +46,7 @@ async def placing(
 
 
 class Progress(terminal.LiveLine):
-    """How something goes, on stdout: one live line at a terminal, a line for each change in a pipe, nothing
-    where it is `quiet`."""
+    """How it goes, on stdout: a live line at a terminal, a line for each change in a pipe; nothing if `quiet`."""
 
     def __init__(self, *, quiet: bool) -> None:
         super().__init__(shown=not quiet)

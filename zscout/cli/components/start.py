@@ -17,17 +17,7 @@ from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common, completion
-from zscout.cli.components.placing import (
-    COMPONENT,
-    OVER,
-    Progress,
-    host_option,
-    placement_object,
-    placing,
-    standing,
-    tail_of,
-    unknown_here,
-)
+from zscout.cli.components import placing
 from zscout.cli.requests.options import timeout_option
 from zscout.config.strict import BadInput, quoted
 from zscout.messages import (
@@ -110,7 +100,7 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
 @click.option("--name", metavar="NAME", type=common.NAME, help="What the component is called. Default: its kind.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON.")
 @click.option("--params", metavar="JSON", help="All parameters, as a JSON object.")
-@host_option("--host", "Run nowhere but there; given several times, on one of them.", multiple=True)
+@placing.host_option("--host", "Run nowhere but there; given several times, on one of them.", multiple=True)
 @click.option("--label", metavar="LABEL", type=common.NAME, multiple=True, help="What its host must have.")
 @click.option("--memory", type=SIZE, default=0, help="What its host must have available, as in 500M.")
 @click.option("--metric", type=click.Choice(METRICS), default="composite", help="What hosts are judged by.")
@@ -153,11 +143,11 @@ async def start(
         raise BadInput(f"the name {quoted(name)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name")
     spec = gather_spec(kind, **wanted)
     stays = f"{name} stays placed; to end it: zscout stop {name}"
-    async with placing("start", {name}, as_json=as_json) as (shown, placer):
+    async with placing.connected("start", {name}, as_json=as_json) as (shown, placer):
 
         def late() -> str:
             record = placer.placements.get(name)
-            now = f" {standing(record)};" if record is not None else ""
+            now = f" {placing.standing(record)};" if record is not None else ""
             return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
 
         before = placer.placements.get(name)
@@ -166,13 +156,13 @@ async def start(
             async with shown.within(timeout, late, stays):
                 placement = await _until_settled(placer, shown, name, spec)
     if as_json:
-        terminal.print_json(placement_object(placement))
+        terminal.print_json(placing.placement_object(placement))
     if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
-        for line in tail_of(placement):
+        for line in placing.tail_of(placement):
             terminal.print_line(line, sys.stderr)
-        raise common.Failed(f"{name} {standing(placement)}")
+        raise common.Failed(f"{name} {placing.standing(placement)}")
     ran = before is not None and before.state == placement.state == "running"
-    shown.say(f"{name} {'already ' if ran else ''}{standing(placement)}")
+    shown.say(f"{name} {'already ' if ran else ''}{placing.standing(placement)}")
 
 
 def gather_spec(
@@ -209,7 +199,7 @@ async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: P
     known = before.incarnation if before is not None else 0
 
     def done(record: Placement) -> bool:
-        return record.spec == spec and (record.state not in OVER or record.incarnation > known)
+        return record.spec == spec and (record.state not in placing.OVER or record.incarnation > known)
 
     try:
         return await placer.request_once(PlaceComponent(name, spec, wait=0.0), done)
@@ -222,22 +212,22 @@ async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: P
         ) from None
 
 
-async def _until_settled(placer: PlacerClient, shown: Progress, name: str, spec: ComponentSpec) -> Placement:
+async def _until_settled(placer: PlacerClient, shown: placing.Progress, name: str, spec: ComponentSpec) -> Placement:
     """Tells how it goes until it runs, or will not. Raises Failed."""
     while True:
         placement = placer.placements.get(name)
         if placement is None:
             # A new placer that does not know it: placed again it is not placed twice.
             placement = await _place(placer, name, spec, None)
-        if placement.state == "running" or placement.state in OVER:
+        if placement.state == "running" or placement.state in placing.OVER:
             return placement
-        shown.update(f"{name} {standing(placement)}")
+        shown.update(f"{name} {placing.standing(placement)}")
         await placer.wait_changed()
 
 
 @click.command()
 @click.argument(
-    "names", type=COMPONENT, nargs=-1, required=True, metavar="NAME...", shell_complete=completion.components
+    "names", type=placing.COMPONENT, nargs=-1, required=True, metavar="NAME...", shell_complete=completion.components
 )
 @timeout_option("Wait at most so long for the end, then exit with 1.")
 @common.json_option("Print one JSON object.")
@@ -254,11 +244,13 @@ async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> No
     """
     names = sorted(set(names))
     stays = f"{', '.join(names)} will be stopped all the same; zscout components tells how that goes"
-    async with placing("stop", names, as_json=as_json) as (shown, placer):
+    async with placing.connected("stop", names, as_json=as_json) as (shown, placer):
 
         def lasting() -> str:
             records = (placer.placements.get(name) for name in names)
-            return "; ".join(f"{one.component} {standing(one)}" for one in records if one and one.state not in OVER)
+            return "; ".join(
+                f"{one.component} {placing.standing(one)}" for one in records if one and one.state not in placing.OVER
+            )
 
         def late() -> str:
             return f"after {terminal.span(timeout or 0)} {lasting()}; {stays}"
@@ -271,9 +263,9 @@ async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> No
         last = {end.component: end for end in ends if isinstance(end, Placement)}
         last |= {name: record for name, record in placer.placements.items() if name in last}
     if as_json:
-        terminal.print_json({"components": [placement_object(one) for one in last.values()]})
+        terminal.print_json({"components": [placing.placement_object(one) for one in last.values()]})
     for one in last.values():
-        shown.say(f"{one.component} {standing(one)}")
+        shown.say(f"{one.component} {placing.standing(one)}")
     failures = [end for end in ends if isinstance(end, BaseException)]
     # All of one kind as a rule; what can't be mended here comes first.
     known = (common.Failed, RequestRefused)
@@ -290,4 +282,4 @@ async def _end(placer: PlacerClient, name: str) -> Placement:
     except RequestRefused as refused:
         if refused.code != "unknown_component":
             raise
-    raise await unknown_here(placer, name)
+    raise await placing.unknown_here(placer, name)

@@ -51,8 +51,7 @@ class Host:
 
 
 class FleetView:
-    """What a client sees of its fleet from now on: who is alive, loads, and the RCM's state when asked. A
-    context manager."""
+    """What a client sees of its fleet from now on: who is alive, loads, the RCM's state if asked. A context manager."""
 
     def __init__(self, client: Client) -> None:
         self.client, self.mesh = client, client.mesh
@@ -66,11 +65,8 @@ class FleetView:
     def __enter__(self) -> Self:
         keys = self.mesh.keys
         self._stack.enter_context(self.placer)
-        for declared in (
-            self.mesh.watch(keys.alive_any(), self._on_token),
-            self.mesh.subscribe(keys.load_any, LoadReport, self._on_load),
-        ):
-            self._stack.callback(declared.close)
+        self._stack.callback(self.mesh.watch(keys.alive_any(), self._on_token).close)
+        self._stack.callback(self.mesh.subscribe(keys.load_any, LoadReport, self._on_load).close)
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -278,9 +278,8 @@ class Child:
 async def child(
     what: str, command: Sequence[str], env: Mapping[str, str], *, job: bytes | None = None
 ) -> AsyncIterator[Child]:
-    """Starts a child that ends with this context, and with this process however that ends.
-
-    It leads a session of its own: Ctrl-C reaches only us, and we end it in order."""
+    """Starts a child that ends with this context, and with this process however that ends. It leads a session of its
+    own: Ctrl-C reaches only us, and we end it in order."""
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(
         *launch.prefix(),

@@ -30,9 +30,8 @@ MAX_BYTES: Final = 2 << 30
 
 
 class PictureRecording(Drawing):
-    """Pictures above events, in a file or served on loopback, or both. A context manager.
-
-    `at` is seconds since whatever zero the caller chose."""
+    """Pictures above events, in a file or served on loopback, or both. A context manager. `at` is seconds since
+    whatever zero the caller chose."""
 
     def __init__(
         self,

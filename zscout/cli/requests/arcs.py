@@ -188,11 +188,8 @@ async def _described(client: Client, view: View, state: RcmState) -> dict[str, A
         holders = [hold_json(hold) | {"rc": rc.rc, "params": hold.needs[rc.rc]} for rc in seen.rcs for hold in rc.holds]
         need = {"need": met.get(seen.need, seen.need), "params": view.needs[seen.need], "holders": holders}
         needs.append(seen.as_json() | need | {"health": await _health(client, seen)})
-    described = structs.asdict(view) | {
-        "state": "running" if isinstance(view, HoldView) else "queued",
-        "needs": needs,
-        "story": list(map(structs.asdict, story)),
-    }
+    stands = "running" if isinstance(view, HoldView) else "queued"
+    described = structs.asdict(view) | {"state": stands, "needs": needs, "story": list(map(structs.asdict, story))}
     if isinstance(view, WaitView):
         described |= {"ahead": state.queue.index(view), "queued": len(state.queue) + state.more}
     return described

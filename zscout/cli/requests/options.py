@@ -51,54 +51,45 @@ def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
 
 
 def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
-    """An RC of one kind: `robot/scout33` or `scout33`, with `pattern` also `robot/*`. Raises BadInput."""
+    """An RC of one kind: `robot/scout33` or `scout33`, with `pattern` also `robot/*`. Raises BadInput, BadName."""
     rc = text if "/" in text else f"{kind}/{text}"
     if rc.partition("/")[0] != kind or (is_pattern(rc) and not pattern):
         raise BadInput(f"{quoted(text)} is no {kind}; name one, as in {kind}/NAME")
-    try:
-        check_need(rc)
-    except BadName as error:
-        raise BadInput(str(error)) from None
+    check_need(rc)
     return rc
 
 
 def parse_need(text: str, _option: str = "") -> tuple[str, dict[str, Decimal]]:
-    """`robot/scout33`, a pattern such as `framegrabber/*`, or with bandwidth parameters
-    `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
+    """`robot/scout33`, a pattern such as `framegrabber/*`, or `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
     rc, colon, rest = text.partition(":")
+    params: dict[str, Decimal] = {}
     try:
         check_need(rc)
-    except BadName as error:
+        for part in rest.split(",") if colon else []:
+            name, equals, number = part.partition("=")
+            remedy = f"write parameter=number, as in {rc}:command_rate=5"
+            try:
+                check_name(name, "parameter")
+            except BadName as error:
+                raise ValueError(f"{error}; {remedy}") from None
+            if name in params:
+                raise ValueError(f"{name} is given twice; give it once")
+            if _NUMBER.fullmatch(number) is None:
+                raise ValueError(f"{name} {f'is {quoted(number)}' if equals else 'has no number'}; {remedy}")
+            params[name] = Decimal(number)
+        if len(params) > MAX_PARAMS:
+            raise ValueError(f"{len(params)} parameters; at most {MAX_PARAMS} are allowed")
+        messages.exact_amounts(params)
+    except ValueError as error:
         context = click.get_current_context(silent=True)
         no_dashes = "/" not in text and context is not None and not context.meta.get("command")
         raise BadInput(f"need {quoted(text)}: {error}{'; a command goes after --' if no_dashes else ''}") from None
-    params: dict[str, Decimal] = {}
-    for part in rest.split(",") if colon else []:
-        name, equals, number = part.partition("=")
-        remedy = f"write parameter=number, as in {rc}:command_rate=5"
-        try:
-            check_name(name, "parameter")
-        except BadName as error:
-            raise BadInput(f"need {quoted(text)}: {error}; {remedy}") from None
-        if name in params:
-            raise BadInput(f"need {quoted(text)}: {name} is given twice; give it once")
-        if _NUMBER.fullmatch(number) is None:
-            found = f"is {quoted(number)}" if equals else "has no number"
-            raise BadInput(f"need {quoted(text)}: {name} {found}; {remedy}")
-        params[name] = Decimal(number)
-    if len(params) > MAX_PARAMS:
-        raise BadInput(f"need {quoted(text)}: {len(params)} parameters; at most {MAX_PARAMS} are allowed")
-    try:
-        messages.exact_amounts(params)
-    except ValueError as error:
-        raise BadInput(f"need {quoted(text)}: {error}") from None
     return rc, params
 
 
 def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
-    """The needs of one ARC; a pattern that comes again is numbered: `framegrabber/*#2` is the second.
-
-    Raises BadInput where there are too many, one RC is named twice, or patterns contradict each other."""
+    """The needs of one ARC; a pattern that comes again is numbered: `framegrabber/*#2` is the second. Raises BadInput
+    where there are too many, one RC is named twice, or patterns contradict each other."""
     if len(pairs) > MAX_NEEDS:
         raise BadInput(f"{len(pairs)} RCs; at most {MAX_NEEDS} are allowed in one request")
     needs: Needs = {}

@@ -87,9 +87,7 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
 
 
 async def carry_out(client: Client, wanted: HoldOptions) -> int:
-    """Waits, holds, runs the command; everything is given back at the end. Returns the exit code.
-
-    Raises Failed, RequestRefused."""
+    """Waits, holds, runs the command, gives back. Returns the exit code. Raises Failed, RequestRefused."""
     stream = sys.stderr if wanted.command else sys.stdout
     with Report(wanted.name, client, as_json=wanted.as_json, stream=stream) as report:
         client.watch(report.news)
@@ -210,9 +208,8 @@ def _ending(arc: OpenArc) -> HoldEnd:
 
 
 async def _foresee(client: Client, wanted: HoldOptions) -> int:
-    """Prints when it would start and whom it would preempt at once. Exit code 1: it would not start.
-
-    Raises RequestRefused, NobodyThere."""
+    """Prints when it would start and whom it would preempt at once. Exit code 1: it would not start. Raises
+    RequestRefused, NobodyThere."""
     foretold = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
     if foretold is None:
         raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
