@@ -107,9 +107,9 @@ def runs(main: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
 
 
 def _given_file() -> Path | None:
-    """What `--fleet` names."""
+    """What `--fleet` names, at Tab as well, where no command has run yet."""
     context = click.get_current_context(silent=True)
-    given = context.find_root().obj if context is not None else None
+    given = context.find_root().params.get("fleet") if context is not None else None
     return given if isinstance(given, Path) else None
 
 
@@ -153,16 +153,14 @@ async def see_rcm(client: Client) -> None:
             stack.callback(mesh.watch(mesh.keys.alive_any(role), on_token).close)
         if await within(LOOK_FOR_RCM, seen) or (candidates and await within(LOOK_FOR_TAKEOVER - LOOK_FOR_RCM, seen)):
             return
-    fleet, links = client.fleet.name, mesh.links()
+    nobody = f"no RCM is on the mesh of fleet {client.fleet.name}"
     if candidates:
         names = ", ".join(sorted(token.host for token in candidates)[:5])
-        raise NobodyThere(
-            f"no RCM is on the mesh of fleet {fleet}, though {names} could lead; see the log of zscout-node"
-        )
-    who = f"{links} links to other programs" if links else "no other program either"
+        raise NobodyThere(f"{nobody}, though {names} could lead; see the log of zscout-node")
+    who = f"{mesh.links()} links to other programs" if mesh.links() else "no other program either"
     raise NobodyThere(
-        f"no RCM is on the mesh of fleet {fleet} ({who}); start zscout-node on a host, or check the fleet's "
-        "name, `interface` and `connect` in its file (--fleet)"
+        f"{nobody} ({who}); start zscout-node on a host, or check the fleet's name, `interface` and `connect` in its "
+        "file (--fleet)"
     )
 
 

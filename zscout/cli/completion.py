@@ -53,16 +53,12 @@ def _on_mesh(
 
     def offered(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         from zscout.cli import common
-        from zscout.config.fleet import fleet_from_env, load_fleet
         from zscout.config.strict import BadInput
         from zscout.keyexpr import BadName
         from zscout.mesh import MeshError
 
         async def look() -> Iterable[str]:
-            # Click has not run anything yet, so the fleet is only an option.
-            file = ctx.find_root().params.get("fleet")
-            fleet = load_fleet(Path(os.fspath(file))) if file is not None else fleet_from_env()
-            async with common.connected("complete", fleet, need_rcm=False) as client:
+            async with common.connected("complete", need_rcm=False) as client:
                 # A mesh that was just joined shows nobody yet.
                 with suppress(common.NobodyThere, TimeoutError):
                     async with asyncio.timeout(LOOK):
@@ -70,7 +66,8 @@ def _on_mesh(
                 return await find(client.mesh, param.name or "")
 
         try:
-            names = asyncio.run(look())
+            with ctx.scope(cleanup=False):
+                names = asyncio.run(look())
         except (BadInput, BadName, MeshError):
             return []
         given = ctx.params.get(param.name or "")

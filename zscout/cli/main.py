@@ -192,8 +192,7 @@ def _drop_unwritten() -> None:
 )
 @click.option("-v", "--verbose", is_flag=True, help="Log to stderr what the mesh client does.")
 @click.version_option(__version__, "--version", message="%(prog)s %(version)s")
-@click.pass_context
-def main(ctx: click.Context, fleet: Path | None, verbose: bool) -> None:
+def main(verbose: bool, **_: Any) -> None:
     """All the devices a program asked for, or none, over a Zenoh mesh.
 
     \b
@@ -207,7 +206,6 @@ def main(ctx: click.Context, fleet: Path | None, verbose: bool) -> None:
 
     level = logging.INFO if verbose else logging.ERROR
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
-    ctx.obj = fleet
 
 
 if __name__ == "__main__":

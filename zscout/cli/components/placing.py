@@ -6,7 +6,7 @@ import asyncio
 import sys
 from collections.abc import AsyncIterator, Callable, Collection, Iterable
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 from msgspec import structs
@@ -21,7 +21,6 @@ from zscout.messages import ListPlacements, Placement, Placements
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
 
-F = TypeVar("F", bound=Callable[..., Any])
 
 PATIENCE: Final = 15.0
 """Seconds within which a placer answers, though the lead changes meanwhile."""
@@ -143,5 +142,5 @@ component_argument = click.argument("name", type=COMPONENT, shell_complete=compl
 host_argument = click.argument("host", type=common.NAME, shell_complete=completion.hosts)
 
 
-def host_option(name: str, help: str, **more: Any) -> Callable[[F], F]:  # noqa: A002 - click's word
+def host_option(name: str, help: str, **more: Any) -> Callable[[common.F], common.F]:  # noqa: A002 - click's word
     return click.option(name, metavar="HOST", type=common.NAME, shell_complete=completion.hosts, help=help, **more)

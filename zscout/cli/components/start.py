@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from decimal import Decimal
 from typing import Any, Final
 
@@ -43,10 +43,9 @@ _POWERS: Final = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
 
 def parse_cores(text: str, what: str) -> float:
     """Cores of a processor, from `0.5` or `2`. Raises BadInput."""
-    try:
+    cores = 0.0
+    with suppress(ValueError):
         cores = float(text)
-    except ValueError:
-        cores = math.nan
     if not 0 < cores <= MAX_CORES:
         raise BadInput(f"{what}: {quoted(text)} is no number of cores; write one, as in 0.5 or 2")
     return cores
@@ -248,9 +247,8 @@ async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> No
 
         def lasting() -> str:
             records = (placer.placements.get(name) for name in names)
-            return "; ".join(
-                f"{one.component} {placing.standing(one)}" for one in records if one and one.state not in placing.OVER
-            )
+            running = (one for one in records if one and one.state not in placing.OVER)
+            return "; ".join(f"{one.component} {placing.standing(one)}" for one in running)
 
         def late() -> str:
             return f"after {terminal.span(timeout or 0)} {lasting()}; {stays}"

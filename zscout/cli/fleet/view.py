@@ -243,13 +243,11 @@ class Child:
                 line = await stderr.readline()
             except ValueError:  # longer than MAX_LINE: it is skipped
                 continue
-            if not line:
-                self._news.set()
-                return
-            text = terminal.clean(_COLOURS.sub("", line.decode(errors="replace"))).strip()
-            if text:
+            if text := terminal.clean(_COLOURS.sub("", line.decode(errors="replace"))).strip():
                 self.lines.append(text)
-                self._news.set()
+            self._news.set()
+            if not line:
+                return
 
     async def end(self) -> None:
         """Ends it, at first by asking; returns when it is gone."""

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import AsyncExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 REFRESH: Final = 0.2
 """Seconds between two drawings of the live line."""
 MAX_RATE: Final = 50.0
-F = TypeVar("F", bound=Callable[..., Any])
 
 WAYS: Final[dict[Way, tuple[bytes, ...]]] = {
     "forward": (b"w", b"\x1b[A", b"\x1bOA"),
@@ -50,7 +49,7 @@ FULL: Final = 32_767
 HELP: Final = "arrows or wasd drive · space stops · + - speed · g gives back · q ends"
 
 
-def _rc_option(kind: str) -> Callable[[F], F]:
+def _rc_option(kind: str) -> Callable[[common.F], common.F]:
     """`--radio RC` and the like; any one of this kind unless it is named."""
     rc = common.Parsed("rc", lambda text, _: parse_rc(text, kind, pattern=True))
     return click.option(f"--{kind}", default=f"{kind}/*", type=rc, shell_complete=completion.rcs)

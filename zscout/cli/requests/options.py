@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import click
 
 from zscout import messages
-from zscout.cli.common import Parsed, json_option
+from zscout.cli.common import F, Parsed, json_option
 from zscout.cli.requests.run_command import check_command
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
@@ -21,7 +21,6 @@ from zscout.messages import MAX_NEEDS, MAX_PARAMS
 from zscout.scheduling.model import check_patterns
 
 Needs = dict[str, dict[str, Decimal]]
-F = TypeVar("F", bound=Callable[..., Any])
 
 _NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
 _UNITS: Final = {"": Decimal(1), "s": Decimal(1), "ms": Decimal("0.001"), "m": Decimal(60), "h": Decimal(3600)}

@@ -18,7 +18,7 @@ from zscout.cli import common
 from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
-from zscout.cli.requests.waiting import NeedContention, contention_of
+from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
 from zscout.messages import Foresight, RcmState
 from zscout.terminal import LiveLine, clean, print_json, print_line, span
 from zscout.types import SECOND, Ns
@@ -321,17 +321,18 @@ class Report(LiveLine):
         # A sharable RC has holders who are in nobody's way, unless the reason names it. Two patterns may be
         # met by one RC: it is listed once.
         met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
-        in_way = [rc.text() for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
+        in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
+        holders = [f"{rc.rc}: {'; '.join(map(hold_text, rc.holds))}" for rc in in_way]
         ahead = f", {arc.ahead} ahead" if arc.ahead else ""
         waits = f"{arc.name} waits {span(self._since(arc))}{ahead}{f', {start}' if start else ''}: {arc.reason}"
-        self.draw("\n  ".join([waits, *in_way]))
+        self.draw("\n  ".join([waits, *holders]))
         # Without the estimate: it changes all the time.
         if self.watched or self._printed == _how(arc):
             return
         self._printed = _how(arc)
         self.event(
             "waits",
-            "; ".join(filter(None, (f"{arc.name} waits{ahead}: {arc.reason}", start, *in_way))),
+            "; ".join(filter(None, (f"{arc.name} waits{ahead}: {arc.reason}", start, *holders))),
             id=arc.id,
             reason=arc.reason,
             ahead=arc.ahead,

@@ -159,19 +159,15 @@ class RunningCommand:
                 pid, status = self.pid, 0
             if pid == 0:
                 return
-            if os.WIFSTOPPED(status):
-                self._stopped(os.WSTOPSIG(status))
-                continue
-            self._process.returncode = os.waitstatus_to_exitcode(status)
-            self._ended.set_result(self._process.returncode)
-            return
-
-    def _stopped(self, number: int) -> None:
-        if number in (signal.SIGTTIN, signal.SIGTTOU):
-            self._want_terminal()
-        elif number == signal.SIGTSTP:
-            self._note_suspension()
-            self._signal(signal.SIGCONT)
+            if not os.WIFSTOPPED(status):
+                self._process.returncode = os.waitstatus_to_exitcode(status)
+                self._ended.set_result(self._process.returncode)
+                return
+            if os.WSTOPSIG(status) in (signal.SIGTTIN, signal.SIGTTOU):
+                self._want_terminal()
+            elif os.WSTOPSIG(status) == signal.SIGTSTP:
+                self._note_suspension()
+                self._signal(signal.SIGCONT)
 
     def _want_terminal(self) -> None:
         """The command was stopped for want of the terminal: it goes on as soon as it can have it."""

@@ -20,14 +20,6 @@ class RcContention:
     sharable: bool
     holds: list[HoldView]
 
-    @property
-    def free(self) -> bool:
-        return self.present and not self.holds
-
-    def text(self) -> str:
-        """Who has it and since when, in words."""
-        return f"{self.rc}: " + "; ".join(hold_text(hold) for hold in self.holds)
-
 
 @dataclass(slots=True)
 class NeedContention:
@@ -52,7 +44,7 @@ class NeedContention:
 
     @property
     def free(self) -> list[str]:
-        return [rc.rc for rc in self.rcs if rc.free]
+        return [rc.rc for rc in self.rcs if rc.present and not rc.holds]
 
     @property
     def met(self) -> bool:
