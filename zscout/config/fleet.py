@@ -23,7 +23,6 @@ from zscout.types import SECOND, Ns
 
 FLEET_VARIABLE: Final = "ZSCOUT_FLEET"
 """Environment variable with the path of the fleet file, for the CLI."""
-DEFAULT_FLEET_NAME: Final = "zscout"
 MAX_CANDIDATES: Final = 1_000
 MAX_ENDPOINTS: Final = 256
 
@@ -126,7 +125,7 @@ class Fleet(Struct, frozen=True):
 class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [fleet]."""
 
-    name: Annotated[str, key("Hosts of one name find each other.", example="lab")] = DEFAULT_FLEET_NAME
+    name: Annotated[str, key("Hosts of one name find each other.", example="lab")] = "zscout"
     candidates: Annotated[
         tuple[str, ...],
         key("Hosts that may lead, best first; none: every one.", most=MAX_CANDIDATES, example=["anvil"]),

@@ -130,8 +130,7 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
     Numbers with a point are read as Decimal, exactly; struct fields may be Decimal, float, int, str, bool,
     Literal, lists and tables of these, and structs (let them forbid unknown fields)."""
     where = Where(source)
-    deep = _DEEP_KEY.search(text)
-    if deep:
+    if deep := _DEEP_KEY.search(text):
         line = text.count("\n", 0, deep.start()) + 1
         raise where.bad(f"line {line} has a dotted key of more than {_MAX_DEPTH} parts", "shorten it")
     try:
@@ -190,13 +189,11 @@ def check_unique(values: Iterable[str], where: Where, key: str = "") -> None:
     """Refuses a value that stands twice in a list (of texts, or of tables with `key`). Raises BadInput."""
     first: dict[str, int] = {}
     for number, value in enumerate(values):
-        if value in first:
-            here = where.item(number, value)
-            earlier = where.item(first[value]).key
-            raise (here / key if key else where.item(number)).bad(
-                f"{quoted(value)} stands at {earlier} already", "rename or remove one of the two"
-            )
-        first[value] = number
+        earlier = first.setdefault(value, number)
+        if earlier != number:
+            here = where.item(number, value) / key if key else where.item(number)
+            what = f"{quoted(value)} stands at {where.item(earlier).key} already"
+            raise here.bad(what, "rename or remove one of the two")
 
 
 def seconds_to_ns(value: Decimal, where: Where, *, low: Decimal = Decimal(0), high: Decimal = MAX_SECONDS) -> int:

@@ -102,7 +102,7 @@ class RcDirectory:
     """Which host offers which RC, by the liveliness tokens, from `watch` on: its node may act for an RC, and
     no other."""
 
-    def __init__(self, mesh: Mesh, on_change: Callable[[], None] | None = None) -> None:
+    def __init__(self, mesh: Mesh, on_change: Callable[[], object] = lambda: None) -> None:
         self._mesh = mesh
         self._tokens: dict[str, set[Token]] = {}
         self._recent: dict[tuple[str, str], Ns] = {}
@@ -124,8 +124,7 @@ class RcDirectory:
             now = self._mesh.now()
             self._recent = {key: until for key, until in self._recent.items() if until > now}
             self._recent[token.host, token.name] = now + DEPARTED_RC_GRACE
-        if self._on_change is not None:
-            self._on_change()
+        self._on_change()
 
     def hosts(self, rc: str) -> set[str]:
         """The hosts that offer this RC now: one, unless two nodes are at odds."""

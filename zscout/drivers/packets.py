@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import binascii
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -148,7 +149,7 @@ def _decode(framed: bytes) -> Packet | None:
     if _crc(framed[:-2]) != framed[-2:]:
         return None
     robot, number, operation, *arguments = framed[1:-2]
-    try:
+    with suppress(ValueError):
         match operation, arguments:
             case DrivePacket.operation, [_, _, ticks]:
                 left, right = struct.unpack_from("bb", framed, 4)
@@ -159,6 +160,4 @@ def _decode(framed: bytes) -> Packet | None:
                 return CameraPacket(robot, number, channel)
             case HaltPacket.operation, []:
                 return HaltPacket(robot, number)
-    except ValueError:
-        pass
     return None

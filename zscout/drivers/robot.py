@@ -14,15 +14,7 @@ from typing import Any, Final
 
 import msgspec
 
-from zscout.drivers.commands import (
-    RadioCamera,
-    RadioDrive,
-    RadioHalt,
-    RadioStop,
-    RobotCamera,
-    RobotDrive,
-    robot_command,
-)
+from zscout.drivers import commands
 from zscout.drivers.driver import Driver, RcDirectory, RcHandle
 from zscout.mesh import Declaration, Refused, Reply
 from zscout.mesh.supervision import done_within
@@ -45,7 +37,7 @@ RECENT: Final = 64
 class _Waiting:
     """A command that was not passed to the radio yet."""
 
-    order: RadioDrive | RadioCamera | RadioStop
+    order: commands.RadioDrive | commands.RadioCamera | commands.RadioStop
     radio: str
     grant: Grant
     answer: asyncio.Future[Any]
@@ -102,25 +94,22 @@ class RobotDriver(Driver):
     # Commands
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        order = robot_command(do)
+        order = commands.robot_command(do)
         radio = self._radio_of(holder)
         self._counts["commands"] += 1
-        sent: RadioDrive | RadioCamera | RadioStop
-        if isinstance(order, RobotCamera):
-            sent = RadioCamera(self._id, self._channel_of(holder) if order.on else 0)
+        sent: commands.RadioDrive | commands.RadioCamera | commands.RadioStop
+        if isinstance(order, commands.RobotCamera):
+            sent = commands.RadioCamera(self._id, self._channel_of(holder) if order.on else 0)
         else:
-            self._drop({"replaced": True}, RadioDrive)  # the newest is the true one
-            sent = RadioStop(self._id)
-            if isinstance(order, RobotDrive):
-                sent = RadioDrive(self._id, order.left, order.right, order.lasts)
-            self._restart_dead_man(turns=isinstance(order, RobotDrive) and bool(order.left or order.right))
+            self._drop({"replaced": True}, commands.RadioDrive)  # the newest is the true one
+            sent = commands.RadioStop(self._id)
+            if isinstance(order, commands.RobotDrive):
+                sent = commands.RadioDrive(self._id, order.left, order.right, order.lasts)
+            self._restart_dead_man(turns=isinstance(order, commands.RobotDrive) and bool(order.left or order.right))
         if len(self._waiting) >= MAX_WAITING:
             raise Refused("busy", f"{MAX_WAITING} commands wait for {radio}; send fewer")
         waiting = _Waiting(sent, radio, holder.grant, asyncio.get_running_loop().create_future())
-        if isinstance(sent, RadioStop):
-            self._waiting.appendleft(waiting)
-        else:
-            self._waiting.append(waiting)
+        (self._waiting.appendleft if isinstance(sent, commands.RadioStop) else self._waiting.append)(waiting)
         self._queued.set()
         return waiting.answer
 
@@ -158,13 +147,13 @@ class RobotDriver(Driver):
 
     async def _send(self, waiting: _Waiting) -> None:
         began, order = self._mesh.now(), waiting.order
-        if isinstance(order, RadioDrive):
+        if isinstance(order, commands.RadioDrive):
             self._stopped_at = None
         reply = await self._ask_radio(waiting.radio, order, waiting.grant, ANSWER)
         self._latencies.append((self._mesh.now() - began) / SECOND)
         if reply is not None and reply.message is not None:
             result = reply.message.result
-            if isinstance(order, RadioDrive) and self._stopped_at is None:
+            if isinstance(order, commands.RadioDrive) and self._stopped_at is None:
                 self._stopped_at = self._mesh.now() + round((_after(result) + order.lasts) * SECOND)
             waiting.resolve(result)
             return
@@ -192,7 +181,7 @@ class RobotDriver(Driver):
         until it does."""
         self._restart_dead_man(turns=False)
         self._drop(Refused("ended", "the hold ended before it was sent"))
-        await self._send_urgent(RadioHalt(self._id, self._rc.name), HALT_TRIES)
+        await self._send_urgent(commands.RadioHalt(self._id, self._rc.name), HALT_TRIES)
 
     def _restart_dead_man(self, *, turns: bool) -> None:
         """A command for the wheels arrived: the dead man's clock begins anew, or is stopped."""
@@ -209,11 +198,11 @@ class RobotDriver(Driver):
         if self._stopped_at is not None and self._stopped_at <= self._mesh.now():
             return
         self._counts["dead_man_stops"] += 1
-        self._drop(Refused("stale", "it waited too long for the radio"), RadioDrive)
+        self._drop(Refused("stale", "it waited too long for the radio"), commands.RadioDrive)
         self._stopped_at = 0
-        self._rc.supervisor.spawn(self._send_urgent(RadioStop(self._id, self._rc.name), HALT_TRIES))
+        self._rc.supervisor.spawn(self._send_urgent(commands.RadioStop(self._id, self._rc.name), HALT_TRIES))
 
-    async def _send_urgent(self, order: RadioStop | RadioHalt, tries: int) -> bool:
+    async def _send_urgent(self, order: commands.RadioStop | commands.RadioHalt, tries: int) -> bool:
         """Has the robot's own radio send a stop or a halt. False: it could not, and the RC counts as lost."""
         problem = ""
         for _ in range(tries):
@@ -222,7 +211,7 @@ class RobotDriver(Driver):
                 break
             reply = await self._ask_radio(self._radio, order, None, HALT_ANSWER)
             if reply is not None and reply.message is not None:
-                self._counts["halts"] += isinstance(order, RadioHalt)
+                self._counts["halts"] += isinstance(order, commands.RadioHalt)
                 return True
             problem = f"{self._radio} does not answer"
             if reply is not None and reply.problem is not None:
@@ -242,7 +231,7 @@ class RobotDriver(Driver):
         while True:
             await self._unsure.wait()
             self._wake.clear()
-            if await self._send_urgent(RadioHalt(self._id, self._rc.name), 1):
+            if await self._send_urgent(commands.RadioHalt(self._id, self._rc.name), 1):
                 self._unsure.clear()
                 self._rc.recover()
                 pause = PAUSES[0]

@@ -138,7 +138,6 @@ class Notice(_ArcParty, frozen=True):
     """While it is queued, where the client asked for estimates: seconds until it will start if nothing else
     comes; None where it will not as things stand, or not within what can be forecast."""
     why: ReasonInfo | None = None
-    """What `reason` says, as data."""
 
 
 # From the RCM to all
@@ -170,7 +169,6 @@ class Revocation(_ArcParty, frozen=True):
     reason: str
     by: str | None = None
     why: ReasonInfo | None = None
-    """What `reason` says, as data."""
 
 
 class Grants(Message, frozen=True):
@@ -227,7 +225,6 @@ class WaitView(_ArcParty, frozen=True):
     starts_in: Seconds | None = None
     """An estimate, where one was asked for: as if nothing else were to come."""
     why: ReasonInfo | None = None
-    """What `reason` says, as data."""
 
 
 class RcView(Message, frozen=True):
