@@ -153,9 +153,12 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
     placement: PlacementPolicy = DEFAULT_PLACEMENT
 
 
-def load_fleet(path: Path) -> Fleet:
-    """Reads a fleet file. Raises BadInput."""
-    return _fleet(read_toml(path, FleetFile), Where(str(path)))
+def load_fleet(path: Path, named_by: str = "") -> Fleet:
+    """Reads a fleet file; an error says what named it. Raises BadInput."""
+    try:
+        return _fleet(read_toml(path, FleetFile), Where(str(path)))
+    except BadInput as error:
+        raise (BadInput(f"{error} (named by {named_by})") if named_by else error) from None
 
 
 def default_fleet() -> Fleet:
@@ -166,12 +169,7 @@ def default_fleet() -> Fleet:
 def fleet_from_env() -> Fleet:
     """The fleet whose file `ZSCOUT_FLEET` names; if that is unset or empty, the default. Raises BadInput."""
     path = os.environ.get(FLEET_VARIABLE)
-    if not path:
-        return default_fleet()
-    try:
-        return load_fleet(Path(path))
-    except BadInput as error:
-        raise BadInput(f"{error} (named by ${FLEET_VARIABLE})") from None
+    return load_fleet(Path(path), f"${FLEET_VARIABLE}") if path else default_fleet()
 
 
 def _fleet(file: FleetFile, top: Where) -> Fleet:

@@ -10,7 +10,7 @@ from msgspec import Meta, Struct, structs
 
 from zscout.config.devices import RcConfig, check_rc
 from zscout.config.fleet import Endpoints, Fleet, check_links, default_fleet, ip_of, load_fleet
-from zscout.config.strict import BadInput, Where, check_name, check_names, check_unique, key, quoted, read_toml
+from zscout.config.strict import Where, check_name, check_names, check_unique, key, quoted, read_toml
 from zscout.keyexpr import valid_name
 from zscout.messages import MAX_LABELS
 
@@ -110,12 +110,8 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
 def load_node(path: Path) -> Node:
     """Reads a node file, and the fleet file that it names (relative to itself). Raises BadInput."""
     file = read_toml(path, NodeFile)
-    fleet = default_fleet()
-    if file.node.fleet is not None:
-        try:
-            fleet = load_fleet(path.parent / file.node.fleet)
-        except BadInput as error:
-            raise BadInput(f"{error} (named by node.fleet in {path})") from None
+    named = file.node.fleet
+    fleet = load_fleet(path.parent / named, f"node.fleet in {path}") if named is not None else default_fleet()
     return _node(file, fleet, path.parent, Where(str(path)))
 
 

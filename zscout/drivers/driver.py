@@ -136,6 +136,5 @@ class RcDirectory:
 
     def is_node_of(self, sender: Sender, rc: str) -> bool:
         """Whether `sender` is the node that offers this RC, or did so until a moment ago."""
-        if sender.client != NODE:
-            return False
-        return sender.host in self.hosts(rc) or self._recent.get((sender.host, rc), 0) > self._mesh.now()
+        offered = sender.host in self.hosts(rc) or self._recent.get((sender.host, rc), 0) > self._mesh.now()
+        return sender.client == NODE and offered

@@ -115,13 +115,10 @@ class PolledSubscription(Declaration, Generic[S]):
         super().__init__(undeclare)
         self._take, self._kind, self._depth = take, kind, depth
 
-    def take(self) -> list[S]:
-        """What was published since the last call, oldest first; malformed messages are dropped silently."""
-        return [message for _, message in self.each()]
-
     def each(self) -> Iterator[tuple[str, S]]:
-        """The same one by one, each with its key; what is not consumed is kept for the next call. Ends after
-        as many as there is room for: more may arrive meanwhile."""
+        """What was published since the last call, oldest first, each with its key; malformed messages are dropped
+        silently, what is not consumed is kept for the next call. Ends after as many as there is room for: more may
+        arrive meanwhile."""
         for _ in range(self._depth):
             sample = self._take()
             if sample is None:

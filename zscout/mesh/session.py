@@ -365,8 +365,7 @@ class Mesh:
         state = Backlog()
 
         def handle(text: str, alive: bool) -> None:
-            token = None if state.closed else self._token_of(text)
-            if token is not None:
+            if not state.closed and (token := self._token_of(text)) is not None:
                 handler(token, alive)
 
         deliver = functools.partial(self._inbox.deliver, handle)
@@ -422,8 +421,7 @@ def _read_reply(key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -
             return Reply(key, messages.decode(payload, kind, limit))
         if payload == b"Timeout":
             return None
-        problem: Problem = messages.decode(payload, Problem)
-        return Reply("", None, problem)
+        return Reply("", None, messages.decode(payload, Problem))
     except Malformed as error:
         log.warning("a reply was malformed: %s", error)
         return None

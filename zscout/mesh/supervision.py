@@ -43,13 +43,10 @@ class Supervisor:
         self.error: Exception | None = None
         """What it failed with."""
         self._on_failure = on_failure
-        self._cancelled = False
+        self.active = True
+        """Whether it neither failed nor was cancelled."""
         self._tasks: set[asyncio.Task[Any]] = set()
         self._timers: WeakSet[asyncio.TimerHandle] = WeakSet()
-
-    @property
-    def active(self) -> bool:
-        return not self._cancelled
 
     def spawn(self, coro: Coroutine[Any, Any, T], name: str | None = None) -> asyncio.Task[T]:
         """Runs `coro` as a task, cancelled before it starts if the supervisor is no longer active."""
@@ -58,14 +55,14 @@ class Supervisor:
         )
         self._tasks.add(task)
         task.add_done_callback(self._done)
-        if self._cancelled:
+        if not self.active:
             task.cancel()
         return task
 
     def call_later(self, delay: float, f: Callable[..., object], *args: Any) -> asyncio.TimerHandle:
         """Calls `f(*args)` in `delay` seconds."""
         handle = asyncio.get_running_loop().call_later(delay, self._call, f, *args)
-        if self._cancelled:
+        if not self.active:
             handle.cancel()
         self._timers.add(handle)
         return handle
@@ -78,7 +75,7 @@ class Supervisor:
 
         @functools.wraps(f)
         def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
-            if self._cancelled:
+            if not self.active:
                 return
             try:
                 f(*args, **kwargs)
@@ -95,9 +92,9 @@ class Supervisor:
         if error is self.error:  # raised on by a task that awaited the one that failed
             return
         log.error("%s failed", self.name, exc_info=error)
-        if self._cancelled:
+        if not self.active:
             return
-        self.error, self._cancelled = error, True
+        self.error, self.active = error, False
         try:
             self._on_failure(error)
         except Exception:
@@ -107,7 +104,7 @@ class Supervisor:
 
     def cancel(self) -> None:
         """Cancels all tasks and timers, without waiting for them."""
-        self._cancelled = True
+        self.active = False
         for handle in tuple(self._timers):
             handle.cancel()
         for task in tuple(self._tasks):
