@@ -40,8 +40,7 @@ class Lifecycle:
         if record is None:
             record = state.add(component, spec)
             if record is None:
-                count = len(state.components)
-                state.refuse(component, "too_many", f"{count} components are placed already")
+                state.refuse(component, "too_many", f"{len(state.components)} components are placed already")
                 return
             self.place_again(record)
         elif record.state in OVER:
@@ -88,11 +87,9 @@ class Lifecycle:
     def place_waiting(self) -> None:
         """Places what is to be placed, the heaviest first."""
         state = self.state
-        names = [name for name in state.to_place if name in state.components]
+        records = [state.components[name] for name in state.to_place if name in state.components]
         state.to_place = {}
-        waiting = [
-            (name, state.components[name].spec.kind) for name in names if state.components[name].state == "waiting"
-        ]
+        waiting = [(record.component, record.spec.kind) for record in records if record.state == "waiting"]
         for number, component in enumerate(state.balancer.heaviest_first(waiting)):
             record = state.components[component]
             state.mark_changed(component)
@@ -129,7 +126,7 @@ class Lifecycle:
             tried.clear()
             pause = self.state.back_off_time(record.failed_rounds)
             record.failed_rounds += 1
-            reason = f"no host started it; tried again after {_seconds(pause)}: {record.restart_cause}"
+            reason = f"no host started it; tried again after {pause / SECOND:g} s: {record.restart_cause}"
             self._back_off(record, reason, pause)
 
     def _start_on(self, record: ComponentRecord, chosen: RankedHost) -> None:
@@ -169,10 +166,9 @@ class Lifecycle:
     def _not_started(self, record: ComponentRecord, answer: StartAnswered) -> None:
         state, host = self.state, answer.host
         if answer.result == "unknown":
-            pause = state.back_off_time(record.unanswered)
+            state.wake(record, state.now + state.back_off_time(record.unanswered))
             record.unanswered += 1
             record.reason = f"{host} does not say whether it started: {answer.reason or 'no answer'}"
-            state.wake(record, state.now + pause)
         elif answer.result == "refused":
             record.ended_incarnations.append(record.incarnation)
             state.component_left(record)
@@ -261,8 +257,7 @@ class Lifecycle:
         state.component_left(record)
         if end.cause in ("moved", "superseded") and not record.whereabouts_unknown:
             record.whereabouts_unknown = True
-            reason = f"it went on elsewhere ({end.cause}), it is not known where"
-            self._back_off(record, reason, GRACE)
+            self._back_off(record, f"it went on elsewhere ({end.cause}), it is not known where", GRACE)
             return
         cause = _cause(end, host)
         if end.cause == "completed" and record.spec.restart != "always":
@@ -279,7 +274,7 @@ class Lifecycle:
             pause = state.back_off_time(record.restarts)
             record.restarts += 1
             if end.cause == "completed" or not self._exhausted(record, cause):
-                self._back_off(record, f"{cause}; started again after {_seconds(pause)}", pause)
+                self._back_off(record, f"{cause}; started again after {pause / SECOND:g} s", pause)
                 record.restart_cause = cause
 
     def _exhausted(self, record: ComponentRecord, cause: str) -> bool:
@@ -295,8 +290,7 @@ class Lifecycle:
     def end_incarnation(self, record: ComponentRecord) -> None:
         state, host = self.state, record.host
         if host is not None and host in state.alive:
-            start_until, token = record.start_until, record.token
-            self.surplus.add(record.component, record.incarnation, host, start_until, token=token)
+            self.surplus.add(record.component, record.incarnation, host, record.start_until, token=record.token)
             state.wake(record, None)
         elif host is not None and state.now < record.not_before:
             # Inherited: its host may be there, and has not joined yet.
@@ -336,7 +330,6 @@ class Lifecycle:
     # Time
 
     def timer(self, record: ComponentRecord) -> None:
-        state = self.state
         match record.state:
             case "backing_off" if record.whereabouts_unknown:
                 record.whereabouts_unknown = False
@@ -351,7 +344,7 @@ class Lifecycle:
             case "stopping":
                 self.end_incarnation(record)
             case _:
-                state.forget(record.component)
+                self.state.forget(record.component)
 
     def _repeat_start(self, record: ComponentRecord) -> None:
         host = record.host
@@ -382,7 +375,3 @@ def _explains(reason: str, causes: str) -> bool:
     return before.startswith("no host will do") and all(
         f"{host}: " in before and cause in before for host, _, cause in known
     )
-
-
-def _seconds(pause: Ns) -> str:
-    return f"{pause / SECOND:g} s"

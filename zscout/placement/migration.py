@@ -120,8 +120,7 @@ class Migrations:
             elif move.stage == "probing":
                 self._judge(record, move)
         elif phase == "standby" and move.stage == "starting":
-            answer = StartAnswered(record.component, move.incarnation, move.to, "ok")
-            self.target_answered(record, move, answer)
+            self.target_answered(record, move, StartAnswered(record.component, move.incarnation, move.to, "ok"))
         elif phase == "standby" and move.stage == "probing":
             move.target = "standby"
             self._judge(record, move)

@@ -46,8 +46,7 @@ class Rebalancer:
             self._paying.clear()
             return
         found = self._changes()
-        before = self._paying
-        self._paying = {move: before.get(move, state.now) for move in found}
+        self._paying = {move: self._paying.get(move, state.now) for move in found}
         ripe = [(gain, move) for move, gain in found.items() if state.now - self._paying[move] >= state.rules.steady]
         if ripe:
             gain, (component, to) = max(ripe)
@@ -103,8 +102,7 @@ class Rebalancer:
         return state.now - state.last_change.get(host, state.now) >= state.rules.rest
 
     def _targets(self, query: RankQuery) -> list[HostName]:
-        ranking = self.state.rankings.rank(query)
-        return [one.host for one in ranking.hosts if self._at_rest(one.host)][:TARGETS]
+        return [one.host for one in self.state.rankings.rank(query).hosts if self._at_rest(one.host)][:TARGETS]
 
     def _outlook(self, host: HostName) -> Outlook:
         """A host as the balancer sees it, less what left it and shows in its load average still."""

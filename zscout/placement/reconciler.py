@@ -83,19 +83,18 @@ class Reconciler:
 
     def _other_runs(self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool) -> None:
         """An incarnation runs that is not the record's."""
-        state = self.state
         if self.surplus.has(record.component, incarnation):
             return
         stopped = record.state == "stopping" or record.state in OVER
         if stopped or incarnation < record.incarnation + record.superseded:
             self.surplus.add(record.component, incarnation, host, token=token)
             return
-        if host not in state.alive:
+        if host not in self.state.alive:
             return
         if record.host is not None:
             self.surplus.add(record.component, record.incarnation, record.host, record.start_until, token=record.token)
         self.migrations.cancel(record)
-        state.component_left(record)
+        self.state.component_left(record)
         record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
         record.superseded = False
         record.host_reason = f"found running on {host}"
@@ -190,8 +189,7 @@ class Reconciler:
             pass
         elif move is not None and incarnation == move.incarnation:
             record.ended_incarnations.append(incarnation)
-            reason = f"what stood by there has ended: {end.reason or end.cause}"
-            self.migrations.target_ended(record, move, reason)
+            self.migrations.target_ended(record, move, f"what stood by there has ended: {end.reason or end.cause}")
         elif incarnation != record.incarnation or record.superseded or record.state in OVER:
             pass
         elif move is not None:

@@ -248,11 +248,9 @@ class Adaptive(Strategy):
         search.local = LocalSearch(problem, search.best)
 
     def _report_gain(self, group: ConflictGroup, search: _Search) -> None:
-        found, heuristic = _pairs(group, search.best), _pairs(group, search.heuristic)
+        was, found = _pairs(group, search.heuristic), _pairs(group, search.best)
         changed = [
-            f"at priority {level}: {heuristic[level]} -> {found[level]}"
-            for level in found
-            if found[level] != heuristic[level]
+            f"at priority {level}: {was[level]} -> {found[level]}" for level in found if found[level] != was[level]
         ]
         self._log_line = f"adaptive: RC assignments {', '.join(changed)}, in {search.steps} steps"
 

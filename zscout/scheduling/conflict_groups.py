@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
 
-from zscout.scheduling.model import Arc, Rank, Rc
+from zscout.scheduling.model import Arc, Rank, Rc, union
 from zscout.scheduling.packing import PackingItem, PackingProblem
 from zscout.scheduling.patterns import bind_all
 from zscout.scheduling.reservations import Reservations
@@ -50,13 +50,9 @@ class _Search:
 
     def run(self, limit: int | None) -> list[Arc] | None:
         index = self.state.index
-        for arc in (*index.ready.values(), *index.parked.values()):
-            self._heap.append((arc.rank, 0, arc, None))
+        self._heap = [(arc.rank, 0, arc, None) for arc in (*index.ready.values(), *index.parked.values())]
         heapq.heapify(self._heap)
-        freed = index.freed
-        for name in self.votes.invalidated:
-            freed |= self.state.rc(name).bit
-        self._call_watchers(freed, None)
+        self._call_watchers(index.freed | union(self.state.rc(name).bit for name in self.votes.invalidated), None)
         found: list[Arc] = []
         last: Rank | None = None
         while self._heap:
@@ -210,10 +206,8 @@ class ConflictGroup:
         keyed = sorted((_level_key(arc, first, now), arc.rank, arc) for arc in arcs)
         self.arcs = [arc for _, _, arc in keyed]
         """Best first."""
-        self.mask = 0
+        self.mask = union(arc.mask for arc in arcs)
         """All that they need or hold."""
-        for arc in arcs:
-            self.mask |= arc.mask
         keys = [key for key, _, _ in keyed]
         levels = {key: level for level, key in enumerate(dict.fromkeys(keys))}
         exclusive = ~state.sharable

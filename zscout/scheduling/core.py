@@ -131,7 +131,7 @@ class Core:
         return answer is None or answer.accept
 
     def _arc_status(self, arc: Arc) -> ArcStatus:
-        reason = arc.reason
+        reason, ahead = arc.reason, self._state.index.ahead(arc) if arc.hold is None else None
         if arc.state is ArcState.WATCHING:
             check = AdmissionCheck(self._state, arc)
             obstacle = check.obstacle(0)
@@ -144,7 +144,7 @@ class Core:
             arc.bound,
             arc.since,
             arc.preemptions,
-            self._state.index.ahead(arc) if arc.hold is None else None,
+            ahead,
             reason,
             arc.reason,
         )
@@ -177,8 +177,7 @@ class Core:
                 self._lose_rc(rc, reason)
             case model.ClientLost(client, reason):
                 for lost in self.arcs_of(client):
-                    why = Reason(ReasonCode.CLIENT_LOST, detail=reason)
-                    self._end_request(lost, Outcome.CLIENT_LOST, why)
+                    self._end_request(lost, Outcome.CLIENT_LOST, Reason(ReasonCode.CLIENT_LOST, detail=reason))
             case model.HandedOver(arc, to, renamed):
                 self._hand_over(arc, to, renamed)
             case model.LeadTaken(term, recovered_holds, waiting):
@@ -242,9 +241,8 @@ class Core:
         if arc.hold is None:
             self._effects.append(model.Dropped(arc.id, arc.request.client, Outcome.HANDED_OVER, reason))
         else:
-            old = self._revocation(arc, arc.hold, Outcome.HANDED_OVER, reason, requeued=False)
-            self._effects.append(old)
-        for rc in self._state.rcs_in(self._state.possible_mask(arc) & self._state.sharable):
+            self._effects.append(self._revocation(arc, arc.hold, Outcome.HANDED_OVER, reason, requeued=False))
+        for rc in self._state.possible_sharables(arc):
             self._votes.rename_arc(rc.name, arc.id, renamed)
         self._state.hand_over(arc, to, renamed)
         if arc.hold is not None:
@@ -300,9 +298,8 @@ class Core:
 
     def preempt(self, arc: Arc, by: Arc) -> bool:
         done = arc.past_min_runtime(self._state.now)
-        outcome = Outcome.COMPLETED if done else Outcome.PREEMPTED
         reason = Reason(ReasonCode.DISPLACED if done else ReasonCode.PREEMPTED, by=(by.party,))
-        self._end_hold(arc, outcome, reason)
+        self._end_hold(arc, Outcome.COMPLETED if done else Outcome.PREEMPTED, reason)
         return arc.id in self._state.queued
 
     def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None:
@@ -338,7 +335,7 @@ class Core:
 
     def _forget(self, arc: Arc) -> None:
         self._state.forget(arc)
-        for rc in self._state.rcs_in(self._state.possible_mask(arc) & self._state.sharable):
+        for rc in self._state.possible_sharables(arc):
             self._votes.forget_arc(rc.name, arc.id)
 
     def number(self) -> int:

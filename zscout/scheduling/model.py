@@ -7,8 +7,10 @@ parameters are `Fraction`, so that sums are exact (0.1 + 0.2 is 0.3).
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Mapping
+import operator
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, TypeAlias
@@ -218,6 +220,11 @@ class Rc:
     def non_preemptible_holders(self, arc: Arc, now: Ns) -> list[Arc]:
         """Its holders that are not preempted for `arc`."""
         return [holder for holder in self.holders.values() if not holder.preemptible_by(arc, now)]
+
+
+def union(masks: Iterable[int]) -> int:
+    """The bits of all masks."""
+    return functools.reduce(operator.or_, masks, 0)
 
 
 # Events: each carries everything the core may know about it

@@ -38,6 +38,17 @@ rest to the next."""
 LEAST: Final = 0.01
 CHUNK: Final = 40
 """Items whose ranks are weighed in one stage: their weights are powers of two."""
+WORK: Final = 200_000
+"""Steps of branch and bound, times items, before a group counts as large: some 20 ms. What is not proven by
+then seldom is soon after."""
+MAX_PACKED: Final = 80
+"""Larger groups are not even tried by branch and bound: at 30x60 it takes 11 ms and CP-SAT 18, at 40x80 it
+seldom comes to a proof."""
+STEPS: Final = 6_000
+"""Steps of local search for a large group."""
+MAX_VETOES: Final = 256
+"""Vetoes on one group. A voter gives no reason that could be reckoned with, so a proof may take a question
+for each of very many sets; beyond so many vetoes `priority` decides the group."""
 
 
 @functools.cache
@@ -139,21 +150,6 @@ class _Solver:
                     self.model.add_bool_and(self.takes[other] for other in others).only_enforce_if(vetoed)
                     excuses.append(vetoed)
             self.model.add_bool_or([self.takes[running], *excuses])
-
-
-WORK: Final = 200_000
-"""Steps of branch and bound, times items, before a group counts as large: some 20 ms. What is not proven by
-then seldom is soon after."""
-MAX_PACKED: Final = 80
-"""Larger groups are not even tried by branch and bound: at 30x60 it takes 11 ms and CP-SAT 18, at 40x80 it
-seldom comes to a proof."""
-STEPS: Final = 6_000
-"""Steps of local search for a large group."""
-
-
-MAX_VETOES: Final = 256
-"""Vetoes on one group. A voter gives no reason that could be reckoned with, so a proof may take a question
-for each of very many sets; beyond so many vetoes `priority` decides the group."""
 
 
 class Optimal(Strategy):

@@ -103,13 +103,10 @@ class PackingProblem:
     def value(self, chosen: int) -> int:
         return sum(self.worth[number] for number in numbers(chosen))
 
-    def preemptions(self, chosen: int) -> int:
-        """How many would be preempted."""
-        return sum(1 for number in self.running if self.items[number].in_min_runtime and not chosen >> number & 1)
-
     def key(self, chosen: int) -> tuple[int, int]:
         """Compares sets by value, then by preemptions; greater is better."""
-        return self.value(chosen), -self.preemptions(chosen)
+        left_out = (self.items[number] for number in self.running if not chosen >> number & 1)
+        return self.value(chosen), -sum(item.in_min_runtime for item in left_out)
 
     def complete(self, preferred: int = 0) -> int:
         """A feasible set that nothing can be added to: level by level the running items, the preferred, the
@@ -166,9 +163,7 @@ class _BranchAndBound:
         ]
         self.in_min_runtime = [item.in_min_runtime for item in items]
         self.ends = any(self.in_min_runtime)
-        self.checked = any(
-            item.running and not always_kept for item, always_kept in zip(items, self.always_kept, strict=True)
-        )
+        self.checked = any(item.running and not kept for item, kept in zip(items, self.always_kept, strict=True))
         self.best = -1
         self.best_preemptions = 0
         self.chosen = 0

@@ -50,7 +50,7 @@ from operator import attrgetter
 from typing import Final, Literal, TypeAlias
 
 from zscout.config.scheduling_policy import StrategyName
-from zscout.scheduling.model import Arc, ArcState, Rank, Rc
+from zscout.scheduling.model import Arc, ArcState, Rank, Rc, union
 from zscout.scheduling.patterns import bind, no_match
 from zscout.scheduling.reason import SHOWN, Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible, Reservations
@@ -96,10 +96,7 @@ class AdmissionCheck:
 
     def footprint(self) -> int:
         """All that the ARC would take or free, as bits."""
-        bits = self.arc.mask
-        for holder in (*self.exclusive_victims.values(), *self._preemptible_sharers()):
-            bits |= holder.mask
-        return bits
+        return union(arc.mask for arc in (self.arc, *self.exclusive_victims.values(), *self._preemptible_sharers()))
 
     def obstacle(self, off_limits: int) -> Inadmissible | None:
         """What keeps the ARC out whatever becomes of what is `off_limits`, with an RC that does so by itself:
@@ -125,13 +122,8 @@ class AdmissionCheck:
 
     def masked_obstacles(self) -> int:
         """Bits of the RCs that keep the ARC out at present, whether off limits or not."""
-        bits = 0
-        for rc, _ in self.non_preemptible:
-            bits |= rc.bit
-        for rc in self._sharables:
-            if (answer := self._answer(rc)) is not None and not answer.accept:
-                bits |= rc.bit
-        return bits
+        vetoing = (rc.bit for rc in self._sharables if (answer := self._answer(rc)) is not None and not answer.accept)
+        return union(rc.bit for rc, _ in self.non_preemptible) | union(vetoing)
 
     def decide(self) -> Inadmissible | VotesNeeded | Admissible:
         """Steps 3b and 3c, with the votes that are known. Only for a check without an obstacle."""
@@ -305,9 +297,7 @@ class Pass:
                 bits = rc.bit
             case "off limits":
                 bits = self.off_limits
-                for rc in arc.rcs:
-                    if any(holder.mask & self.off_limits for holder in rc.holders.values()):
-                        bits |= rc.bit
+                bits |= union(rc.bit for rc in arc.rcs if any(one.mask & bits for one in rc.holders.values()))
             case VotesNeeded(proposals):
                 bits = sum(rc.bit for rc, _ in proposals if rc.name in self.votes.unresponsive)
             case _:
@@ -346,8 +336,8 @@ class Pass:
             case "over quota":
                 # Whoever of its owner's ends may let it go: no RC shows that.
                 self.index.put(arc, ArcState.READY)
-                owner, quota = arc.owner, self.state.policy.max_running_per_host
-                self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=owner, number=quota or 0))
+                quota = self.state.policy.max_running_per_host or 0
+                self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=arc.owner, number=quota))
             case "off limits":
                 self._defer(arc, check, ArcState.DEFERRED)
                 self.actions.wait(arc, VOTING, settled=False)

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-from zscout.scheduling.model import Arc, Rc
+from zscout.scheduling.model import Arc, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.votes import HolderSet
@@ -61,7 +61,6 @@ class Reservations:
     """What is reserved for whom, of those starving."""
 
     def __init__(self, state: SchedulerState, patience: Ns) -> None:
-        """`patience` in ns."""
         self._state, self._votes, self._patience = state, state.votes, patience
         self.by_rc: dict[int, list[Reservation]] = {}
         """By bit of the RC, the first that starved first; of an exclusive RC only the first."""
@@ -94,8 +93,7 @@ class Reservations:
         rcs = list(self._state.rcs_in(arc.named_mask)) if arc.patterns else list(arc.rcs)
         for need in arc.patterns:
             left = [rc for rc in self._state.matching(need) if rc.present and rc not in rcs]
-            placeholder = Rc(need, 0)
-            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc), rc.bit), default=placeholder))
+            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc), rc.bit), default=Rc(need, 0)))
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:
@@ -145,16 +143,15 @@ class Reservations:
             if not rc.sharable:
                 return Inadmissible(rc, reason)
             together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
-            if not self._votes.accepts(rc.name, together):
-                known = self._votes.known(rc.name, together)
-                is_open = known is None and rc.name not in self._votes.unresponsive
+            answer = self._votes.known(rc.name, together)
+            if answer is None or not answer.accept:
+                is_open = answer is None and rc.name not in self._votes.unresponsive
                 return Inadmissible(rc, reason, together if is_open else None)
         return None
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
         """Whether `rc`, exclusive, is reserved for another that goes before `arc`."""
-        reserved = self.by_rc.get(rc.bit, ())
-        return any(one.arc is not arc and self._delays(arc, one) for one in reserved)
+        return any(one.arc is not arc and self._delays(arc, one) for one in self.by_rc.get(rc.bit, ()))
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
@@ -166,8 +163,5 @@ class Reservations:
 
     def changed(self, earlier: Reservations) -> int:
         """Bits of the RCs at which the reservations differ from the `earlier` ones."""
-        bits = 0
-        for bit in self.by_rc.keys() | earlier.by_rc.keys():
-            if self.by_rc.get(bit) != earlier.by_rc.get(bit):
-                bits |= bit
-        return bits
+        either = self.by_rc.keys() | earlier.by_rc.keys()
+        return union(bit for bit in either if self.by_rc.get(bit) != earlier.by_rc.get(bit))

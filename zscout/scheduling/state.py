@@ -15,7 +15,7 @@ from typing import Protocol
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName
 from zscout.keyexpr import matcher
-from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc
+from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc, union
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
 from zscout.types import ArcId, ClientId, Need, Ns, Params, RcName
@@ -181,13 +181,10 @@ class SchedulerState:
             found = arc.request.needs[next(meets)]
         return found
 
-    def possible_mask(self, arc: Arc) -> int:
-        """Bits of all RCs that an ARC could hold."""
-        bits = arc.mask
-        for need in arc.patterns:
-            for rc in self.matching(need):
-                bits |= rc.bit
-        return bits
+    def possible_sharables(self, arc: Arc) -> Iterator[Rc]:
+        """All sharable RCs that an ARC could hold."""
+        matching = union(rc.bit for need in arc.patterns for rc in self.matching(need)) if arc.patterns else 0
+        return self.rcs_in((arc.mask | matching) & self.sharable)
 
     def mask(self, names: Iterable[RcName]) -> int:
         mask, rcs = 0, self.rcs
