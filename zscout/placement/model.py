@@ -81,8 +81,7 @@ class RankQuery:
     @classmethod
     def of(cls, asked: ComponentSpec | RankAsk) -> RankQuery:
         hosts = None if asked.hosts is None else frozenset(asked.hosts)
-        labels = frozenset(asked.labels)
-        return cls(asked.kind, asked.metric, asked.policy, labels, asked.memory, hosts)
+        return cls(asked.kind, asked.metric, asked.policy, frozenset(asked.labels), asked.memory, hosts)
 
 
 NO_REPORT: Final = "no report of it"

@@ -1,16 +1,15 @@
 """The core of the RCM: events in, effects out, time given.
 
-Every decision of the RCM is made in this room, and this is its door; there is no clock, thread, socket or
-log inside. This module applies events and carries out what is decided; who starts, and who is preempted for
-it, is decided by the strategy's pass (`priority.py` has its steps), ARC by ARC, by the
-rule of `Arc.preemptible_by`; what RCs voted is in `votes.py`, who holds what in `state.py`. The RCM
-service, `zscout replay`, the study and the forecast drive this one class:
+Every decision of the RCM is made in this room, and this is its door; there is no clock, thread, socket or log inside.
+This module applies events and carries out what is decided; who starts, and who is preempted for it, is decided by the
+strategy's pass (`priority.py` has its steps), ARC by ARC, by the rule of `Arc.preemptible_by`; what RCs voted is in
+`votes.py`, who holds what in `state.py`. The RCM service, `zscout replay`, the study and the forecast drive this one
+class:
 
     effects = core.handle(now, Requested(request), ...)
 
-A batch of events is one instant: holds whose time is over end first, then the events are applied in the
-order given, then one pass runs. The caller carries the effects out in their order and comes back with what
-follows from them: votes, and a `Tick` at the latest when `WakeAt` says.
+A batch of events is one instant (`Core.handle` has its steps). The caller carries the effects out in their order and
+comes back with what follows from them: votes, and a `Tick` at the latest when `WakeAt` says.
 """
 
 from __future__ import annotations

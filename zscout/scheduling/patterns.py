@@ -4,10 +4,9 @@ While an ARC waits, each check *binds* it: gives each of its patterns an RC of i
 So a bound ARC is like any other, and every strategy knows patterns. Where a bound RC keeps the ARC out, the check goes
 on with the next best. A hold keeps its binding to its end.
 
-How good a choice is (`Fitness`): an RC that is free, before one that can be preempted, before one that is reserved for
-another or does not answer, before one that is held. The worst of an ARC's choices counts: of two bindings, the one that
-gets by without the worse kind is taken, by augmenting paths (Kuhn's algorithm), so that an ARC never waits where some
-choice of free RCs would let it run. Between equals, the RC that fewest wait for by name: they have no other choice.
+The worst of an ARC's choices counts (`Fitness`): of two bindings, the one that gets by without the worse kind is taken,
+by augmenting paths (Kuhn's algorithm), so that an ARC never waits where some choice of free RCs would let it run.
+Between equals, the RC that fewest wait for by name: they have no other choice.
 
 `optimal` is exact for the binding of the instant; it does not search all bindings of all ARCs.
 """

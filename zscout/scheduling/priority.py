@@ -16,10 +16,9 @@ A pass:
 A vote that is not known yet leaves a check undecided. What an undecided check would take or free is *off
 limits* for lower ranks, and so is what a check stopped by that would take or free; all others go on.
 
-**Why a pass can be run again at any time.** What a lower rank takes never makes a higher one possible (a
-lower rank only preempts holders that would have been preempted for the higher one as well, and votes are
-monotone). So an answer that arrives simply runs the next pass, and the outcome is that of votes given on
-the spot.
+**Why a pass can be run again at any time.** What a lower rank takes never makes a higher one possible (a lower rank
+only preempts holders that would have been preempted for the higher one as well, and votes are monotone). So an answer
+that arrives simply runs the next pass, and the outcome is that of votes given on the spot.
 
 **Why the index may pass ARCs over** (`QueueIndex`). The outcome is that of a pass over the whole queue,
 because one is passed over only where its check would again come to "waits", stopping nobody and asking

@@ -175,11 +175,9 @@ class SchedulerState:
 
     def params(self, arc: Arc, rc: Rc) -> Params:
         """What an ARC would ask of an RC, whether it is bound to it at present or not."""
-        found = arc.needs.get(rc.name)
-        if found is None:
-            meets = (need for need in arc.patterns if rc in self.matching(need))
-            found = arc.request.needs[next(meets)]
-        return found
+        if rc.name in arc.needs:
+            return arc.needs[rc.name]
+        return arc.request.needs[next(need for need in arc.patterns if rc in self.matching(need))]
 
     def possible_sharables(self, arc: Arc) -> Iterator[Rc]:
         """All sharable RCs that an ARC could hold."""
@@ -263,10 +261,7 @@ class SchedulerState:
             self._rename(arc, to, renamed)
             self.enqueue(arc, arc.since)
             return
-        del self.running[arc.id]
-        for rc in arc.rcs:
-            del rc.holders[arc.id]
-        self._uncount_owner(arc)
+        self._remove_running(arc)
         self._rename(arc, to, renamed)
         arc.entry = self._next_entry()
         self._add_running(arc)
@@ -291,12 +286,8 @@ class SchedulerState:
         """Takes everything from a running ARC; what it was holding is returned."""
         hold = arc.hold
         assert hold is not None, arc.id  # noqa: S101
-        del self.running[arc.id]
-        self.version += 1
-        self._uncount_owner(arc)
+        self._remove_running(arc)
         arc.hold = None
-        for rc in arc.rcs:
-            del rc.holders[arc.id]
         self.busy &= ~arc.mask
         self.index.freed |= arc.mask
         return hold
@@ -352,15 +343,18 @@ class SchedulerState:
         for rc in arc.rcs:
             rc.holders[arc.id] = arc
 
+    def _remove_running(self, arc: Arc) -> None:
+        del self.running[arc.id]
+        self.version += 1
+        self.running_by_owner[arc.owner] -= 1
+        if not self.running_by_owner[arc.owner]:
+            del self.running_by_owner[arc.owner]
+        for rc in arc.rcs:
+            del rc.holders[arc.id]
+
     def _count_demand(self, arc: Arc, by: int) -> None:
         for rc in self.rcs_in(arc.named_mask) if arc.patterns else arc.rcs:
             rc.demand += by
-
-    def _uncount_owner(self, arc: Arc) -> None:
-        owner = arc.owner
-        self.running_by_owner[owner] -= 1
-        if not self.running_by_owner[owner]:
-            del self.running_by_owner[owner]
 
     def _next_entry(self) -> int:
         self.entries += 1
