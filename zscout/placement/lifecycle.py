@@ -38,8 +38,8 @@ class Lifecycle:
         state = self.state
         record = state.get(component)
         if record is None:
-            record = state.add(component, spec)
-            if record is None:
+            record = ComponentRecord(component, spec)
+            if not state.add(record):
                 state.refuse(component, "too_many", f"{len(state.components)} components are placed already")
                 return
             self.place_again(record)

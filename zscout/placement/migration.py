@@ -260,12 +260,11 @@ class Migrations:
     def cancel(self, record: ComponentRecord, *, stop_standby: bool = True) -> None:
         """Ends the migration, if there is one."""
         move = record.migration
-        if move is not None:
-            self._close(record, move)
-            if stop_standby:
-                self.lifecycle.surplus.add(
-                    record.component, move.incarnation, move.to, move.start_until, token=move.token
-                )
+        if move is None:
+            return
+        self._close(record, move)
+        if stop_standby:
+            self.lifecycle.surplus.add(record.component, move.incarnation, move.to, move.start_until, token=move.token)
 
     def _close(self, record: ComponentRecord, move: Migration) -> None:
         state = self.state

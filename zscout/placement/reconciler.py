@@ -133,8 +133,7 @@ class Reconciler:
         if record is None:
             self._adopt(host, listed)
         elif listed.phase == "ended":
-            end = Termination(listed.ended or "lost", listed.reason, listed.tail)
-            self._listed_as_ended(record, host, incarnation, end)
+            self._listed_as_ended(record, host, listed)
         elif incarnation in record.ended_incarnations:
             self.surplus.add(component, incarnation, host)
         elif (move := record.migration) is not None and incarnation == move.incarnation:
@@ -149,8 +148,8 @@ class Reconciler:
         state = self.state
         if listed.phase in ("ended", "standby") or host not in state.alive:
             return
-        record = state.add(listed.component, listed.spec, "starting", listed.incarnation, host)
-        if record is None:
+        record = ComponentRecord(listed.component, listed.spec, "starting", listed.incarnation, host=host)
+        if not state.add(record):
             return
         running = listed.phase in RUNNING
         record.movable, record.confirmed = listed.movable, running
@@ -178,10 +177,9 @@ class Reconciler:
                 record.enter("starting")
                 self.state.start(record)
 
-    def _listed_as_ended(
-        self, record: ComponentRecord, host: HostName, incarnation: Incarnation, end: Termination
-    ) -> None:
-        move = record.migration
+    def _listed_as_ended(self, record: ComponentRecord, host: HostName, listed: ComponentView) -> None:
+        move, incarnation = record.migration, listed.incarnation
+        end = Termination(listed.ended or "lost", listed.reason, listed.tail)
         if self.surplus.has(record.component, incarnation):
             self.surplus.ended(record.component, incarnation)
             self.lifecycle.surplus_ended(record.component)
@@ -284,8 +282,8 @@ class Reconciler:
         moved = status.state == "moving"
         stands: ComponentState = "running" if moved else status.state
         host = status.host if stands in ("starting", "running", "stopping") else None
-        record = state.add(status.component, status.spec, stands, status.incarnation, host)
-        if record is None:
+        record = ComponentRecord(status.component, status.spec, stands, status.incarnation, host=host)
+        if not state.add(record):
             return
         record.reason = f"it was to move to {status.to}" if moved else status.reason
         record.host_reason, record.tail, record.wanted = status.reason, status.tail, status.wanted

@@ -290,22 +290,15 @@ class PlacementState:
             self.refuse(component, "unknown_component", f"there is no component {component}")
         return self.get(component)
 
-    def add(
-        self,
-        component: ComponentId,
-        spec: ComponentSpec,
-        state: ComponentState = "waiting",
-        incarnation: Incarnation = 0,
-        host: HostName | None = None,
-    ) -> ComponentRecord | None:
-        """None: there is no room for it."""
+    def add(self, record: ComponentRecord) -> bool:
+        """False: there is no room for it."""
         if len(self.components) >= MAX_COMPONENTS:
             if not self._ended:
-                return None
+                return False
             self.forget(next(iter(self._ended)))
-        record = self.components[component] = ComponentRecord(component, spec, state, incarnation, host=host)
-        self.mark_changed(component)
-        return record
+        self.components[record.component] = record
+        self.mark_changed(record.component)
+        return True
 
     def retire(self, record: ComponentRecord) -> None:
         """It is only remembered from now on."""

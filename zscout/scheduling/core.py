@@ -179,8 +179,8 @@ class Core:
                     self._end_request(lost, Outcome.CLIENT_LOST, Reason(ReasonCode.CLIENT_LOST, detail=reason))
             case model.HandedOver(arc, to, renamed):
                 self._hand_over(arc, to, renamed)
-            case model.LeadTaken(term, recovered_holds, waiting):
-                self._take_lead(term, recovered_holds, waiting)
+            case model.LeadTaken():
+                self._take_lead(event)
             case model.Tick():
                 pass
 
@@ -250,14 +250,12 @@ class Core:
         elif arc.reason:
             self._effects.append(model.Queued(arc.id, to, arc.reason))
 
-    def _take_lead(
-        self, term: Term, recovered_holds: tuple[model.RecoveredHold, ...], waiting: tuple[model.Requested, ...]
-    ) -> None:
-        if term <= self.term:
-            raise ValueError(f"the new term {term} is not above {self.term}")
-        self.term, self.seq, self._arrivals = term, 0, 0
+    def _take_lead(self, lead: model.LeadTaken) -> None:
+        if lead.term <= self.term:
+            raise ValueError(f"the new term {lead.term} is not above {self.term}")
+        self.term, self.seq, self._arrivals = lead.term, 0, 0
         # The newest grant is the truth where two claim one exclusive RC.
-        for held in sorted(recovered_holds, key=lambda held: held.grant, reverse=True):
+        for held in sorted(lead.recovered_holds, key=lambda held: held.grant, reverse=True):
             if self._state.arc(held.request.arc) is not None:
                 continue
             arc = self._new_arc(held.request, held.place)
@@ -277,7 +275,7 @@ class Core:
             else:
                 self._state.start(arc, hold)
         self._expire()
-        for asked in waiting:
+        for asked in lead.waiting:
             self._ask(asked)
 
     def _expire(self) -> None:

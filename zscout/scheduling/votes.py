@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from zscout.scheduling.model import QUANTUM
 from zscout.types import ArcId, Ns, RcName
@@ -70,7 +70,7 @@ class RcVotes:
         for arc in holders:
             self._accepted_with.setdefault(arc, {})[holders] = None
         while len(self.accepted) > ANSWERS_PER_RC:
-            self._drop_accepted(next(iter(self.accepted)))
+            self._drop(next(iter(self.accepted)), self.accepted, self._accepted_with)
 
     def veto(self, holders: HolderSet, reason: str) -> None:
         if holders not in self.vetoed:
@@ -78,24 +78,24 @@ class RcVotes:
             self._vetoed_at.setdefault(rarest, {})[holders] = None
         self.vetoed[holders] = reason
         while len(self.vetoed) > ANSWERS_PER_RC:
-            self._drop_vetoed(next(iter(self.vetoed)))
+            self._drop(next(iter(self.vetoed)), self.vetoed, self._vetoed_at)
 
     def forget(self, arc: ArcId) -> None:
         """Of sets with this ARC, what was accepted is accepted without it too, and vetoes are dropped."""
         for holders in list(self._accepted_with.get(arc, ())):
-            self._drop_accepted(holders)
+            self._drop(holders, self.accepted, self._accepted_with)
             if len(holders) > 1:
                 self.accept(holders - {arc})
         for holders in [holders for holders in self.vetoed if arc in holders]:
-            self._drop_vetoed(holders)
+            self._drop(holders, self.vetoed, self._vetoed_at)
 
     def rename(self, arc: ArcId, renamed: ArcId) -> list[int]:
         """An ARC goes on by another name. Returns the numbers of the open proposals that name it."""
         for holders in list(self._accepted_with.get(arc, ())):
-            self._drop_accepted(holders)
+            self._drop(holders, self.accepted, self._accepted_with)
             self.accept(_renamed(holders, arc, renamed))
         for holders, reason in [item for item in self.vetoed.items() if arc in item[0]]:
-            self._drop_vetoed(holders)
+            self._drop(holders, self.vetoed, self._vetoed_at)
             self.veto(_renamed(holders, arc, renamed), reason)
         self.overdue = {_renamed(holders, arc, renamed) for holders in self.overdue}
         proposed = [holders for holders in self.proposals if arc in holders]
@@ -103,27 +103,19 @@ class RcVotes:
             self.proposals[_renamed(holders, arc, renamed)] = self.proposals.pop(holders)
         return [number for holders in proposed for number in self.proposals[_renamed(holders, arc, renamed)]]
 
-    def _drop_accepted(self, holders: HolderSet) -> None:
-        del self.accepted[holders]
+    def _drop(
+        self, holders: HolderSet, answers: dict[HolderSet, Any], by_arc: dict[ArcId, dict[HolderSet, None]]
+    ) -> None:
+        del answers[holders]
         for arc in holders:
-            _discard(self._accepted_with, arc, holders)
-
-    def _drop_vetoed(self, holders: HolderSet) -> None:
-        del self.vetoed[holders]
-        for arc in holders:
-            _discard(self._vetoed_at, arc, holders)
+            sets = by_arc.get(arc, {})
+            sets.pop(holders, None)
+            if not sets:
+                by_arc.pop(arc, None)
 
 
 def _renamed(holders: HolderSet, arc: ArcId, renamed: ArcId) -> HolderSet:
     return holders - {arc} | {renamed} if arc in holders else holders
-
-
-def _discard(index: dict[ArcId, dict[HolderSet, None]], arc: ArcId, holders: HolderSet) -> None:
-    sets = index.get(arc)
-    if sets is not None and holders in sets:
-        del sets[holders]
-        if not sets:
-            del index[arc]
 
 
 class Votes:
