@@ -317,24 +317,19 @@ class Migrations:
         names = [(record.component, record.spec.kind) for record in records if record.migration is None]
         for component in state.balancer.heaviest_first(names):
             record = state.components[component]
+            state.mark_changed(component)
             if not record.movable:
-                self._stays(record, f"it can't be moved; {host} is drained")
+                record.drain_reason = f"it can't be moved; {host} is drained"
             elif record.not_before <= state.now and room > 0:
                 hosts, why_none = state.eligible_hosts(record.spec, other_than=host)
                 if hosts:
                     room -= 1
-                    state.mark_changed(component)
                     self.begin(record, hosts[0].host, f"{host} is drained")
                 else:
                     record.not_before = state.now + RETRY
-                    self._stays(record, f"{host} is drained, and no other host will do: {why_none}")
+                    record.drain_reason = f"{host} is drained, and no other host will do: {why_none}"
         if any(record.movable and record.migration is None for record in records):
             state.timers.set(TimerKind.DRAIN, "", state.now + RETRY)
-
-    def _stays(self, record: ComponentRecord, why: str) -> None:
-        if record.drain_reason != why:
-            record.drain_reason = why
-            self.state.mark_changed(record.component)
 
 
 def _reservation(record: ComponentRecord) -> ComponentId:

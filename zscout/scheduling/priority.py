@@ -429,10 +429,7 @@ class Pass:
     def _needs_check(self, rc: Rc, arc: Arc) -> bool:
         """False ends it: `rc`, exclusive and not off limits, has a holder again that is preempted for nobody from
         `arc` downwards."""
-        if rc.sharable or not rc.holders or rc.bit & self.off_limits:
-            return True
-        (holder,) = rc.holders.values()
-        if holder.preemptible_by(arc, self.state.now):
+        if rc.sharable or rc.bit & self.off_limits or not rc.non_preemptible_holders(arc, self.state.now):
             return True
         if not self._reports_left[rc.bit]:
             del self._reports_left[rc.bit]
