@@ -245,7 +245,7 @@ class Core:
             self._votes.rename_arc(rc.name, arc.id, renamed)
         self._state.hand_over(arc, to, renamed)
         if arc.hold is not None:
-            arc.hold = replace(arc.hold, grant=self._next_grant())
+            arc.hold = replace(arc.hold, grant=Grant(self.term, self.number()))
             self._effects.append(self._granted(arc, arc.hold))
         elif arc.reason:
             self._effects.append(model.Queued(arc.id, to, arc.reason))
@@ -288,7 +288,7 @@ class Core:
     # What a strategy may do (state.Actions)
 
     def start(self, arc: Arc) -> None:
-        grant = self._next_grant()
+        grant = Grant(self.term, self.number())
         hold = Hold(grant, self._state.now, self._state.now + arc.request.min_runtime, self._state.protected_below(arc))
         self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold))
@@ -339,9 +339,6 @@ class Core:
         """The next number of this term. Grants take theirs here, and so does all else that is published."""
         self.seq += 1
         return self.seq
-
-    def _next_grant(self) -> Grant:
-        return Grant(self.term, self.number())
 
     def _granted(self, arc: Arc, hold: Hold) -> model.Granted:
         end = None if arc.request.keep else hold.end
