@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+from contextlib import suppress
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Final
 
@@ -123,10 +124,8 @@ def installed_kinds() -> dict[str, str]:
     A kind that two packages bring, in different places, is none: which one is meant nobody knows."""
     found: dict[str, set[str]] = {}
     for entry in metadata.entry_points(group=GROUP):
-        try:
+        with suppress(BadName):
             found.setdefault(check_name(entry.name, "kind"), set()).add(entry.value)
-        except BadName:
-            continue
     return {name: values.pop() for name, values in sorted(found.items()) if len(values) == 1}
 
 

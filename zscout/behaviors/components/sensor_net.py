@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import Annotated, Any, Final
 
 from msgspec import Meta, Struct, structs
@@ -46,13 +46,10 @@ class SharedParams(Struct, kw_only=True):
         """Raises BadInput."""
         check_rc_name(robot, PARAMS / "robot", "robot")
         for kind, need in (("radio", self.radio), ("video", self.video), ("framegrabber", self.framegrabber)):
-            try:
-                fits = check_need(need).startswith(f"{kind}/")
-            except BadName:
-                fits = False
-            if not fits:
-                remedy = f'name one, or a pattern, as in "{kind}/*"'
-                raise (PARAMS / kind).bad(f"{quoted(need)} is no {kind}", remedy)
+            with suppress(BadName):
+                if check_need(need).startswith(f"{kind}/"):
+                    continue
+            raise (PARAMS / kind).bad(f"{quoted(need)} is no {kind}", f'name one, or a pattern, as in "{kind}/*"')
         return RobotNeeds(robot, self.radio, self.video, self.framegrabber, self.command_rate)
 
 

@@ -64,9 +64,7 @@ class HeldRobot:
 
         Wheels that are to stand are stopped at once, by one command."""
         if left == 0 and right == 0:
-            if self._still:
-                return True
-            self._still = await self._command({"name": "stop"})
+            self._still = self._still or await self._command({"name": "stop"})
             return self._still
         now = self.held.now()
         if now < self._next:
