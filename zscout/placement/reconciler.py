@@ -145,11 +145,8 @@ class Reconciler:
 
     def _adopt(self, host: HostName, listed: ComponentView) -> None:
         """A placer of a term before had it started."""
-        state = self.state
-        if listed.phase in ("ended", "standby") or host not in state.alive:
-            return
         record = ComponentRecord(listed.component, listed.spec, "starting", listed.incarnation, host=host)
-        if not state.add(record):
+        if listed.phase in ("ended", "standby") or host not in self.state.alive or not self.state.add(record):
             return
         running = listed.phase in RUNNING
         record.movable, record.confirmed = listed.movable, running
@@ -158,7 +155,7 @@ class Reconciler:
             self.lifecycle.runs(record)
         else:
             record.reason = f"found starting on {host}"
-            state.start(record)
+            self.state.start(record)
 
     def _listed_alive(self, record: ComponentRecord, host: HostName, listed: ComponentView) -> None:
         """The record's incarnation lives."""

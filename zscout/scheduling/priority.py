@@ -20,18 +20,16 @@ limits* for lower ranks, and so is what a check stopped by that would take or fr
 only preempts holders that would have been preempted for the higher one as well, and votes are monotone). So an answer
 that arrives simply runs the next pass, and the outcome is that of votes given on the spot.
 
-**Why the index may pass ARCs over** (`QueueIndex`). The outcome is that of a pass over the whole queue,
-because one is passed over only where its check would again come to "waits", stopping nobody and asking
-nothing:
+**Why the index may pass ARCs over** (`QueueIndex`). The outcome is that of a pass over the whole queue, because one is
+passed over only where its check would again come to "waits", stopping nobody and asking nothing:
 
-- It is WATCHING an RC outside what is off limits. (a) An absent RC: until it joins. (b) An exclusive RC
-  whose holder is not preempted for it: until that holder goes or passes its minimum runtime. Who takes the
-  RC instead ranks above all that still watch it below, so it is not preempted for them either: after the
-  first watcher that takes the RC, the others need no check. (c) A sharable RC that vetoed it beside the
-  holders that are not preempted: until one of them goes or passes its minimum runtime, or the RC's rules
-  change; more holders leave a veto in force, because what an RC accepts it accepts of every subset. (d) An
-  RC that is reserved for another (`reservations.py`): until its reservations change. When the RC
-  becomes off limits, its watchers below are checked.
+- It is WATCHING an RC outside what is off limits. (a) An absent RC: until it joins. (b) An exclusive RC whose holder is
+  not preempted for it: until that holder goes or passes its minimum runtime. Who takes the RC instead ranks above all
+  that still watch it below, so it is not preempted for them either: after the first watcher that takes the RC, the
+  others need no check. (c) A sharable RC that vetoed it beside the holders that are not preempted: until one of them
+  goes or passes its minimum runtime, or the RC's rules change; more holders leave a veto in force, because what an RC
+  accepts it accepts of every subset. (d) An RC that is reserved for another (`reservations.py`): until its reservations
+  change. When the RC becomes off limits, its watchers below are checked.
 - It is PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked
   when anything within changes, is answered or becomes off limits, and when that RC may be asked again.
 - It is VOTING or DEFERRED, but nothing within its footprint has changed: if what it would take is off limits
