@@ -10,14 +10,7 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
-from zscout.config.scheduling_policy import (
-    OPERATOR_PRIORITY,
-    PATIENCE,
-    Preempt,
-    Promise,
-    SchedulingPolicy,
-    StrategyName,
-)
+from zscout.config.scheduling_policy import DEFAULT, PATIENCE, Preempt, Promise, SchedulingPolicy, StrategyName
 from zscout.config.strict import BadInput, Where, check_name, check_names, check_unique, key, quoted, read_toml, seconds
 from zscout.types import SECOND, Ns
 
@@ -133,14 +126,14 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     strategy: Annotated[StrategyName, key("By which the RCM schedules.")] = "adaptive"
     operator_priority: Annotated[
         int, key("ARCs of this priority and above are an operator's: nothing keeps them.", 0, 1_000_000_000)
-    ] = OPERATOR_PRIORITY
-    preempt: Annotated[Preempt, key("When one ARC may take the hold of another of lower priority.")] = "always"
+    ] = DEFAULT.operator_priority
+    preempt: Annotated[Preempt, key("When one ARC may take the hold of another of lower priority.")] = DEFAULT.preempt
     patience: Annotated[
         Ns, seconds("0", "31622400", "`adaptive`: after this long an ARC that waits is due; 0: never.")
     ] = PATIENCE
     promise: Annotated[
         Promise, key("Whom an ARC that is due goes before: equal and lower priority, or all but operators.")
-    ] = "equals"
+    ] = DEFAULT.promise
 
 
 class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
@@ -184,16 +177,14 @@ def _fleet(file: FleetFile, top: Where) -> Fleet:
             f'is "{table.promise}", but only "adaptive" with some patience promises anything',
             'write strategy = "adaptive" and a patience above 0, or promise = "equals"',
         )
-    scheduling = SchedulingPolicy(
+    policy = SchedulingPolicy(
         preempt=table.preempt,
         operator_priority=table.operator_priority,
         patience=table.patience or None,
         promise=table.promise,
         max_running_per_host=file.limits.max_running_per_host or None,
     )
-    return Fleet(
-        table.name, table.candidates, table.strategy, scheduling, mesh, file.limits, file.timing, file.placement
-    )
+    return Fleet(table.name, table.candidates, table.strategy, policy, mesh, file.limits, file.timing, file.placement)
 
 
 def _check_timing(timing: Timing, lease: float, at: Where) -> None:

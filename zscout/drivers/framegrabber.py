@@ -69,8 +69,7 @@ class FramegrabberDriver(Driver):
             raise ValueError("a framegrabber has a source, a rate above 0 and a quality of 1 to 100")
         self._sources = dict(sources)
         self._receives = ", ".join(sorted(sources))
-        self._rate = rate
-        self._quality = quality
+        self._rate, self._quality = rate, quality
         self._meter = FrameMeter()
         self._holder: Holder | None = None
         self._source: str | None = None

@@ -18,7 +18,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
+from msgspec import structs
 
 from zscout.messages import EndedHold, Grants, Holder, Problem, RcmState, absurd
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
@@ -202,9 +202,7 @@ class HoldTable:
 
     def holders(self, now: Ns) -> list[Holder]:
         """The holders, with the time that each has left now."""
-        return [
-            msgspec.structs.replace(held.holder, remaining=(held.end - now) / SECOND) for held in self.held.values()
-        ]
+        return [structs.replace(held.holder, remaining=(held.end - now) / SECOND) for held in self.held.values()]
 
     # Changes
 

@@ -44,6 +44,11 @@ class Packet:
         _check("robot id", self.robot, MAX_ROBOT)
         _check("packet number", self.number, 255)
 
+    @property
+    def size(self) -> int:
+        """In bytes."""
+        return len(encode(self))
+
 
 @dataclass(frozen=True, slots=True)
 class DrivePacket(Packet):

@@ -105,17 +105,14 @@ class ResourceController:
         stall: StallWatch,
         on_failure: Callable[[Exception], object] = lambda _error: None,
     ) -> None:
-        self.mesh = mesh
-        self.name = name
-        self.driver = driver
+        self.mesh, self.name, self.driver = mesh, name, driver
         self.holds = HoldTable(name, hold_lease=round(hold_lease * SECOND))
         self.instance = new_instance()
         self.rules = 0
         self.health = "ok"
         self.queue = WorkQueue()
         self.directory = RcDirectory(mesh) if driver.relays else None
-        self.stall = stall
-        self._on_failure = on_failure
+        self.stall, self._on_failure = stall, on_failure
         self.supervisor = Supervisor(name, self._failed)
         self._leaders: set[Token] = set()
         self._declared: list[Declaration] = []

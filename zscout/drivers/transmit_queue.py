@@ -21,16 +21,7 @@ from typing import Final
 
 from zscout.drivers.airtime import RESERVE, Bucket, Share, urgent_burst
 from zscout.drivers.commands import RadioCamera, RadioDrive
-from zscout.drivers.packets import (
-    MAX_PACKET,
-    OVERHEAD,
-    CameraPacket,
-    DrivePacket,
-    HaltPacket,
-    Packet,
-    StopPacket,
-    encode,
-)
+from zscout.drivers.packets import MAX_PACKET, OVERHEAD, CameraPacket, DrivePacket, HaltPacket, Packet, StopPacket
 from zscout.mesh import Refused
 from zscout.types import SECOND, Grant, Ns, Place
 
@@ -313,13 +304,12 @@ class TransmitQueue:
 
     def _may_repeat(self, repeat: _Repeat) -> Fraction:
         """When a repeat may go out: where it is due, and the reserve has room for it."""
-        return max(Fraction(repeat.due), self._reserve.ready(len(encode(repeat.packet))))
+        return max(Fraction(repeat.due), self._reserve.ready(repeat.packet.size))
 
     def _transmit(self, packet: Packet, entered: Fraction, now: Ns, *, repeat: bool = False) -> OutgoingPacket:
-        size = len(encode(packet))
         if repeat or isinstance(packet, StopPacket | HaltPacket):
-            self._reserve.take(size, now)
+            self._reserve.take(packet.size, now)
         if not repeat:
             self._robots[packet.robot].sent(packet, now)
-        self._free_at = max(self._free_at, Fraction(now)) + size * self._ns_per_byte
+        self._free_at = max(self._free_at, Fraction(now)) + packet.size * self._ns_per_byte
         return OutgoingPacket(packet, entered, self._free_at, repeat)

@@ -50,9 +50,7 @@ class Supervisor:
 
     def spawn(self, coro: Coroutine[Any, Any, T], name: str | None = None) -> asyncio.Task[T]:
         """Runs `coro` as a task, cancelled before it starts if the supervisor is no longer active."""
-        task = asyncio.get_running_loop().create_task(
-            coro, name=f"{self.name}: {name or getattr(coro, '__name__', 'task')}"
-        )
+        task = asyncio.create_task(coro, name=f"{self.name}: {name or getattr(coro, '__name__', 'task')}")
         self._tasks.add(task)
         task.add_done_callback(self._done)
         if not self.active:

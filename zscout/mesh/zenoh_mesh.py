@@ -151,10 +151,8 @@ class ZenohTransport(Transport):
 
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
         def on_zenoh_sample(sample: zenoh.Sample) -> None:
-            attachment = sample.attachment
-            on_sample(
-                str(sample.key_expr), sample.payload.to_bytes(), None if attachment is None else attachment.to_bytes()
-            )
+            head = sample.attachment
+            on_sample(str(sample.key_expr), sample.payload.to_bytes(), None if head is None else head.to_bytes())
 
         return _undeclare(self._session.declare_subscriber(key, _direct(on_zenoh_sample)))
 
