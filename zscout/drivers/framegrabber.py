@@ -298,16 +298,9 @@ class FramePump:
     even encoded."""
 
     def __init__(
-        self,
-        publisher: FramePublisher,
-        capture: Capture,
-        meter: FrameMeter,
-        head: FrameHead,
-        *,
-        rate: float,
-        quality: int,
+        self, to: FramePublisher, capture: Capture, meter: FrameMeter, head: FrameHead, *, rate: float, quality: int
     ) -> None:
-        self._publisher, self._capture, self._meter, self._head = publisher, capture, meter, head
+        self._publisher, self._capture, self._meter, self._head = to, capture, meter, head
         self._quality = quality
         self._pace = pace_of(rate)
         self._after = capture.number

@@ -65,11 +65,10 @@ class SerialLine:
 
     def write(self, data: bytes) -> bool:
         """Hands a packet to the thread, and `wrote` will be called for it; False: DEPTH wait there."""
-        try:
+        with contextlib.suppress(queue.Full):
             self._queue.put_nowait(data)
-        except queue.Full:
-            return False
-        return True
+            return True
+        return False
 
     # In the thread
 

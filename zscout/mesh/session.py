@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Self, TypeAlias, TypeVar
 
-import msgspec
+from msgspec import Struct
 
 from zscout import messages
 from zscout.keyexpr import BadName, Keys, Sender, Token
@@ -167,7 +167,7 @@ class Mesh:
     async def ask(
         self,
         key: str,
-        message: msgspec.Struct | None,
+        message: Struct | None,
         kind: type[R],
         *,
         timeout: float,
@@ -190,21 +190,13 @@ class Mesh:
         await self._all(lambda to: self._get(key, message, timeout, to), on_reply, timeout)
         return replies
 
-    async def ask_one(
-        self, key: str, message: msgspec.Struct | None, kind: type[R], *, timeout: float
-    ) -> Reply[R] | None:
+    async def ask_one(self, key: str, message: Struct | None, kind: type[R], *, timeout: float) -> Reply[R] | None:
         """The first reply, message or problem; None if there was none within `timeout` seconds."""
         replies = await self.ask(key, message, kind, timeout=timeout, enough=lambda _: True)
         return replies[0] if replies else None
 
     def ask_then(
-        self,
-        key: str,
-        message: msgspec.Struct,
-        kind: type[R],
-        then: Callable[[Reply[R] | None], None],
-        *,
-        timeout: float,
+        self, key: str, message: Struct, kind: type[R], then: Callable[[Reply[R] | None], None], *, timeout: float
     ) -> None:
         """Queries, and calls `then` once with the first reply or None: cheaper than a task that waits."""
         first: Reply[R] | None = None
@@ -216,7 +208,7 @@ class Mesh:
 
         self._get(key, message, timeout, _Collector(self._inbox, on_reply, lambda: then(first)))
 
-    def _get(self, key: str, message: msgspec.Struct | None, timeout: float, to: Collector) -> None:
+    def _get(self, key: str, message: Struct | None, timeout: float, to: Collector) -> None:
         payload = None if message is None else messages.encode(message)
         self._transport.get(key, payload, None if message is None else type(message), timeout, to)
 
@@ -288,7 +280,7 @@ class Mesh:
         rather than wait, and yield to control."""
         return Publisher(self._transport.publisher(key, kind, Quality.DATA if data else Quality.CONTROL))
 
-    def put(self, key: str, message: msgspec.Struct) -> None:
+    def put(self, key: str, message: Struct) -> None:
         """Publishes one control message without a declaration: for keys of which there are many."""
         self._transport.put(key, messages.encode(message), type(message))
 
