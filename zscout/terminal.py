@@ -77,9 +77,6 @@ def many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-# Tables
-
-
 @dataclass(frozen=True, slots=True)
 class Table:
     """Rows of texts, made safe to print where they are. `styles` has Rich's style for each row, `spare` the
@@ -222,10 +219,9 @@ def typed_keys(pressed: Callable[[bytes], None], ended: Callable[[], None]) -> I
     before = termios.tcgetattr(terminal)
 
     def readable() -> None:
-        try:
+        typed = b""
+        with suppress(OSError):
             typed = os.read(terminal, MAX_TYPED)
-        except OSError:
-            typed = b""
         if not typed:
             loop.remove_reader(terminal)
             ended()

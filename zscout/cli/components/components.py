@@ -104,24 +104,15 @@ class Listing:
                     self._began[key] = now - round(view.uptime * SECOND)
 
     def overview(self) -> Overview:
-        rows, styles = [], []
+        rows, styles = [], [STYLES.get(one.state, "") for one in self._all()]
         for one in self._all():
             use, up = self._use(one), self._uptime(one)
-            rows.append(
-                (
-                    one.component,
-                    one.spec.kind,
-                    one.state.replace("_", " "),
-                    f"{one.host or '-'} > {one.to}" if one.to is not None else one.host or "-",
-                    "-" if up is None else terminal.span(up),
-                    str(one.restarts),
-                    str(one.moves) + (f" ({one.dead * 1000:.0f} ms)" if one.dead is not None else ""),
-                    "-" if use is None else f"{use.cpu:.2f}",
-                    "-" if use is None else f"{use.memory / 2**20:.0f} MiB",
-                    one.reason,
-                )
-            )
-            styles.append(STYLES.get(one.state, ""))
+            where = f"{one.host or '-'} > {one.to}" if one.to is not None else one.host or "-"
+            since = "-" if up is None else terminal.span(up)
+            moves = str(one.moves) + (f" ({one.dead * 1000:.0f} ms)" if one.dead is not None else "")
+            cores, memory = ("-", "-") if use is None else (f"{use.cpu:.2f}", f"{use.memory / 2**20:.0f} MiB")
+            stands = (one.component, one.spec.kind, one.state.replace("_", " "), where, since)
+            rows.append((*stands, str(one.restarts), moves, cores, memory, one.reason))
         columns = ("NAME", "KIND", "STATE", "HOST", "UP", "RESTARTS", "MOVES", "CORES", "MEMORY", "WHY")
         table = Table("Components", columns, rows, styles, ("KIND", "RESTARTS", "MOVES"))
         running = self._running()

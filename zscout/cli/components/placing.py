@@ -95,13 +95,10 @@ STANDING: Final = {
 }
 
 
-def standing(placement: Placement) -> str:
+def standing(one: Placement) -> str:
     """How a component stands, in words that follow its name."""
-    return STANDING[placement.state].format(
-        host=placement.host or "no host",
-        to=placement.to or "another host",
-        why=f": {placement.reason}" if placement.reason else "",
-    )
+    why = f": {one.reason}" if one.reason else ""
+    return STANDING[one.state].format(host=one.host or "no host", to=one.to or "another host", why=why)
 
 
 def unknown(name: str, known: Iterable[str]) -> common.Failed:

@@ -182,15 +182,8 @@ def gather_spec(
         raise BadInput(f"{len(hosts)} hosts; name at most {MAX_RANKED}, or give them a label")
     if len(labels) > MAX_LABELS:
         raise BadInput(f"{len(labels)} labels; at most {MAX_LABELS} are taken")
-    return ComponentSpec(
-        kind=kind,
-        params=gather_params(params, settings),
-        restart=restart.replace("-", "_"),  # type: ignore[arg-type]
-        labels=labels,
-        hosts=hosts or None,
-        cpu_limit=cpu_limit or 0.0,
-        **same,
-    )
+    given: Any = {"params": gather_params(params, settings), "restart": restart.replace("-", "_")}
+    return ComponentSpec(kind=kind, labels=labels, hosts=hosts or None, cpu_limit=cpu_limit or 0.0, **given, **same)
 
 
 async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: Placement | None) -> Placement:

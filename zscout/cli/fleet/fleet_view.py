@@ -112,13 +112,12 @@ class FleetView:
         clients = {hold.client for hold in state.holds}
 
         def complete() -> bool:
-            silent = any(host.load is None for host in self.hosts.values() if host.has(Role.LOAD))
             seen = rcs <= {token.name for token in self.tokens(Role.RC)}
             seen &= clients <= {f"{token.host}/{token.name}" for token in self.tokens(Role.CLIENT)}
-            if loads:
-                # Without this a candidate whose token comes last would be shown as missing.
-                seen &= all(host.tokens for host in self.all_hosts().values())
-            return seen and not (loads and silent)
+            if not (seen and loads):
+                return seen
+            # A candidate whose token comes last is not to be shown as missing.
+            return all(host.tokens and (host.load or not host.has(Role.LOAD)) for host in self.all_hosts().values())
 
         await common.until(complete, self.changed, FIND_LOADS)
         self._settled = loads

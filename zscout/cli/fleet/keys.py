@@ -47,9 +47,8 @@ async def keys(as_json: bool) -> None:
 
 
 def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str, Any]]:
-    """The keys behind a token: `how` is query (it answers), put (it publishes) or hear (it subscribes).
-
-    `sharable` names the RCs that vote; None where nobody knows, so that all may."""
+    """The keys behind a token: `how` is query (it answers), put (it publishes) or hear (it subscribes). `sharable`
+    names the RCs that vote; None where nobody knows, so that all may."""
     match token.role:
         case Role.RCM:
             found = [

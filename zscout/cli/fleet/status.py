@@ -75,8 +75,6 @@ class Standing:
         self.fleet_view.forget_gone()
         await self.devices.ask()
 
-    # For people
-
     def overview(self) -> Overview:
         fleet, links = self.fleet_view.client.fleet.name, many(self.fleet_view.mesh.links(), "link")
         headline = f"Fleet {fleet}: nobody leads; nothing is granted until a node does ({links})"
@@ -147,8 +145,6 @@ class Standing:
         styles = ["" if one.health == "ok" else "red" for one in shown]
         return Table("Devices", ("RC", "HEALTH", "FIGURES"), rows, styles)
 
-    # For programs
-
     def as_object(self) -> dict[str, Any]:
         """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
         state, homes, now = self.state, self._homes(), self.fleet_view.mesh.now()
@@ -196,20 +192,13 @@ class Standing:
 
 
 def _waiting(state: RcmState) -> Table:
-    rows = [
-        (
-            str(number),
-            wait.arc,
-            str(wait.priority),
-            span(wait.waited),
-            span(float(wait.min_runtime)),
-            "?" if wait.starts_in is None else f"in {span(wait.starts_in)}",
-            str(wait.preemptions),
-            wait.client,
-            wait.reason,
+    rows = []
+    for number, wait in enumerate(state.queue, 1):
+        starts = "?" if wait.starts_in is None else f"in {span(wait.starts_in)}"
+        spans = (span(wait.waited), span(float(wait.min_runtime)), starts)
+        rows.append(
+            (str(number), wait.arc, str(wait.priority), *spans, str(wait.preemptions), wait.client, wait.reason)
         )
-        for number, wait in enumerate(state.queue, 1)
-    ]
     title = f"Waiting, and {state.more} more" if state.more else "Waiting"
     columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "CLIENT", "WHY")
     return Table(title, columns, rows, spare={"RUNTIME", "PREEMPTED", "CLIENT"})

@@ -224,9 +224,8 @@ class _Console(terminal.LiveLine):
         now = teleop.client.mesh.now()
         pictures = sum(now - at < SECOND for at in self._pictures)
         wheels = teleop.pilot.wheels(now / SECOND)
-        line = Text()
         colour = {"driving": "bold green", "waiting": "yellow", "free": "dim"}[teleop.state]
-        line.append(f"{self._robot}  {teleop.state}", style=colour)
+        line = Text().append(f"{self._robot}  {teleop.state}", style=colour)
         if teleop.why:
             line.append(f": {terminal.clean(teleop.why)}")
         if teleop.robot is not None:
@@ -235,9 +234,6 @@ class _Console(terminal.LiveLine):
             if teleop.robot.refused:
                 line.append(f", {teleop.robot.refused} refused", style="red")
         self.draw(line.append(f"\n{HELP}", style="dim"))
-
-
-# Hands
 
 
 class Hands:

@@ -102,11 +102,8 @@ class WatchRecording(PictureRecording):
             jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
             self._bytes += len(jpeg)
             self.picture(at, jpeg)
-        shapes = rr.Boxes2D(
-            array=[[side * scale for side in box] for box in boxes] or np.zeros((0, 4)),
-            array_format=rr.Box2DFormat.XYWH,
-            colors=np.full(len(boxes), OPERATOR if moving else OTHER, np.uint32),
-        )
-        self.log(at, "picture/moving", shapes)
+        shapes = [[side * scale for side in box] for box in boxes] or np.zeros((0, 4))
+        colours = np.full(len(boxes), OPERATOR if moving else OTHER, np.uint32)
+        self.log(at, "picture/moving", rr.Boxes2D(array=shapes, array_format=rr.Box2DFormat.XYWH, colors=colours))
         share = sum(box.width * box.height for box in boxes) / (height * width) if moving else 0.0
         self.log(at, "moving", rr.Scalars(100 * share))

@@ -152,7 +152,10 @@ class _WatchReport(LiveLine):
         self._moving += event.end - event.start
         if self.recording is not None:
             self.recording.words(event.start, _words(event))
-        text = _as_json(event) if self._json else _words(event)
+        text = _words(event)
+        if self._json:
+            times = {name: round(getattr(event, name), 3) for name in ("start", "end", "peak")}
+            text = json.dumps(event._asdict() | times)
         if terminal.at_terminal():
             self.print(text, "" if self._json else "yellow")
         else:
@@ -189,11 +192,6 @@ class _WatchReport(LiveLine):
         line = f"{span(self.at)} watched, {many(self.pictures, 'picture')}; "
         line += f"{many(self._events, 'event')}, motion for {span(self._moving)}{share}"
         terminal.print_line(line, sys.stderr if self._json else sys.stdout)
-
-
-def _as_json(event: Event) -> str:
-    times = {name: round(getattr(event, name), 3) for name in ("start", "end", "peak")}
-    return json.dumps(event._asdict() | times)
 
 
 def _words(event: Event) -> str:

@@ -54,16 +54,13 @@ class VideoFile:
         """Raises BadInput."""
         self.name = str(path)
         try:
-            mode = path.stat().st_mode
-            head = b""
-            if stat.S_ISREG(mode):
-                with path.open("rb") as file:
-                    head = file.read(HEAD)
+            if not stat.S_ISREG(path.stat().st_mode):
+                raise BadInput(f"{quoted(self.name)} is no file; name a video file, a URL or a device")
+            with path.open("rb") as file:
+                head = file.read(HEAD)
         except (OSError, ValueError) as error:
             why = (error.strerror if isinstance(error, OSError) else None) or error
             raise BadInput(f"{quoted(self.name)} can't be read ({why}); name a video file, a URL or a device") from None
-        if not stat.S_ISREG(mode):
-            raise BadInput(f"{quoted(self.name)} is no file; name a video file, a URL or a device")
         nothing = BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
         # FFmpeg draws a text as a picture, and follows playlists to wherever they point.
         if not head or not head.translate(None, TEXT):

@@ -115,18 +115,16 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
             if arc is None:
                 arc = await client.request(wanted.name, wanted.needs, **wanted.terms(), estimate=True)
             grant = await client.granted(arc)
-    except TimeoutError:
+    except (TimeoutError, asyncio.CancelledError) as error:
         why = arc.reason if arc is not None else ""
         if arc is not None:
             await client.end(arc)
+        if isinstance(error, asyncio.CancelledError):
+            report.event("ended", f"{wanted.name} is cancelled", outcome="cancelled")
+            raise
         line = f"{wanted.name} was not granted within {span(wanted.timeout or 0)}, and is cancelled"
         report.event("ended", "", outcome="timeout", reason=why)
         raise Failed(f"{line}: {why}" if why else line) from None
-    except asyncio.CancelledError:
-        if arc is not None:
-            await client.end(arc)
-        report.event("ended", f"{wanted.name} is cancelled", outcome="cancelled")
-        raise
     if grant is None:
         report.event("ended", "", outcome=arc.outcome, reason=arc.reason)
         raise Failed(f"{wanted.name} was not granted: {arc.reason or arc.outcome}")
@@ -234,12 +232,8 @@ def _words(foretold: Foresight) -> Iterator[str]:
         yield f"it would preempt {', '.join(foretold.preempts)}"
 
 
-# The report
-
-
 class Report(LiveLine):
-    """Reports one request of a client on `stream`: a live line at a terminal, plain lines in a pipe, or JSON
-    lines. A context manager: the live line is gone afterwards."""
+    """Reports one request of a client on `stream`: a live line at a terminal, plain lines in a pipe, or JSON lines."""
 
     def __init__(self, name: str, client: Client, *, as_json: bool, stream: IO[str]) -> None:
         super().__init__(stream, shown=not as_json)
@@ -257,8 +251,7 @@ class Report(LiveLine):
     def event(self, kind: str, text: str, /, **details: Any) -> None:
         """Reports one event: `text` for people (empty: nothing), the rest for programs."""
         if self._as_json:
-            who = {"event": kind, "arc": self._name, "client": str(self._mesh.me)}
-            print_json(who | details, self._stream)
+            print_json({"event": kind, "arc": self._name, "client": str(self._mesh.me)} | details, self._stream)
         elif text:
             self.print(text)
 
@@ -330,15 +323,9 @@ class Report(LiveLine):
         if self.watched or self._printed == _how(arc):
             return
         self._printed = _how(arc)
-        self.event(
-            "waits",
-            "; ".join(filter(None, (f"{arc.name} waits{ahead}: {arc.reason}", start, *holders))),
-            id=arc.id,
-            reason=arc.reason,
-            ahead=arc.ahead,
-            starts_in=starts_in,
-            needs=[need.as_json() for need in needs],
-        )
+        text = "; ".join(filter(None, (f"{arc.name} waits{ahead}: {arc.reason}", start, *holders)))
+        stand = [need.as_json() for need in needs]
+        self.event("waits", text, id=arc.id, reason=arc.reason, ahead=arc.ahead, starts_in=starts_in, needs=stand)
 
     def _since(self, arc: OpenArc) -> float:
         return (self._mesh.now() - arc.since) / SECOND

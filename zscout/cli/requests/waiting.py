@@ -53,14 +53,8 @@ class NeedContention:
 
     def as_json(self) -> dict[str, Any]:
         """For programs; `rc` is null for a pattern."""
-        return {
-            "need": self.need,
-            "rc": self.rc,
-            "present": self.present,
-            "sharable": self.sharable,
-            "free": self.free,
-            "holders": [hold_json(hold) | {"rc": rc.rc} for rc in self.rcs for hold in rc.holds],
-        }
+        said = {name: getattr(self, name) for name in ("need", "rc", "present", "sharable", "free")}
+        return said | {"holders": [hold_json(hold) | {"rc": rc.rc} for rc in self.rcs for hold in rc.holds]}
 
 
 def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> list[NeedContention]:
