@@ -132,9 +132,6 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, title:
     Table(title, columns, rows).print()
 
 
-# Drawn in place
-
-
 class LiveLine:
     """Drawn in place at a terminal, while lines that stay are printed above it; nothing is drawn elsewhere,
     or if not `shown`. A context manager: it is gone afterwards, but for one that `stays`."""
@@ -203,9 +200,6 @@ def progress(total: int) -> Iterator[Callable[[], None]]:
     with Progress(*columns, console=console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=total)
         yield lambda: bar.advance(task)
-
-
-# Keys
 
 
 @contextmanager

@@ -80,9 +80,6 @@ class Progress(terminal.LiveLine):
             raise
 
 
-# Words
-
-
 STANDING: Final = {
     "running": "runs on {host}",
     "starting": "is starting on {host}",

@@ -35,7 +35,6 @@ from zscout.types import METRICS, POLICIES
 MAX_BYTES: Final = 1 << 60
 MAX_CORES: Final = 1_000_000
 BAD_JSON: Final = (msgspec.MsgspecError, ValueError, RecursionError)
-RESTARTS: Final = ("never", "on-failure", "always")
 
 _SIZE: Final = re.compile(r"([0-9]{1,19}(?:\.[0-9]{1,6})?)([KMGT]?)i?B?", re.IGNORECASE)
 _POWERS: Final = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
@@ -106,7 +105,7 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
 @click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How one is chosen of them.")
 @click.option(
     "--restart",
-    type=click.Choice(RESTARTS),
+    type=click.Choice(["never", "on-failure", "always"]),
     default="on-failure",
     show_default=True,
     help="Whether it is started again when it has ended.",

@@ -202,9 +202,6 @@ def _ending(arc: OpenArc) -> HoldEnd:
     return arc.ending or HoldEnd("lost", "")
 
 
-# What would come of it
-
-
 async def _foresee(client: Client, wanted: HoldOptions) -> int:
     """Prints when it would start and whom it would preempt at once. Exit code 1: it would not start. Raises
     RequestRefused, NobodyThere."""
