@@ -214,11 +214,17 @@ class Mesh:
 
     async def _all(self, query: Callable[[Collector], None], on_reply: OnReply, timeout: float) -> None:
         """Makes a query, and returns when it is over, or when `on_reply` says that it is enough."""
-        done = asyncio.Event()
-        query(_Collector(self._inbox, on_reply, done.set))
-        guard = self._inbox.loop.call_later(timeout + FINAL_SLACK, done.set)
+        loop = self._inbox.loop
+        done: asyncio.Future[None] = loop.create_future()  # not an Event: this is the way of every request
+
+        def finish() -> None:
+            if not done.done():
+                done.set_result(None)
+
+        query(_Collector(self._inbox, on_reply, finish))
+        guard = loop.call_later(timeout + FINAL_SLACK, finish)
         try:
-            await done.wait()
+            await done
         finally:
             guard.cancel()
 
