@@ -18,7 +18,7 @@ from zscout.behaviors.client.request import OpenArc, RequestStore
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import BadName, Keys, Sender
 from zscout.mesh import Mesh
-from zscout.messages import Amounts, Notice, OpenRequest, Problem
+from zscout.messages import Amounts, Notice, OpenRequest, Problem, ReasonInfo
 from zscout.types import SECOND, Grant, Place, Term
 
 OLD, TERM = Term(1, "zz"), Term(2, "aa")
@@ -126,8 +126,9 @@ def test_what_the_client_ends_itself() -> None:
         True,
         ("lost", "no RCM was heard", None),
     )
+    given_up.why = ReasonInfo("held")
     given_up.finish("released", "given up", NOW)
-    assert (given_up.open, given_up.ending) == (False, ("released", "given up", None))
+    assert (given_up.open, given_up.ending, given_up.why) == (False, ("released", "given up", None), None)
     assert not given_up.take(AGAIN, NOW)
 
 

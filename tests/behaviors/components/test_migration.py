@@ -12,7 +12,7 @@ from zscout.behaviors.components.component import SafePointGate
 from zscout.behaviors.components.migration import RESTORE_TIMEOUT, NotMoved, OutgoingMove
 from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
-from zscout.keyexpr import Sender
+from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import ComponentOperation, ComponentSpec, ComponentView, MoveComponent
 from zscout.types import SECOND
@@ -36,5 +36,31 @@ def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
 
         asyncio.get_running_loop().call_later(1, serve)
         await move._give(b"", [])
+
+    run(test())
+
+
+def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
+    async def test() -> None:
+        network = MemoryNetwork()
+        client = Client(network.open("f", Sender("a", "c.1")), default_fleet())
+        node = network.open("f", Sender("b", "node"))
+        token = node.alive(Token("b", Role.NODE, "node", "i"))
+        dies: list[asyncio.Task[None]] = []
+        key = node.keys.component("b")
+        node.serve(key, ComponentOperation, lambda _: dies.append(asyncio.ensure_future(node.close())))
+        await asyncio.sleep(1)
+        gate = SafePointGate()
+        move = OutgoingMove(client, Counter({}), gate, MoveComponent("c", 1, "b", 2))
+        began = client.mesh.now()
+        moving = asyncio.ensure_future(move.carry_out())
+        while not moving.done():
+            await gate.come()
+            await asyncio.sleep(0.01)
+        with pytest.raises(NotMoved, match="b did not answer"):
+            await moving
+        assert dies
+        assert (client.mesh.now() - began) / SECOND < 1
+        token.close()
 
     run(test())

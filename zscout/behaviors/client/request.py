@@ -150,6 +150,7 @@ class OpenArc:
         """The request is over by the client's own judgement."""
         self._close(HoldEnd(outcome, reason), now)
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
+        self.why = None
 
     def take_first(self, notice: Notice, now: Ns) -> bool:
         """Applies the first notice of an expected request. False if it is none: an old one, or not credible."""

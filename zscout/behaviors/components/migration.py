@@ -59,12 +59,15 @@ class OutgoingMove:
         """To be set when the token of the other incarnation is seen: it runs, whatever else is known."""
         self.began = False
         """Whether the component is held for it."""
+        self._was_there = False
+        """Whether the other process, or its node, was seen before the component was held."""
         self.called_off = ""
         """Why it must not be, as long as it is not committed."""
 
     async def carry_out(self) -> float:
         """Returns how long (s) the component did not run, once the other one does: this process is to end
         then, and to give up nothing. Raises NotMoved where it goes on here."""
+        self._was_there = await self._lives()
         if not await self._gate.hold(self._patience):
             raise NotMoved("not_safe", f"it came to no safe point within {self._patience:g} s")
         began, self.began = self._client.mesh.now(), True
@@ -110,7 +113,10 @@ class OutgoingMove:
         pause, longest = PAUSES
         left = RESTORE_TIMEOUT
         while (reply := await self._ask(order, ComponentView, left)) is None:
-            # No answer comes at once where there is no link yet to a node that has just come.
+            # No answer comes at once where there is no link yet to a node that has just come; one that has gone does
+            # not come back.
+            if self._was_there and not await self._lives():
+                break
             left = (deadline - self._client.mesh.now()) / SECOND - pause
             if left <= 0:
                 break
