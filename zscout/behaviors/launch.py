@@ -15,11 +15,8 @@ import sys
 
 PR_SET_PDEATHSIG = 1
 NOT_EXECUTABLE, NOT_FOUND = 126, 127
-
-
-def prefix(tty: int = -1) -> list[str]:
-    """What stands before a command that is to end with this process."""
-    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(tty)]
+LAUNCH = (sys.executable, "-I", "-S", __file__)
+"""What stands before PARENT."""
 
 
 def main() -> None:

@@ -151,7 +151,9 @@ async def see_rcm(client: Client) -> None:
     with ExitStack() as stack:
         for role in (Role.RCM, Role.CANDIDATE):
             stack.callback(mesh.watch(mesh.keys.alive_any(role), on_token).close)
-        if await within(LOOK_FOR_RCM, seen) or (candidates and await within(LOOK_FOR_TAKEOVER - LOOK_FOR_RCM, seen)):
+        if await until(seen.is_set, seen, LOOK_FOR_RCM):
+            return
+        if candidates and await until(seen.is_set, seen, LOOK_FOR_TAKEOVER - LOOK_FOR_RCM):
             return
     nobody = f"no RCM is on the mesh of fleet {client.fleet.name}"
     if candidates:
@@ -173,12 +175,7 @@ async def state_of(client: Client, arc: str | None = None, *, forecast: bool = F
     raise NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again, or see its log")
 
 
-async def within(seconds: float | None, event: asyncio.Event) -> bool:
-    """Waits for an event, at most so long; returns whether it has come."""
-    return await until(event.is_set, event, seconds)
-
-
-async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float | None) -> bool:
+async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float) -> bool:
     """Waits until `true()`, looked at whenever something has `changed`, at most so long; returns which."""
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):

@@ -13,6 +13,7 @@ from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.cli import common
 from zscout.cli.components.placing import OVER, component_argument, host_option, placer_of, standing, unknown_here
 from zscout.cli.fleet.fleet_view import see_hosts
+from zscout.mesh.supervision import done_within
 from zscout.messages import Output, Placement, ReadOutput
 
 READ_TIMEOUT: Final = 2.0
@@ -95,7 +96,7 @@ class Reader:
             if (found is None or found.over) and (self._only or not await self._successor(silent=silent)):
                 break
             if found is None or not (found.over or found.text):
-                await common.within(READ_EVERY, self._placer.changed)
+                await done_within(READ_EVERY, self._placer.changed.wait())
                 self._placer.changed.clear()
             found = await self._read()
             if found is not None:

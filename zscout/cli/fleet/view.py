@@ -22,7 +22,7 @@ import click
 import msgspec
 
 from zscout import terminal
-from zscout.behaviors import launch
+from zscout.behaviors.launch import LAUNCH
 from zscout.cli import common
 from zscout.config.node import RecorderConfig
 from zscout.config.strict import BadInput, quoted
@@ -280,7 +280,9 @@ async def child(
     own: Ctrl-C reaches only us, and we end it in order."""
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(
-        *launch.prefix(),
+        *LAUNCH,
+        str(os.getpid()),
+        "-1",
         *command,
         stdin=pipe if job is not None else asyncio.subprocess.DEVNULL,
         stdout=pipe if job is not None else asyncio.subprocess.DEVNULL,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from zscout import terminal
-from zscout.cli import common
+from zscout.mesh.supervision import done_within
 from zscout.terminal import Table
 
 if TYPE_CHECKING:
@@ -102,8 +102,8 @@ async def show(
                 printed = now
             if not watch:
                 return
-            await common.within(EVERY, news)
-            await common.within(HASTE, stop)
+            await done_within(EVERY, news.wait())
+            await done_within(HASTE, stop.wait())
             news.clear()
             await refresh()
 

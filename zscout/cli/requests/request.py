@@ -19,6 +19,7 @@ from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
+from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState
 from zscout.terminal import LiveLine, clean, print_json, print_line, span
 from zscout.types import SECOND, Ns
@@ -283,7 +284,7 @@ class Report(LiveLine):
                     self._state = await self._client.state()
                 if arc.state in ("asking", "queued"):
                     self._show_wait(arc)
-            await common.within(REFRESH if self.watched else None, self.changed)
+            await done_within(REFRESH if self.watched else None, self.changed.wait())
 
     async def follow_hold(self, arc: OpenArc) -> None:
         """Shows how long a hold without a command goes on, until cancelled."""
@@ -292,7 +293,7 @@ class Report(LiveLine):
             left = (arc.end - self._mesh.now()) / SECOND
             rest = f"held for {span(self._since(arc))}, kept" if arc.keep else f"{span(left)} left"
             self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}; Ctrl-C gives back")
-            await common.within(REFRESH if self.watched else None, self.changed)
+            await done_within(REFRESH if self.watched else None, self.changed.wait())
 
     def _show_wait(self, arc: OpenArc) -> None:
         now, start, starts_in = self._mesh.now(), "", None

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
 
-from zscout.behaviors import launch
+from zscout.behaviors.launch import LAUNCH
 from zscout.cli.common import Failed, fleet_file
 from zscout.terminal import print_line
 
@@ -77,13 +77,13 @@ class RunningCommand:
         # First the handler, then the child: it may end at once.
         self._loop.add_signal_handler(signal.SIGCHLD, self._look)
         self._loop.add_signal_handler(signal.SIGTSTP, self._note_suspension)
-        handed = self._tty.fd if self._tty.ours_to_give() else None
+        handed = self._tty.fd if self._tty.ours_to_give() else -1
         try:
             self._process: subprocess.Popen[Any] = subprocess.Popen(  # noqa: S603, ASYNC220 - returns at once
-                [*launch.prefix(-1 if handed is None else handed), *self._command],
+                [*LAUNCH, str(os.getpid()), str(handed), *self._command],
                 env=dict(self._env),
                 process_group=0,
-                pass_fds=() if handed is None else (handed,),
+                pass_fds=() if handed < 0 else (handed,),
             )
         except OSError as error:
             self._close()
@@ -188,7 +188,7 @@ class _Terminal:
     """The controlling terminal, if there is one."""
 
     def __init__(self) -> None:
-        self.fd: int | None = None
+        self.fd = -1
         self._modes: list[Any] = []
         try:
             self.fd = os.open("/dev/tty", os.O_RDWR | os.O_CLOEXEC)
@@ -208,7 +208,7 @@ class _Terminal:
 
     def take_back(self, group: int, *, restore: bool) -> None:
         """Takes the foreground back from a group; with `restore`, the terminal's modes as they were."""
-        if self.fd is None or self._foreground() != group:
+        if self.fd < 0 or self._foreground() != group:
             return
         self._set(os.getpgrp())
         if restore:
@@ -216,12 +216,12 @@ class _Terminal:
                 termios.tcsetattr(self.fd, termios.TCSADRAIN, self._modes)
 
     def close(self) -> None:
-        if self.fd is not None:
+        if self.fd >= 0:
             os.close(self.fd)
-            self.fd = None
+            self.fd = -1
 
     def _foreground(self) -> int | None:
-        if self.fd is None:
+        if self.fd < 0:
             return None
         try:
             return os.tcgetpgrp(self.fd)
@@ -231,7 +231,6 @@ class _Terminal:
             raise
 
     def _set(self, group: int) -> None:
-        assert self.fd is not None  # noqa: S101
         # From the background this would stop us, were the signal not blocked.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTOU})
         try:

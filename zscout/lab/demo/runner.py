@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from zscout.behaviors import launch
+from zscout.behaviors.launch import LAUNCH
 from zscout.config.fleet import Fleet, load_fleet
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.lab import LabError
@@ -114,7 +114,7 @@ class DemoRunner(ABC):
             file = self.folder / f"{host}.toml"
             file.write_text(text + extra.get(host, ""))
             # The launcher has the kernel end the node with this process, however that may end.
-            node = [*launch.prefix()[1:], sys.executable, "-m", "zscout.node", str(file)]
+            node = [*LAUNCH[1:], str(os.getpid()), "-1", sys.executable, "-m", "zscout.node", str(file)]
             await self.start(f"node {host}", node)
 
     async def start(self, name: str, arguments: Sequence[str], *, piped: bool = False) -> asyncio.subprocess.Process:
