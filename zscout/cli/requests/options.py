@@ -22,6 +22,8 @@ from zscout.scheduling.model import check_patterns
 
 Needs = dict[str, dict[str, Decimal]]
 
+MAX_ARC_NAME: Final = 200
+"""Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 _NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
 _UNITS: Final = {"": Decimal(1), "s": Decimal(1), "ms": Decimal("0.001"), "m": Decimal(60), "h": Decimal(3600)}
 
@@ -189,3 +191,13 @@ def gather(needs: Any, name: str | None, default_name: str = "request", **rest: 
     return HoldOptions(
         name=check_name(name or default_name, "--name"), needs=gather_needs(needs), command=command, **rest
     )
+
+
+def arc_named(text: str, _option: str) -> str:
+    """What may be an ARC's name, its id or `<host>/<client>/<id>`. Raises BadInput."""
+    if not text or len(text) > MAX_ARC_NAME or not text.isprintable():
+        raise BadInput(f"{quoted(text)} names no ARC; zscout status lists them")
+    return text
+
+
+arc_argument = click.argument("arc", type=Parsed("text", arc_named))

@@ -1,0 +1,126 @@
+"""`zscout cancel` and `release`: the end of an ARC at somebody's word."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import click
+
+from zscout import terminal
+from zscout.behaviors.client.client import TRY_AGAIN, Client
+from zscout.cli import common
+from zscout.cli.requests.options import arc_argument
+from zscout.config.strict import quoted
+from zscout.keyexpr import check_name, client_of
+from zscout.messages import Cancel, Notice, RcmState, Release
+
+MAX_LISTED: Final = 20
+"""ARCs of one name, where one has to be chosen."""
+TRIES: Final = 3
+TIMEOUT: Final = 1.0
+
+every_option = click.option("--all", "every", is_flag=True, help="All ARCs of that name, not only one.")
+
+
+@click.command()
+@arc_argument
+@every_option
+@common.json_option("Print one JSON object.")
+@common.runs
+async def cancel(arc: str, every: bool, as_json: bool) -> None:
+    """End an ARC, whether it runs or waits: by name, id, or <host>/<client>/<id>.
+
+    Its program is told; one that `zscout request` runs is stopped. A name that
+    several ARCs have is refused with the list of them, unless --all is given.
+
+    \b
+    Examples:
+      zscout cancel survey
+      zscout cancel 5f0c2a9d13be
+      zscout cancel survey --all
+    """
+    await _end(arc, "cancel", every=every, as_json=as_json)
+
+
+@click.command()
+@arc_argument
+@every_option
+@common.json_option("Print one JSON object.")
+@common.runs
+async def release(arc: str, every: bool, as_json: bool) -> None:
+    """End the hold of a running ARC: by name, id, or <host>/<client>/<id>.
+
+    The same as `zscout cancel`, but only for ARCs that run: one that waits is
+    left alone. A name that several have is refused, unless --all is given.
+
+    \b
+    Examples:
+      zscout release survey
+      zscout release anvil/request-5f0c2a9d13be/0b1d3c5e7f90 --json
+    """
+    await _end(arc, "release", every=every, as_json=as_json)
+
+
+class Target(NamedTuple):
+    """An ARC to be ended. `was` is `running` or `queued`."""
+
+    arc: str
+    id: str
+    client: str
+    was: str
+
+    @property
+    def full_name(self) -> str:
+        return f"{self.client}/{self.id}"
+
+
+async def _end(named: str, word: str, *, every: bool, as_json: bool) -> None:
+    async with common.connected(word) as client:
+        found = _choose(await common.state_of(client), named, word, every=every)
+        done = [(target, await _operate(client, target, word)) for target in found]
+    if as_json:
+        arcs = [{**target._asdict(), "state": notice.state, "outcome": notice.outcome} for target, notice in done]
+        terminal.print_json({"op": word, "arcs": arcs})
+        return
+    for target, notice in done:
+        outcome = notice.outcome or notice.state
+        terminal.print_line(terminal.clean(f"{target.arc} ({target.full_name}) was {target.was}: {outcome}"))
+
+
+def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Target]:
+    """The ARCs that are meant. Raises Failed where there is none, or more than one without `every`."""
+    known = [Target(hold.arc, hold.id, hold.client, "running") for hold in state.holds]
+    known += [Target(wait.arc, wait.id, wait.client, "queued") for wait in state.queue]
+    matching = [target for target in known if named in (target.arc, target.id, target.full_name)]
+    if not matching and state.more and named.count("/") == 2:
+        # The answer leaves out the end of a long queue; a full name is enough to end it all the same.
+        client, _, request = named.rpartition("/")
+        matching = [Target(request, check_name(request, "id"), str(client_of(client)), "queued")]
+    found = [target for target in matching if word == "cancel" or target.was == "running"]
+    if matching and not found:
+        raise common.Failed(f"{quoted(named)} holds nothing, it waits; to end that: zscout cancel {named}")
+    if not found:
+        more = f"; {state.more} more wait: name it <host>/<client>/<id>" if state.more else ""
+        raise common.Failed(f"no ARC {quoted(named)} runs or waits{more}; see zscout status")
+    if len(found) > 1 and not every:
+        listed = ", ".join(target.full_name for target in found[:MAX_LISTED])
+        rest = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
+        raise common.Failed(f"{len(found)} ARCs are called {quoted(named)}: {listed}{rest}; name one so, or add --all")
+    return found
+
+
+async def _operate(client: Client, target: Target, word: str) -> Notice:
+    """Has the RCM end one ARC; asking twice does no harm. Raises Failed, NobodyThere."""
+    operation = (Cancel if word == "cancel" else Release)(id=target.id, client=target.client)
+    key = client.mesh.keys.schedule(client.mesh.me)
+    for _ in range(TRIES):
+        replies = await client.mesh.ask(
+            key, operation, Notice, timeout=TIMEOUT, enough=lambda reply: reply.message is not None
+        )
+        notices = [reply.message for reply in replies if reply.message is not None]
+        if notices:
+            return max(notices, key=lambda notice: (notice.term, notice.step))
+        problem = next((reply.problem for reply in replies if reply.problem is not None), None)
+        if problem is not None and problem.code not in TRY_AGAIN:
+            raise common.Failed(f"{target.full_name} was not ended: {problem.message}")
+    raise common.NobodyThere("the RCM did not answer: it may be done or not; see zscout status, and try again")
