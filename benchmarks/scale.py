@@ -21,6 +21,7 @@ from unittest.mock import patch
 from benchmarks.stats import Samples
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling import priority
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     ArcRequest,
@@ -39,7 +40,6 @@ from zscout.scheduling.model import (
 from zscout.scheduling.priority import Priority
 from zscout.scheduling.state import Actions, SchedulerState
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.scheduling.workload import excess
 from zscout.types import SECOND, ArcId, Ns, Params
 
 QUEUES = (10, 100, 1_000, 10_000)

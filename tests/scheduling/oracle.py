@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from zscout.lab.replay import HoldRecord, Replay
+from zscout.lab.workload import Arrival, Workload, WorkloadRc
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.model import ArcRequest, Outcome
-from zscout.scheduling.replay import HoldRecord, Replay
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc, excess
 from zscout.types import Ns, RcName
 
 

@@ -16,7 +16,10 @@ from tests.scheduling.workloads import workloads
 from tests.services.recorder.paper_run import RCS, TABLE1
 from tests.thorough import times
 from zscout.config.scheduling_policy import StrategyName
+from zscout.lab.replay import replay
+from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.adaptive import MAX_SLICES, SLICE, Adaptive, steps_for
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     ArcRequest,
@@ -36,9 +39,7 @@ from zscout.scheduling.model import (
     WakeAt,
 )
 from zscout.scheduling.priority import Priority
-from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc, excess
 from zscout.types import SECOND, Ns
 
 MANY_PASSES = 500

@@ -6,6 +6,8 @@ from hypothesis import given, settings
 
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
+from zscout.lab.workload import Workload
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
@@ -21,7 +23,6 @@ from zscout.scheduling.model import (
     Tick,
     Vote,
 )
-from zscout.scheduling.workload import Workload, excess
 from zscout.types import SECOND, ArcId, Ns
 
 

@@ -10,7 +10,10 @@ from tests.scheduling.exhaustive import best_set
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
+from zscout.lab.replay import replay
+from zscout.lab.workload import Workload, WorkloadRc
 from zscout.scheduling import optimal
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     ArcRequest,
@@ -27,8 +30,6 @@ from zscout.scheduling.model import (
     VoteOverdue,
 )
 from zscout.scheduling.packing import PackingItem
-from zscout.scheduling.replay import replay
-from zscout.scheduling.workload import Workload, WorkloadRc, excess
 from zscout.types import SECOND, ArcId
 
 

@@ -14,6 +14,8 @@ from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
 from zscout.keyexpr import is_pattern, matcher
+from zscout.lab.replay import replay
+from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Arc,
@@ -33,9 +35,7 @@ from zscout.scheduling.model import (
     VoteOverdue,
     check_patterns,
 )
-from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Grant, Ns, Params, Place, Term
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")

@@ -12,6 +12,8 @@ from tests.scheduling.test_waiting import workload
 from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
+from zscout.lab.replay import replay
+from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     ArcRequest,
@@ -26,9 +28,7 @@ from zscout.scheduling.model import (
     Requested,
     Tick,
 )
-from zscout.scheduling.replay import replay
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Grant, Ns, Place, Term
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")

@@ -11,6 +11,9 @@ from tests.scheduling import oracle
 from tests.scheduling.invariants import Ledger, check_settled
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
+from zscout.lab.replay import HoldRecord, Replay, replay
+from zscout.lab.workload import Workload
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Effect,
@@ -24,8 +27,6 @@ from zscout.scheduling.model import (
     Tick,
     Vote,
 )
-from zscout.scheduling.replay import HoldRecord, Replay, replay
-from zscout.scheduling.workload import Workload, excess
 from zscout.types import ArcId, Ns
 
 

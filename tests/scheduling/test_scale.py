@@ -13,6 +13,7 @@ from tests.scheduling.plain_pass import PlainPriority
 from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.scheduling import priority
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Arc,
@@ -39,7 +40,6 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.priority import AdmissionCheck
 from zscout.scheduling.state import SchedulerState
-from zscout.scheduling.workload import excess
 from zscout.types import SECOND, Params
 
 

@@ -10,12 +10,12 @@ import pytest
 from tests.scheduling.invariants import Ledger
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy
+from zscout.lab.replay import Replay, replay
+from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, Effect, LeadTaken, RcJoined, Requested, Tick
-from zscout.scheduling.replay import Replay, replay
 from zscout.scheduling.reservations import MAX_STARVING
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.types import NO_TERM, SECOND, Ns, Params, Place, RcName, Term
 
 RUNS = times(1_000)

@@ -9,7 +9,7 @@ from typing import Any
 
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder, exact, exact_amounts
-from zscout.scheduling.workload import excess
+from zscout.scheduling.capacity import excess
 
 
 class ExclusiveDriver(Driver):

@@ -8,17 +8,42 @@ does who releases early: it is an estimate, and is shown as one.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcRequest, Event, Granted, HoldEnded, Outcome, Propose, Requested, Tick, Vote
+from zscout.scheduling.model import (
+    ArcRequest,
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    Outcome,
+    Propose,
+    Requested,
+    Tick,
+    Vote,
+    WakeAt,
+)
 from zscout.scheduling.reason import Reason
-from zscout.scheduling.replay import play_instant
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import ArcId, Ns, Term
 
 MAX_CHECKS = 4_000
 """Queued ARCs, summed over all instants: a forecast must not keep the RCM from its work."""
+
+
+def play_instant(
+    core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], Vote]
+) -> Iterator[list[Effect]]:
+    """One instant, with every vote and every further pass that it takes; yields the effects of each batch."""
+    batch = list(events)
+    while batch:
+        effects = core.handle(now, *batch)
+        yield effects
+        batch = [vote(effect) for effect in effects if isinstance(effect, Propose)]
+        if not batch and any(isinstance(effect, WakeAt) and effect.at == now for effect in effects):
+            batch = [Tick()]
 
 
 @dataclass(slots=True)

@@ -10,15 +10,15 @@ from random import Random
 import numpy as np
 import pytest
 
+from zscout.lab.replay import HoldRecord, Replay, replay
 from zscout.lab.study.scheduling.families import FAMILIES, Mix, at_once, stream
 from zscout.lab.study.scheduling.foretell import FEWEST, Condition, correlations, fit
 from zscout.lab.study.scheduling.measures import Curve, curve, measure, percentile
 from zscout.lab.study.scheduling.situations import FEATURES, Situation
 from zscout.lab.study.scheduling.summary import Study
 from zscout.lab.study.scheduling.trial import STRATEGIES, SchedulingJob, SchedulingTrial, play, run
+from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.model import ArcRequest, Outcome
-from zscout.scheduling.replay import HoldRecord, Replay, replay
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND
 
 

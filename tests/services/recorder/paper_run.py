@@ -9,9 +9,9 @@ from typing import Any
 
 from rerun.chunk import RrdReader
 
+from zscout.lab.replay import Replay, replay
+from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.model import ArcRequest, Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.replay import Replay, replay
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.services.recorder.blueprint import TIME
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import OPERATOR_MARK, Timeline

@@ -17,9 +17,9 @@ from zscout.lab.building.node_file import rc_table
 from zscout.lab.demo.arc import ArcReport, ArcSpec
 from zscout.lab.demo.runner import HOSTS, DemoRunner
 from zscout.lab.demo.tables import Observed
+from zscout.lab.workload import Arrival, Workload
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.messages import Grants, LoadReport, RcmState, StateAsk, decimal_seconds
-from zscout.scheduling.workload import Arrival, Workload
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 START: Final = 30.0

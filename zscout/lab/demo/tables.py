@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from importlib import resources
 from typing import NamedTuple, TypeAlias
 
+from zscout.lab.workload import Workload, parse_workload
 from zscout.messages import LoadReport
-from zscout.scheduling.workload import Workload, parse_workload
 from zscout.types import SECOND, Ns
 
 Table: TypeAlias = dict[str, list[str]]

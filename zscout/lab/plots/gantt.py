@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from zscout.scheduling.replay import HoldRecord
-from zscout.scheduling.workload import Workload
+from zscout.lab.replay import HoldRecord
+from zscout.lab.workload import Workload
 from zscout.types import SECOND, ArcId, Ns, RcName
 
 MAX_SECONDS: Final = 60

@@ -6,9 +6,9 @@ from typing import Final
 
 from zscout.config.fleet import default_fleet
 from zscout.config.strict import BadInput
+from zscout.lab.replay import HoldRecord, Replay
+from zscout.lab.workload import Workload
 from zscout.scheduling.model import Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.replay import HoldRecord, Replay
-from zscout.scheduling.workload import Workload
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import SECOND, ArcId, Ns, RcName

@@ -17,10 +17,10 @@ import click
 from zscout.config.scheduling_policy import StrategyName
 from zscout.config.strict import read_text
 from zscout.lab.plots.gantt import columns_of, rows_of, short_names
+from zscout.lab.replay import Replay, replay
+from zscout.lab.workload import MAX_BYTES, Workload, parse_workload
 from zscout.scheduling.model import Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.replay import Replay, replay
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.scheduling.workload import MAX_BYTES, Workload, parse_workload
 from zscout.types import SECOND, ArcId, Ns
 
 if TYPE_CHECKING:

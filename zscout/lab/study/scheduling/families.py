@@ -12,8 +12,8 @@ from fractions import Fraction
 from random import Random
 from typing import Final
 
+from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.model import ArcRequest
-from zscout.scheduling.workload import Arrival, Workload, WorkloadRc
 from zscout.types import Ns, Params, RcName
 
 MILLISECOND: Final[Ns] = 1_000_000

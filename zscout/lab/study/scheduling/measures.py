@@ -7,9 +7,9 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from zscout.lab.replay import HoldRecord, Replay
+from zscout.lab.workload import Workload
 from zscout.scheduling.model import Outcome
-from zscout.scheduling.replay import HoldRecord, Replay
-from zscout.scheduling.workload import Workload
 from zscout.types import ArcId, Ns, RcName
 
 

@@ -15,11 +15,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from zscout.lab.workload import WorkloadRc
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import Arc, ArcStatus, LeadTaken, Propose, RcJoined, RecoveredHold, Requested, Vote
-from zscout.scheduling.replay import play_instant
 from zscout.scheduling.state import SchedulerState, Strategy
-from zscout.scheduling.workload import WorkloadRc, excess
 from zscout.types import Ns, Term
 
 FEATURES: Final = (

@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from zscout.lab.replay import replay
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.measures import Curve, Measures, curve, measure
 from zscout.lab.study.scheduling.situations import Observer, Situation
+from zscout.lab.workload import Workload
 from zscout.scheduling import strategies
-from zscout.scheduling.replay import replay
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
-from zscout.scheduling.workload import Workload
 from zscout.types import Ns
 
 STRATEGIES: Final[Mapping[str, Callable[[], Strategy]]] = {

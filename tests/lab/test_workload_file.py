@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from tests.thorough import times
 from zscout.config.strict import BadInput
+from zscout.lab.replay import replay
+from zscout.lab.workload import MAX_ARCS, MAX_NEEDS, MAX_RCS, Arrival, Workload, WorkloadRc, parse_workload
 from zscout.scheduling.model import ArcRequest
-from zscout.scheduling.replay import replay
-from zscout.scheduling.workload import MAX_ARCS, MAX_NEEDS, MAX_RCS, Arrival, Workload, WorkloadRc, parse_workload
 
 RC = '[[rc]]\nname = "robot/a"\n'
 RADIO = '[[rc]]\nname = "radio/r"\nsharable = true\n'

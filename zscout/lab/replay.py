@@ -3,28 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
+from zscout.lab.workload import Workload
 from zscout.scheduling import model
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.state import Strategy
-from zscout.scheduling.workload import Workload, excess
 from zscout.types import ArcId, Ns, RcName
-
-
-def play_instant(
-    core: Core, now: Ns, events: Iterable[model.Event], vote: Callable[[model.Propose], model.Vote]
-) -> Iterator[list[model.Effect]]:
-    """One instant, with every vote and every further pass that it takes; yields the effects of each batch."""
-    batch = list(events)
-    while batch:
-        effects = core.handle(now, *batch)
-        yield effects
-        batch = [vote(effect) for effect in effects if isinstance(effect, model.Propose)]
-        if not batch and any(isinstance(effect, model.WakeAt) and effect.at == now for effect in effects):
-            batch = [model.Tick()]
 
 
 @dataclass(frozen=True, slots=True)

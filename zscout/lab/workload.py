@@ -19,7 +19,7 @@ it then never runs, and ends among the unserved.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
@@ -30,7 +30,7 @@ from msgspec import Meta, Struct
 from zscout.config.strict import Where, amounts, check_unique, parse_toml, quoted, seconds_to_ns
 from zscout.keyexpr import is_pattern
 from zscout.scheduling.model import ArcRequest
-from zscout.types import ArcId, Ns, Params, RcName
+from zscout.types import Ns, Params, RcName
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,22 +56,6 @@ class Workload:
 
     rcs: tuple[WorkloadRc, ...]
     arrivals: tuple[Arrival, ...]
-
-
-def excess(capacity: Mapping[str, Fraction], holders: Iterable[tuple[ArcId, Params]]) -> str:
-    """Why a sharable RC of this capacity can't carry these holders; empty if it can.
-
-    A parameter without a capacity is unbounded, a missing one counts 0; sums are exact."""
-    totals: dict[str, Fraction] = {}
-    for _, params in holders:
-        for parameter, value in params.items():
-            totals[parameter] = totals.get(parameter, Fraction(0)) + value
-    over = [
-        f"{parameter} would be {float(totals[parameter]):g} of {float(bound):g}"
-        for parameter, bound in capacity.items()
-        if totals.get(parameter, 0) > bound
-    ]
-    return ", ".join(over)
 
 
 MAX_BYTES: Final = 64_000_000
