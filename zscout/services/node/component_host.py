@@ -6,7 +6,6 @@ import asyncio
 import logging
 from collections import OrderedDict
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Final
 
 import msgspec
@@ -17,6 +16,7 @@ from zscout.config.fleet import Fleet
 from zscout.config.node import MAX_KINDS, ComponentsConfig
 from zscout.keyexpr import BadName, check_name
 from zscout.mesh import IncomingQuery, Mesh, Refused, Supervisor
+from zscout.mesh.supervision import done_within
 from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.services.node.process_use import RunningComponent
@@ -103,12 +103,9 @@ class ComponentHost:
                 return await self._start(operation)
             case messages.StopComponent():
                 process = self._find(operation.component, operation.incarnation, old="unknown_component")
-                await process.stop(operation.grace)
-                return process.view()
+                return await process.stop(operation.grace)
             case messages.CheckpointComponent():
-                process = self._find(operation.component)
-                state = await process.checkpoint()
-                return messages.Checkpoint(operation.component, process.start.incarnation, state)
+                return await self._find(operation.component).checkpoint()
             case messages.ListComponents():
                 return await self._list(operation.component)
             case messages.ReadOutput():
@@ -122,21 +119,15 @@ class ComponentHost:
                     raise Refused("bad_request", "it moves to another host, and gets a higher incarnation there")
                 return await self._find(operation.component, operation.incarnation).move(operation)
             case messages.RestoreComponent():
-                process = self._find(operation.component, operation.incarnation)
-                await process.restore(operation)
-                return process.view()
+                return await self._find(operation.component, operation.incarnation).restore(operation)
             case messages.ActivateComponent():
-                process = self._find(operation.component, operation.incarnation)
-                await process.activate(operation)
-                return process.view()
+                return await self._find(operation.component, operation.incarnation).activate(operation)
 
     async def _start(self, start: messages.StartComponent) -> msgspec.Struct:
         before = self._living.get(start.component)
         if before is not None and before.leaving and start.incarnation > before.start.incarnation:
             # It moved away, failed or is being stopped: what comes next may be here before it is quite gone.
-            with suppress(TimeoutError):
-                async with asyncio.timeout(MAKE_WAY):
-                    await before.over.wait()
+            await done_within(MAKE_WAY, before.over.wait())
         process = self._same(start) or await self._launch(start)
         await process.settled.wait()
         return process.view()

@@ -23,6 +23,7 @@ from zscout.behaviors.components.processes import VARIABLE, kill_family
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import new_instance
 from zscout.mesh import Refused, Supervisor, clock
+from zscout.mesh.supervision import done_within
 from zscout.messages import ComponentView, HowEnded, MoveComponent, Moved, Phase, RestoreComponent, StartComponent
 from zscout.services.node.component_output import OutputReader, OutputRing
 from zscout.services.node.limits import ComponentGroup, ControlGroups
@@ -110,21 +111,21 @@ class ComponentProcess:
 
     # Orders. Each raises Refused.
 
-    async def stop(self, grace: float) -> None:
+    async def stop(self, grace: float) -> ComponentView:
         """Returns when it has ended: by itself within `grace` seconds, or killed."""
         if self.phase != "ended":
             self.phase = "stopping"
             self._send(Order(0, messages.StopComponent(self.start.component)))
-        try:
-            async with asyncio.timeout(grace):
-                await self.over.wait()
-        except TimeoutError:
+        if not await done_within(grace, self.over.wait()):
             self._kill(EndReport("stopped", f"it was killed: it had not ended {grace:g} s after it was asked to"))
         await self.over.wait()
+        return self.view()
 
-    async def checkpoint(self) -> bytes:
+    async def checkpoint(self) -> messages.Checkpoint:
         self._check_runs()
-        return (await self._ask(messages.CheckpointComponent(self.start.component), channel.PATIENCE + SLACK)).state
+        start, patience = self.start, channel.PATIENCE + SLACK
+        answer = await self._ask(messages.CheckpointComponent(start.component), patience)
+        return messages.Checkpoint(start.component, start.incarnation, answer.state)
 
     async def move(self, order: MoveComponent) -> Moved:
         """Asked again for the same move it answers with the outcome of that one."""
@@ -146,15 +147,17 @@ class ComponentProcess:
         self.moved = Moved(order.component, order.to, order.to_incarnation, answer.dead)
         return self.moved
 
-    async def restore(self, order: RestoreComponent) -> None:
+    async def restore(self, order: RestoreComponent) -> ComponentView:
         if self.phase != "standby":
             raise Refused("move_failed", f"it is {self.phase} here; only one that stands by is restored")
         await self._ask(order, SLACK)
+        return self.view()
 
-    async def activate(self, order: messages.ActivateComponent) -> None:
+    async def activate(self, order: messages.ActivateComponent) -> ComponentView:
         """Returns when it runs, or has ended."""
         self._send(Order(0, order))
         await self.running.wait()
+        return self.view()
 
     def _check_runs(self) -> None:
         if self.phase != "running":
@@ -244,9 +247,7 @@ class ComponentProcess:
             await gone.wait()
             self._gone = True
             # Its last messages are on their way.
-            with suppress(TimeoutError):
-                async with asyncio.timeout(LINGER):
-                    await receiving
+            await done_within(LINGER, receiving)
         finally:
             loop.remove_reader(handle)
             os.close(handle)
