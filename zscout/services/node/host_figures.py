@@ -9,6 +9,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Generic, NamedTuple, TypeVar
 
@@ -132,11 +133,9 @@ def group_folders(root: Path, parts: tuple[str, ...]) -> list[Path]:
 
 
 def read_text(file: Path) -> str:
-    try:
-        with file.open("rb") as opened:
-            return opened.read(MAX_BYTES).decode("ascii", "replace").strip()
-    except (OSError, ValueError):
-        return ""
+    with suppress(OSError, ValueError), file.open("rb") as opened:
+        return opened.read(MAX_BYTES).decode("ascii", "replace").strip()
+    return ""
 
 
 def _whole(text: str) -> int | None:
@@ -209,19 +208,16 @@ def cores(cgroup: Cgroup) -> float:
 def memory(cgroup: Cgroup) -> HostMemory:
     """What the host has, or the container where that is less."""
     host = psutil.virtual_memory()
-    limit = cgroup.memory()
-    if limit is None:
-        return HostMemory(host.available, host.total)
+    limit = cgroup.memory() or host
     return HostMemory(min(limit.available, host.available), min(limit.total, host.total))
 
 
 def clock() -> tuple[float, float]:
     """Processor clock in MHz, now and rated; 0 where the system does not tell."""
-    try:
-        found = psutil.cpu_freq()
-    except (OSError, NotImplementedError, RuntimeError, ValueError):
-        found = None
-    return (0.0, 0.0) if found is None else (float(found.current or 0), float(found.max or 0))
+    with suppress(OSError, NotImplementedError, RuntimeError, ValueError):
+        if (found := psutil.cpu_freq()) is not None:
+            return float(found.current or 0), float(found.max or 0)
+    return 0.0, 0.0
 
 
 def temperature() -> float | None:
