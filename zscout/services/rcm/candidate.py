@@ -9,13 +9,13 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from typing import TypeVar
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Role, Token, client_of, new_instance
 from zscout.mesh import Mesh, Reply
-from zscout.mesh.supervision import Supervisor
+from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import ClientRequests, Grants, RcAsk, RcState, absurd
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
@@ -45,6 +45,7 @@ class Candidate:
         """The highest term seen anywhere."""
         self.rcm: Rcm | None = None
         self.ledger = PlacementLedger(mesh)
+        self._timeout = fleet.timing.rebuild / SECOND
         self._leading = ExitStack()
         """Ends the RCM, and the load balancer and the placer beside it, while this node leads."""
         self._candidacy = ExitStack()
@@ -141,14 +142,11 @@ class Candidate:
                 if await self._leader_elsewhere() or not await self._take_over():
                     self.election.failed(self.mesh.now())
                 continue
-            with suppress(TimeoutError):
-                async with asyncio.timeout(None if at is None else (at - now) / SECOND):
-                    await self._changed.wait()
+            await done_within(None if at is None else (at - now) / SECOND, self._changed.wait())
 
     async def _leader_elsewhere(self) -> bool:
         """Whether most RCs still see a leader: then it is this candidate that is cut off."""
-        timeout = self.fleet.timing.rebuild / SECOND
-        replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=timeout)
+        replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
         states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
         for state in states:
             self._see(state.term)
@@ -159,7 +157,6 @@ class Candidate:
         return False
 
     async def _take_over(self) -> bool:
-        timeout = self.fleet.timing.rebuild / SECOND
         keys = self.mesh.keys
         for _ in range(MAX_ATTEMPTS):
             if self.election.sees_leader(self.mesh.now()):
@@ -167,8 +164,8 @@ class Candidate:
             term = Term(self.known.counter + 1, new_instance())
             promise_query = RcAsk(promise=term)
             rcs, clients = await asyncio.gather(
-                self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=timeout),
-                self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=timeout),
+                self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=self._timeout),
+                self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=self._timeout),
             )
             for problem in (*(reply.problem for reply in rcs), *(reply.problem for reply in clients)):
                 if problem is not None and problem.term is not None:
@@ -200,8 +197,7 @@ class Candidate:
         self._leading.callback(rcm.stop)
         rcm.start(recovered)
         balancer = LoadBalancer(self.mesh, self._failed)
-        self._leading.callback(balancer.stop)
-        balancer.start()
         placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, self.ledger.inherited(), self._failed)
-        self._leading.callback(placer.stop)
-        placer.start()
+        for service in (balancer, placer):
+            self._leading.callback(service.stop)
+            service.start()

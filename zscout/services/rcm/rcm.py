@@ -16,6 +16,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 from typing import Any
 
+from msgspec.structs import replace
+
 from zscout import messages
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
@@ -118,7 +120,6 @@ class Rcm:
         """Stops leading. Nothing is revoked: holds and requests stay for the next RCM."""
         for declared in reversed(self._declared):
             declared.close()
-        self._declared = []
         self.supervisor.cancel()
         self.registry.close()
         self.requests.close()
@@ -154,8 +155,7 @@ class Rcm:
         for event in events:
             match event:
                 case Requested(ArcRequest(client=client)) | HandedOver(to=client):
-                    if client not in self.membership.clients:
-                        self.membership.expect(client)
+                    self.membership.expect(client)
         effects = self.core.handle(self.mesh.now(), *events)
         self._publish(effects, named)
         self.registry.report(effects, self.requests.waiting, self.requests.given_up)
@@ -166,8 +166,6 @@ class Rcm:
                     self._propose(effect)
                 case WakeAt(at):
                     self._set_wake(at)
-                case _:
-                    pass
         if line := self.core.strategy.log_line():
             log.info("%s", line)
 
@@ -252,31 +250,24 @@ class Rcm:
             log.warning("%s did not vote: %s", rc, reply.problem.message)
         self._receive(VoteOverdue(proposal))
 
-    # The present state
-
     def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
         asked, now = query.message, self.mesh.now()
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
-        if asked.holds_only:
-            query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, holds))
-            return
-        starts = self.registry.starts() if asked.forecast else {}
-        query.answer(
-            messages.RcmState(
-                term=self.term,
-                seq=self.seq,
-                host=self.mesh.me.host,
-                holds=holds,
+        state = messages.RcmState(self.term, self.seq, self.mesh.me.host, holds)
+        if not asked.holds_only:
+            starts = self.registry.starts() if asked.forecast else {}
+            state = replace(
+                state,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
                 rcs=[
-                    messages.RcView(rc.name, rc.present, rc.sharable, [request_id(arc) for arc in rc.holders])
+                    messages.RcView(rc.name, rc.present, rc.sharable, [*map(request_id, rc.holders)])
                     for rc in status.rcs
                 ],
                 story=self.registry.story(asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
             )
-        )
+        query.answer(state)
 
 
 # The core's values as messages

@@ -151,8 +151,6 @@ class RequestRegistry:
                     if arc not in answered:
                         self._put(self.notice(arc))
                 case HoldEnded(arc=arc) | Dropped(arc=arc):
-                    again = "; queued again" if isinstance(effect, HoldEnded) and effect.requeued else ""
-                    self.record(arc, f"{effect.outcome}: {effect.reason}{again}")
                     notice = self._close(effect)
                     if isinstance(effect, Dropped) or arc not in given_up:
                         self._put(notice)
@@ -160,8 +158,6 @@ class RequestRegistry:
                     if not self._changed:
                         self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
                     self._changed.add(arc)
-                case _:
-                    pass
 
     def publish(self, arcs: Iterable[ArcId]) -> None:
         """Publishes the present state of these ARCs, as far as they are open."""
@@ -182,10 +178,11 @@ class RequestRegistry:
             log.exception("a notice could not be addressed")
 
     def _close(self, effect: HoldEnded | Dropped) -> Notice:
-        """How a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
+        """Records how a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
         why = reason_info(effect.reason)
         details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
         requeued = isinstance(effect, HoldEnded) and effect.requeued
+        self.record(effect.arc, f"{effect.outcome}: {effect.reason}{'; queued again' if requeued else ''}")
         arc = self._core.arc(effect.arc)
         if isinstance(effect, HoldEnded):
             details |= {"by": effect.by, "grant": effect.grant, "rcs": list(effect.rcs)}

@@ -201,8 +201,6 @@ class RequestHandler:
                     self._answer([arc])
                 case Queued(arc=arc, settled=True) if self.core.is_queued(arc):
                     self._answer([arc])
-                case _:
-                    pass
 
     def _answer(self, arcs: Iterable[ArcId]) -> None:
         for arc in arcs:
