@@ -61,7 +61,6 @@ class ComponentPlacer:
         """As published last."""
         self._declarations = ExitStack()
         self._wake: TimerHandle | None = None
-        self._begin_by: TimerHandle | None = None
 
     def start(self) -> None:
         keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
@@ -74,7 +73,7 @@ class ComponentPlacer:
             mesh.serve(keys.placer, PlacerOperation, guard(self._requests.receive)),
         ):
             self._declarations.callback(declared.close)
-        self._begin_by = self._supervisor.call_later(BEGIN, self._begin)
+        self._supervisor.call_later(BEGIN, self._requests.open)
 
     def stop(self) -> None:
         """Stops placing. Nothing is stopped: what runs, runs for the next placer."""
@@ -105,9 +104,8 @@ class ComponentPlacer:
     async def _list_components(self, node: Token) -> None:
         """Asks a host what runs there until it answers."""
         for _ in range(LIST_TRIES):
-            if node.instance not in self._instances.get(node.host, ()):
-                break
-            if await self._command(events.HostCommand(node.host, ListComponents())):
+            gone = node.instance not in self._instances.get(node.host, ())
+            if gone or await self._command(events.HostCommand(node.host, ListComponents())):
                 break
             await sleep(LIST_AGAIN)
         self._listed(node.host)
@@ -115,18 +113,11 @@ class ComponentPlacer:
     def _listed(self, host: HostName) -> None:
         self._unlisted.discard(host)
         if not self._unlisted:
-            self._begin()
+            self._requests.open()
 
     def _on_component(self, token: Token, alive: bool) -> None:
         event = events.TokenAppeared if alive else events.TokenVanished
         self._feed(event(token.name, incarnation_of(token.instance), token.host))
-
-    def _begin(self) -> None:
-        """Carries out requests from now on: all hosts have listed what runs there, or had their time."""
-        if self._begin_by is not None:
-            self._begin_by.cancel()
-            self._begin_by = None
-            self._requests.open()
 
     # Events into the core, effects out of it
 
