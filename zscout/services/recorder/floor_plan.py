@@ -113,7 +113,6 @@ class FloorPlan:
         self.size: tuple[int, int] | None = None
         """Of the plan's picture, in pixels; None before there is one."""
         self._metres = (1.0, 1.0)
-        self._longer = 1.0
         self._trails: dict[str, deque[tuple[float, Spot]]] = {}
         """Seconds and place, by robot."""
         self._building: _Building | None = None
@@ -174,7 +173,7 @@ class FloorPlan:
             return
         building.planned = True
         self._clear(at)
-        self.size, self._longer, self._metres = size, float(max(size)), (width, depth)
+        self.size, self._metres = size, (width, depth)
         # For all times: a server that forgets its oldest data for want of memory must keep the plan.
         image = rr.EncodedImage(contents=plan.picture, media_type="image/png", draw_order=-20.0)
         self._drawing.log(None, "/floor/plan", image)
@@ -230,7 +229,8 @@ class FloorPlan:
 
     def _places(self, spots: Sequence[Spot]) -> list[Spot]:
         """Where names stand: each gives way to one that it would cover."""
-        wide, line = WIDE * self._longer, LINE * self._longer
+        longer = max(self.size or (1, 1))
+        wide, line = WIDE * longer, LINE * longer
         places: list[Spot] = []
         for x, y in spots:
             for _ in range(MAX_STACK):
@@ -270,7 +270,7 @@ class FloorPlan:
         return round(one.x * width / metres_x, 1), round((metres_y - one.y) * height / metres_y, 1)
 
     def _vector(self, heading: float, part: float) -> Spot:
-        length = part * self._longer
+        length = part * max(self.size or (1, 1))
         return round(length * math.cos(heading), 1), round(-length * math.sin(heading), 1)
 
     def _beside(self, spot: Spot, heading: float, part: float) -> Spot:

@@ -35,6 +35,8 @@ SMOOTHING: Final = 0.1
 SAME_MOMENT: Final = 1.0
 """Marks of one host within so many seconds stand above each other."""
 MAX_STACK: Final = 10
+SEATED: Final = {"starting": "starting", "running": "", "moving": "moves", "stopping": "stopping"}
+"""States of a component that has a host, and what it does there."""
 GETS_READY: Final = "gets ready"
 """A component on the host to which it moves."""
 SILENCE: Final = 10.0
@@ -192,11 +194,10 @@ class HostTracker:
             touched |= _seats(known.placement).keys() if known is not None else set()
         for host in sorted(touched):
             self._show_lane(at, host)
-        cordoned, before = frozenset(news.cordoned), self._cordoned
-        self._cordoned = cordoned
-        for host in sorted(cordoned - before):
+        before, self._cordoned = self._cordoned, frozenset(news.cordoned)
+        for host in sorted(self._cordoned - before):
             self._drawing.warn(at, f"{host} is being emptied: nothing is placed there any more")
-        for host in sorted(before - cordoned):
+        for host in sorted(before - self._cordoned):
             self._drawing.event(at, f"{host} is used again")
 
     def _show_lane(self, at: float, host: str) -> None:
@@ -269,26 +270,16 @@ class HostTracker:
                 if host is not None and news:
                     mark(at, host, "given_up", name)
                 event(at, f"{name} is given up{why}", "ERROR")
-            case _:
-                pass
 
 
 def _seats(placement: Placement) -> dict[str, str]:
     """In which hosts' lanes a component stands, and what it does there: empty while it just runs."""
     host, to = placement.host, placement.to
-    if host is None:
+    if host is None or placement.state not in SEATED:
         return {}
-    match placement.state:
-        case "running":
-            return {host: ""}
-        case "moving" if to is not None and to != host:
-            return {host: f"moves to {to}", to: GETS_READY}
-        case "moving":
-            return {host: "moves"}
-        case "starting" | "stopping":
-            return {host: placement.state}
-        case _:
-            return {}
+    if placement.state == "moving" and to is not None and to != host:
+        return {host: f"moves to {to}", to: GETS_READY}
+    return {host: SEATED[placement.state]}
 
 
 def _duration(seconds: float) -> str:

@@ -20,6 +20,7 @@ from zscout.config.fleet import Fleet, MeshConfig
 from zscout.config.node import RecorderConfig
 from zscout.config.strict import BadInput
 from zscout.mesh import Supervisor
+from zscout.mesh.supervision import done_within
 
 log = logging.getLogger(__name__)
 
@@ -128,10 +129,7 @@ class RecorderProcess:
             return
         if child.stdin is not None:
             child.stdin.close()
-        try:
-            async with asyncio.timeout(GRACE):
-                await child.wait()
-        except TimeoutError:
+        if not await done_within(GRACE, child.wait()):
             log.warning("the recorder did not finish in %g s and is killed", GRACE)
             child.kill()
             await child.wait()

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from contextlib import suppress
 from typing import Final
 
 from zscout import messages
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Declaration, Mesh, Supervisor
+from zscout.mesh.supervision import done_within
 from zscout.services.recorder.hosts import MAX_FOLLOWED
 from zscout.services.recorder.request_tracker import RequestTracker
 from zscout.services.recorder.robots import MAX_CAMERAS
@@ -170,10 +170,7 @@ class Recorder:
     async def _keep_reading(self) -> None:
         known = 0
         while True:
-            try:
-                async with asyncio.timeout(CHECK_EVERY):
-                    await self._wanted.wait()
-            except TimeoutError:
+            if not await done_within(CHECK_EVERY, self._wanted.wait()):
                 missed = sum(declared.missed for declared in self._declared)
                 if missed == known:
                     continue
@@ -203,10 +200,8 @@ class Recorder:
         """Asks the placer at the start, and whenever something may have been missed. Does not return."""
         key, failed = self.mesh.keys.placer, 0
         while True:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(AGAIN if 0 < failed < TRIES else None):
-                    await self._placer_wanted.wait()
-                    failed = 0
+            if await done_within(AGAIN if 0 < failed < TRIES else None, self._placer_wanted.wait()):
+                failed = 0
             self._placer_wanted.clear()
             self._fresher = fresher = set[str]()
             reply = await self.mesh.ask_one(key, messages.ListPlacements(), messages.Placements, timeout=READ_TIMEOUT)

@@ -78,7 +78,7 @@ class RequestTracker:
         if (state.term, state.seq) < (self.term, self.seq):
             return False
         self.term, self.seq = state.term, state.seq
-        holders: dict[str, list[HoldView]] = {view.rc: [] for view in state.rcs}
+        holders: dict[str, list[HoldView]] = {rc: [] for rc in (*(view.rc for view in state.rcs), *self._rcs)}
         open_now = {(hold.client, hold.id) for hold in state.holds}
         open_now |= {(wait.client, wait.id) for wait in state.queue}
         for hold in state.holds:
@@ -99,8 +99,6 @@ class RequestTracker:
             # What the answer left out may still wait.
             if not state.more or self._requests[key].grant is not None:
                 self._ended(at, key, "ended", "while nobody listened")
-        for rc in self._rcs.keys() - holders.keys():
-            self._show(at, rc, [])
         for rc, held in holders.items():
             self._show(at, rc, held)
         return True
