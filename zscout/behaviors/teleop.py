@@ -1,8 +1,8 @@
 """A robot in an operator's hands: taken at operator priority, driven as a `Pilot` says, given back.
 
-teleop = Teleop(client, RobotNeeds("robot/scout33"), Pilot(), priority=10)
-running = asyncio.create_task(teleop.run())
-teleop.take()                       # and give_back(); press keys at teleop.pilot, then teleop.wake()
+    teleop = Teleop(client, RobotNeeds("robot/scout33"), Pilot(), priority=10)
+    running = asyncio.create_task(teleop.run())
+    teleop.take()                       # and give_back(); press keys at teleop.pilot, then teleop.wake()
 """
 
 from __future__ import annotations
@@ -229,12 +229,11 @@ class Teleop:
             robot = self.robot = HeldRobot(held, self.needs)
             self.held = held
             self._set_state("driving", "")
-            # The wheels go first: whoever takes over in a hurry does not wait for the camera.
-            await self._steer(robot)
             while True:
+                # The wheels go first: whoever takes over in a hurry does not wait for the camera.
+                await self._steer(robot)
                 await robot.camera(True)
                 await done_within(PERIOD, self._wake.wait())
-                await self._steer(robot)
 
     async def _steer(self, robot: HeldRobot) -> None:
         self._wake.clear()

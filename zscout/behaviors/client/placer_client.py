@@ -26,9 +26,6 @@ R = TypeVar("R")
 class PlacerSilent(RequestRefused):
     """No component placer answered: what was requested may be done or not."""
 
-    def __init__(self, message: str) -> None:
-        super().__init__(Problem("unknown", message))
-
 
 class PlacerClient:
     """The component placer, as one program knows it. `timeout`: seconds within which some placer answers,
@@ -94,7 +91,7 @@ class PlacerClient:
             if answer is not None:
                 return answer
             if self.mesh.now() > deadline:
-                raise PlacerSilent(silent)
+                raise PlacerSilent(Problem("unknown", silent))
             await asyncio.sleep(RETRY_AFTER)
 
     # Placements

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Any, NamedTuple, Self
@@ -131,8 +132,10 @@ class OpenArc:
         if notice.state != "running" or not bound:
             return {}
         rcs = {bound.get(need, need) for need in self.needs}
-        fits = all(_is_rc(rc) and matcher(need)(rc) for need, rc in bound.items())
-        return bound if fits and len(rcs) == len(self.needs) else None
+        with suppress(BadName):
+            if len(rcs) == len(self.needs) and all(matcher(need)(check_rc(rc)) for need, rc in bound.items()):
+                return bound
+        return None
 
     def _close(self, ending: HoldEnd, now: Ns) -> None:
         if self.grant is not None:
@@ -173,10 +176,6 @@ class OpenArc:
         self.state, self.reason, self.outcome, self.since = "asking", reason, None, now
         self.why = None
 
-    def _waited(self, now: Ns) -> float:
-        since = self.waits_since
-        return 0.0 if since is None or self.grant is not None else max(0, now - since) / SECOND
-
     def ask(self, now: Ns) -> Ask:
         return Ask(**self._as_asked(now), estimate=self.estimate)
 
@@ -185,6 +184,7 @@ class OpenArc:
         return OpenRequest(**self._as_asked(now), grant=self.grant)
 
     def _as_asked(self, now: Ns) -> dict[str, Any]:
+        since = now if self.waits_since is None or self.grant is not None else self.waits_since
         return {
             "id": self.id,
             "arc": self.name,
@@ -193,15 +193,8 @@ class OpenArc:
             "min_runtime": self.min_runtime,
             "keep": self.keep,
             "place": self.place,
-            "waited": self._waited(now),
+            "waited": max(0, now - since) / SECOND,
         }
-
-
-def _is_rc(name: str) -> bool:
-    try:
-        return bool(check_rc(name))
-    except BadName:
-        return False
 
 
 def amounts(needs: Needs) -> dict[str, Amounts]:

@@ -80,25 +80,17 @@ def _send(connection: socket.socket, frame: bytes) -> None:
 
 
 def _listen(orders: BinaryIO, tag: str, deliver: Callable[[Order], object]) -> None:
-    """Receives orders until the node has closed. In a thread: it must work while the component computes."""
+    """Receives orders until the node has closed, then kills all processes of this component, this one last. In a
+    thread: it must work while the component computes."""
     try:
-        while True:
-            order: Order | None = channel.receive(orders, Order)
-            if order is None:
-                break
-            deliver(order)
-    except (BadFrame, RuntimeError):  # the latter: the loop is closed
-        pass
+        with suppress(BadFrame, RuntimeError):  # the latter: the loop is closed
+            while (order := channel.receive(orders, Order)) is not None:
+                deliver(order)
     finally:
-        die(tag)
-
-
-def die(tag: str) -> None:
-    """Kills all processes of this component, this one last."""
-    try:
-        kill_family(tag, spare=os.getpid())
-    finally:
-        os.killpg(0, signal.SIGKILL)
+        try:
+            kill_family(tag, spare=os.getpid())
+        finally:
+            os.killpg(0, signal.SIGKILL)
 
 
 if __name__ == "__main__":

@@ -100,7 +100,9 @@ class Spin(Component):
     async def run(self, context: ComponentContext) -> None:
         due = said = time.monotonic()
         while True:
-            self._turn(SLICE * self.cpu)
+            until = time.thread_time() + SLICE * self.cpu
+            while time.thread_time() < until:
+                self.loops += 1
             due += SLICE
             now = time.monotonic()
             if now - said >= 1:
@@ -110,12 +112,6 @@ class Spin(Component):
             # What it was not given is not made up for.
             due = max(due, now)
             await asyncio.sleep(due - now)
-
-    def _turn(self, seconds: float) -> None:
-        """Computes for so long on the processor."""
-        until = time.thread_time() + seconds
-        while time.thread_time() < until:
-            self.loops += 1
 
     def checkpoint(self) -> bytes:
         return json.dumps({"loops": self.loops}).encode()

@@ -210,9 +210,6 @@ class Scout:
             return step
         if picture is None or not good:
             return Step(0, 0, 0, "blind", "no good picture")
-        return self._watch(now, picture)
-
-    def _watch(self, now: float, picture: Picture) -> Step:
         seen = self._detector.see(now, picture)
         edge, count = self.alerts.see(now, seen.moving), self.alerts.count
         if self.alerts.moving:

@@ -113,14 +113,12 @@ class Hider:
         view = analyse(picture)
         drove = phase.cruises and not waits and robot.ends > robot.clock - passed
         stuck = drove and robot.blocked_by(picture)
-        return self._follow((phase.stuck if stuck else phase.step)(robot, view), view)
-
-    def _follow(self, step: Step, view: View) -> WheelCommand:
-        """Changes the phase, if that is the step, and takes its first step on the same picture."""
-        if isinstance(step, WheelCommand):
-            return step
-        self._go(step)
-        return self._follow(PHASES[step].step(self._robot, view), view)
+        step = (phase.stuck if stuck else phase.step)(robot, view)
+        while not isinstance(step, WheelCommand):
+            # The next phase takes its first step on the same picture.
+            self._go(step)
+            step = PHASES[step].step(robot, view)
+        return step
 
     def _go(self, phase: Phase) -> None:
         self._robot.go(phase)
