@@ -1,8 +1,8 @@
 """A robot in an operator's hands: taken at operator priority, driven as a `Pilot` says, given back.
 
-    teleop = Teleop(client, RobotNeeds("robot/scout33"), Pilot(), priority=10)
-    running = asyncio.create_task(teleop.run())
-    teleop.take()                       # and give_back(); press keys at teleop.pilot, then teleop.wake()
+teleop = Teleop(client, RobotNeeds("robot/scout33"), Pilot(), priority=10)
+running = asyncio.create_task(teleop.run())
+teleop.take()                       # and give_back(); press keys at teleop.pilot, then teleop.wake()
 """
 
 from __future__ import annotations
@@ -188,7 +188,9 @@ class Teleop:
                 await self._while_wanted(self._drive())
                 if self._wanted.is_set():
                     # To ask again would take it back from an operator of the same rank, and so on in turns.
-                    why = f"it was taken by {self._successor() or 'another'}"
+                    ending = self.held.arc.ending if self.held is not None else None
+                    successor = (ending.by or ending.reason) if ending is not None else ""
+                    why = f"it was taken by {successor or 'another'}"
                     self.give_back()
             except Revoked as revoked:
                 self._set_state("waiting", f"it was taken away: {revoked}")
@@ -202,11 +204,6 @@ class Teleop:
                 self.robot = self.held = None
             if not self._wanted.is_set():
                 self._set_state("free", why)
-
-    def _successor(self) -> str:
-        """The ARC that has the robot now, by the last notice of our ARC."""
-        ending = self.held.arc.ending if self.held is not None else None
-        return ending.by or ending.reason if ending is not None else ""
 
     def _on_notice(self, arc: OpenArc) -> None:
         if arc.name == self._name and arc.state == "queued" and self.state == "waiting" and arc.reason:

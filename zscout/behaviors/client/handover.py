@@ -70,9 +70,8 @@ class MovableClient:
         for arc in arcs.values():
             # What comes back: notices from before it went are old.
             if (before := self._store.moved.pop(arc.id, None)) is not None:
-                arc.last = before.last
+                arc.last, arc.news = before.last, before.news
             self._store.withdrawn.pop(arc.id, None)
-            self._store.listen(arc)
 
     def _take_moving(self, notice: Notice) -> bool:
         """Applies a notice of what is expected, or was handed over. False if it is of neither."""

@@ -114,7 +114,6 @@ class PlacerClient:
         self.changed.clear()
 
     def take(self, *placements: Placement) -> None:
-        """Takes them in as the newest."""
         for placement in placements:
             if self.only is None or placement.component in self.only:
                 self.placements[placement.component] = placement

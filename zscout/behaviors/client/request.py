@@ -82,6 +82,7 @@ class OpenArc:
     ending: HoldEnd | None = None
     """How the last hold ended; `outcome` and `reason` are of the newest notice, whatever it is about."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
+    news: asyncio.Event = field(default_factory=asyncio.Event, compare=False, repr=False)
 
     @classmethod
     def expected(cls, request: OpenRequest, now: Ns) -> Self:
@@ -222,7 +223,6 @@ class RequestStore:
         self.resumed = asyncio.Event()
         """Not set while the client is paused."""
         self.resumed.set()
-        self._news: dict[str, asyncio.Event] = {}
         self.watchers: list[Callable[[OpenArc], None]] = []
         """Each is called with whatever there is news of."""
 
@@ -237,32 +237,23 @@ class RequestStore:
 
     def add(self, arc: OpenArc) -> None:
         self.arcs[arc.id] = arc
-        self.listen(arc)
-
-    def listen(self, arc: OpenArc) -> None:
-        """From now on somebody may wait for news of `arc`."""
-        self._news.setdefault(arc.id, asyncio.Event())
 
     def forget(self, arc: OpenArc) -> None:
         self.arcs.pop(arc.id, None)
         self.moved.pop(arc.id, None)
         self.expected.pop(arc.id, None)
-        self._news.pop(arc.id, None)
 
     def notify(self, arc: OpenArc) -> None:
         """Wakes all who wait for news of `arc`."""
-        event = self._news.get(arc.id)
-        if event is not None:
-            event.set()
+        arc.news.set()
         for watcher in self.watchers:
             watcher(arc)
 
     async def changed(self, arc: OpenArc) -> None:
         """Waits for the next news; not at all where none is to come."""
-        event = self._news.get(arc.id)
-        if event is not None:
-            event.clear()
-            await event.wait()
+        if arc.id in self.arcs or arc.id in self.moved or arc.id in self.expected:
+            arc.news.clear()
+            await arc.news.wait()
 
     def take(self, arc: OpenArc, notice: Notice) -> None:
         """Applies a notice of the RCM about one of `arcs`."""
@@ -300,9 +291,6 @@ class RequestStore:
         """A moved one is this client's again, under a new id; it is to be asked for."""
         del self.moved[arc.id]
         self.reclaimed.discard(arc.id)
-        news = self._news.pop(arc.id, None)
         arc.take_back(new_instance(), "it was handed over, and its new client is gone", self._now())
         self.arcs[arc.id] = arc
-        # Who waits for news goes on waiting for those of the same ARC.
-        self._news[arc.id] = news or asyncio.Event()
         self.notify(arc)

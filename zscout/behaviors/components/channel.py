@@ -39,7 +39,6 @@ class ComponentJob(msgspec.Struct, frozen=True, tag="job"):
 
     @property
     def client(self) -> str:
-        """Its name on the mesh."""
         return f"{self.start.component}.{self.start.incarnation}"
 
 

@@ -50,7 +50,6 @@ class ComponentContext:
     def __init__(self, client: Client, component: str, incarnation: int, gate: SafePointGate) -> None:
         self.client = client
         self.component = component
-        """Its name."""
         self.incarnation = incarnation
         """Which start of it this is."""
         self._gate = gate
@@ -94,7 +93,6 @@ class SafePointGate:
         """Holds what comes from now on; False, and nothing is held, if nothing came within `patience`
         seconds. `release` ends it."""
         self._open.clear()
-        self._come.clear()
         try:
             async with asyncio.timeout(patience):
                 while not self.holds:

@@ -89,7 +89,6 @@ class ComponentLifecycle:
         return ends
 
     def order(self, order: Order) -> None:
-        """Carries out an order of the node."""
         match order.operation:
             case messages.StopComponent():
                 self.end(EndReport("stopped"))

@@ -49,8 +49,6 @@ def state_of(component: Component) -> bytes:
 
 
 class OutgoingMove:
-    """One move of `component`, as it was ordered."""
-
     def __init__(self, client: Client, component: Component, gate: SafePointGate, order: MoveComponent) -> None:
         self._client, self._component, self._gate = client, component, gate
         self._name, self.to, self.incarnation = order.component, order.to, order.to_incarnation

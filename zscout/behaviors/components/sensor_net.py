@@ -7,7 +7,7 @@ import re
 from contextlib import closing, suppress
 from typing import Annotated, Any, Final
 
-from msgspec import Meta, Struct, structs
+from msgspec import Meta, Struct
 
 from zscout.behaviors.components.component import Component, ComponentContext
 from zscout.behaviors.components.shipped import PARAMS, read_params
@@ -148,8 +148,7 @@ class PlaceSensorNetComponent(TreeComponent):
     def __init__(self, params: dict[str, Any]) -> None:
         net = read_params(params, NetParams)
         self.speed = net.speed
-        shared = [field.name for field in structs.fields(SharedParams)]
-        self._shared: dict[str, Any] = {name: params[name] for name in shared if name in params}
+        self._shared: dict[str, Any] = {name: params[name] for name in SharedParams.__struct_fields__ if name in params}
         robots = SensorNet(list(net.robots), net.wanted or len(net.robots))
         self.root = PlaceSensorNet(net.name, robots, self._spec_for)
 

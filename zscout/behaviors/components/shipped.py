@@ -34,8 +34,6 @@ def read_params(params: dict[str, Any], kind: type[T]) -> T:
 
 
 class CounterParams(Struct):
-    """Parameters of `counter`."""
-
     period: Annotated[float, key("Seconds from one count to the next.", 0.001, 3600)] = 1.0
     rc: Annotated[str | None, key("An RC that it holds, and that echoes each count.")] = None
     priority: Annotated[float, key("Of its ARC.", -1000, 1000)] = 0.0
@@ -81,8 +79,6 @@ class Counter(Component):
 
 
 class SpinParams(Struct):
-    """Parameters of `spin`."""
-
     cpu: Annotated[float, key("The share of one core that it wants.", 0, 1)] = 0.5
     memory: Annotated[float, key("In MB, that it fills.", 0, 1_000_000)] = 0.0
 

@@ -80,8 +80,6 @@ class Box(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a picture showed."""
-
     moving: bool
     boxes: tuple[Box, ...] = ()
     """Where, largest first; of a sighting that is not sure yet as well."""
@@ -109,8 +107,6 @@ class Event(NamedTuple):
 
 
 class MotionDetector:
-    """The memory of one camera."""
-
     def __init__(self) -> None:
         self._mean: _Plane = np.empty((0, 0), np.float32)
         self._variance = self._mean

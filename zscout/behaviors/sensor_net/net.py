@@ -41,8 +41,6 @@ Effect: TypeAlias = StartRobot | StopRobot
 
 @dataclass(slots=True)
 class Member:
-    """A robot of the net."""
-
     robot: str
     standing: MemberStatus = "free"
     doing: str = ""
@@ -55,8 +53,6 @@ class Member:
 
 
 class SensorNet:
-    """The state of a sensor net."""
-
     def __init__(self, robots: Sequence[str], wanted: int | None = None) -> None:
         """Raises ValueError for no robots, one named twice, or more wanted than named."""
         if not robots or len(set(robots)) != len(robots):

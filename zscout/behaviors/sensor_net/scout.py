@@ -35,8 +35,6 @@ Task: TypeAlias = Literal["hide", "watch"]
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What follows from one look."""
-
     left: float
     right: float
     lasts: float
@@ -165,8 +163,6 @@ class Blindness:
 
 
 class Scout:
-    """One robot's part of the net."""
-
     def __init__(self, *, seed: int = 0) -> None:
         self.hider = Hider(seed=seed)
         self.alerts = Alerts()

@@ -66,8 +66,6 @@ class BadCheckpoint(ValueError):
 
 
 class Hider:
-    """Hides one robot."""
-
     def __init__(self, *, seed: int = 0) -> None:
         self._robot = HidingState(dice=seed & 0xFFFFFFFFFFFFFFFF)
 

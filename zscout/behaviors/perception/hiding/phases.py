@@ -376,7 +376,6 @@ def settle(robot: HidingState, view: View) -> Step:
 
 
 def hidden(robot: HidingState, _: View) -> Step:
-    """Keeps still."""
     return robot.stand(robot.note)
 
 

@@ -70,8 +70,6 @@ WORDS: Final = {phase: word for word, phases in PHASES_OF.items() for phase in p
 
 @dataclass(frozen=True, slots=True)
 class WheelCommand:
-    """What the wheels are to do now, and why."""
-
     left: float
     right: float
     """Shares of top speed, -1 to 1."""
@@ -142,7 +140,6 @@ class HidingState(msgspec.Struct):
     form: int = FORM
     phase: Phase = "scan"
     began: float = 0.0
-    """When this phase began."""
     clock: float = 0.0
     last_now: float | None = None
     interval: float = 0.2
@@ -222,7 +219,6 @@ class HidingState(msgspec.Struct):
     """As last reported."""
 
     def go(self, phase: Phase) -> None:
-        """Changes the phase."""
         self.phase, self.began = phase, self.clock
         self.hopping, self.hops, self.shifted, self.seen_target = False, 0, False, self.clock
         self.thumbs, self.floors, self.halted = [], [], 0
