@@ -111,7 +111,6 @@ class Attempt:
         self.arc: OpenArc | None = None
         self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None]] | None = None
         """The hold, its body, and what cancels the body when the hold is over."""
-        self._interrupted = False
 
     async def granted(self) -> Held:
         """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused."""
@@ -129,23 +128,22 @@ class Attempt:
     async def __aenter__(self) -> Held:
         held, body = await self.granted(), asyncio.current_task()
         assert body is not None  # noqa: S101 - this is a coroutine
-        self._interrupted = False
         self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body))
         return held
 
     async def _interrupt_when_over(self, held: Held, body: asyncio.Task[Any]) -> None:
         await held.over()
         await held.resumed()
-        self._interrupted = True
         body.cancel()
 
     async def __aexit__(self, kind: type[BaseException] | None, *_error: object) -> bool:
         assert self._entered is not None  # noqa: S101 - entered before left
         held, body, watch = self._entered
         arc = held.arc
+        interrupted = watch.done() and not watch.cancelled()
         watch.cancel()
         # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
-        interrupted = self._interrupted and body.uncancel() == 0 and kind is asyncio.CancelledError
+        interrupted = interrupted and body.uncancel() == 0 and kind is asyncio.CancelledError
         if held.completed:
             self._client.complete(arc)
             return interrupted

@@ -12,8 +12,8 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Coroutine, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
-from typing import Any, TypeVar
+from contextlib import contextmanager
+from typing import Any, Self, TypeVar
 
 import uvloop
 
@@ -65,7 +65,7 @@ class BlockingHeld:
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
 
 
-class Lab(AbstractContextManager["Lab"]):
+class Lab:
     """A client whose event loop runs in a thread of its own."""
 
     def __init__(self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> None:
@@ -77,6 +77,9 @@ class Lab(AbstractContextManager["Lab"]):
         except BaseException:
             self._stop()
             raise
+
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

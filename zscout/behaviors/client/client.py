@@ -88,8 +88,7 @@ class Client(MovableClient):
     async def leave(self) -> None:
         """Leaves the mesh without ending anything or giving it back: for who has handed over all. What is
         still this client's goes when the RCM sees that its token has gone."""
-        if self._leaving is None:
-            self._leaving = asyncio.get_running_loop().create_task(self._leave())
+        self._leaving = self._leaving or asyncio.create_task(self._leave())
         # Its token must go even if the caller is cancelled.
         await asyncio.shield(self._leaving)
 
@@ -107,7 +106,7 @@ class Client(MovableClient):
         for arc in self._store.open:
             arc.finish("lost", f"this client failed: {error!r}", self.mesh.now())
             self._store.notify(arc)
-        self._leaving = self._leaving or asyncio.get_running_loop().create_task(self._leave())
+        self._leaving = self._leaving or asyncio.create_task(self._leave())
 
     @property
     def term(self) -> Term:
@@ -264,8 +263,7 @@ class Client(MovableClient):
     def _on_notice(self, _key: str, notice: Notice) -> None:
         if not self._rcm.accept(notice.term):
             return
-        arc = self._store.arcs.get(notice.id)
-        if arc is not None:
+        if (arc := self._store.arcs.get(notice.id)) is not None:
             self._store.take(arc, notice)
         elif not self._take_moving(notice) and notice.state == "running":
             # A grant that nobody here asked for, or gave up meanwhile, is given back.

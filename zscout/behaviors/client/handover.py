@@ -64,19 +64,14 @@ class MovableClient:
         for arc in list(self._store.expected.values()):
             self._unclaimed.pop(arc.id, None)
             self._store.forget(arc)
-        self._store.expected.update(arcs)
+        for arc in arcs.values():
+            self._store.expect(arc)
         self._unclaimed |= arcs
         self.expected_came.clear()
-        for arc in arcs.values():
-            # What comes back: notices from before it went are old.
-            if (before := self._store.moved.pop(arc.id, None)) is not None:
-                arc.last, arc.news = before.last, before.news
-            self._store.withdrawn.pop(arc.id, None)
 
     def _take_moving(self, notice: Notice) -> bool:
         """Applies a notice of what is expected, or was handed over. False if it is of neither."""
-        arc = self._store.expected.get(notice.id)
-        if arc is not None:
+        if (arc := self._store.expected.get(notice.id)) is not None:
             if arc.take_first(notice, self.mesh.now()):
                 del self._store.expected[arc.id]
                 self._store.add(arc)

@@ -73,8 +73,7 @@ class PlacerClient:
         missing. Raises RequestRefused, PlacerSilent."""
 
         async def attempt() -> Placement | None:
-            answer = await self._ask(operation, Placement)
-            if answer is not None:
+            if (answer := await self._ask(operation, Placement)) is not None:
                 self.take(answer)
                 return answer
             await self.refresh()
@@ -87,8 +86,7 @@ class PlacerClient:
     async def _until(self, attempt: Callable[[], Awaitable[R | None]], silent: str) -> R:
         deadline = self.mesh.now() + round(self._timeout * SECOND)
         while True:
-            answer = await attempt()
-            if answer is not None:
+            if (answer := await attempt()) is not None:
                 return answer
             if self.mesh.now() > deadline:
                 raise PlacerSilent(Problem("unknown", silent))
@@ -102,8 +100,7 @@ class PlacerClient:
 
     async def try_refresh(self) -> None:
         """The same with one query: without an answer `placements` stay as they are."""
-        listed = await self._ask(self._list, Placements)
-        if listed is not None:
+        if (listed := await self._ask(self._list, Placements)) is not None:
             self._listed(listed)
 
     async def wait_changed(self) -> None:

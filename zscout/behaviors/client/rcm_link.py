@@ -183,8 +183,7 @@ class RcmLink:
 
     async def _withdraw(self, request_id: str) -> bool:
         """Sends once what is to be withdrawn; whether that was answered."""
-        operation = self.store.withdrawn.get(request_id)
-        if operation is None:
+        if (operation := self.store.withdrawn.get(request_id)) is None:
             return True
         reply = await self.query(operation)
         if reply is None or (reply.problem is not None and reply.problem.code in TRY_AGAIN):

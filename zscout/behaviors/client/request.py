@@ -82,7 +82,7 @@ class OpenArc:
     ending: HoldEnd | None = None
     """How the last hold ended; `outcome` and `reason` are of the newest notice, whatever it is about."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
-    news: asyncio.Event = field(default_factory=asyncio.Event, compare=False, repr=False)
+    _news: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
 
     @classmethod
     def expected(cls, request: OpenRequest, now: Ns) -> Self:
@@ -104,8 +104,7 @@ class OpenArc:
         hold that is not what was asked for."""
         if (notice.term, notice.step) <= self.last or not self.open:
             return False
-        bound = self._binding(notice)
-        if bound is None:
+        if (bound := self._binding(notice)) is None:
             return False
         self.last = (notice.term, notice.step)
         if notice.state != self.state or notice.grant != self.grant:
@@ -238,6 +237,13 @@ class RequestStore:
     def add(self, arc: OpenArc) -> None:
         self.arcs[arc.id] = arc
 
+    def expect(self, arc: OpenArc) -> None:
+        """`arc` is to be handed to this client. If it comes back, notices from before it went are old."""
+        if (before := self.moved.pop(arc.id, None)) is not None:
+            arc.last, arc._news = before.last, before._news
+        self.withdrawn.pop(arc.id, None)
+        self.expected[arc.id] = arc
+
     def forget(self, arc: OpenArc) -> None:
         self.arcs.pop(arc.id, None)
         self.moved.pop(arc.id, None)
@@ -245,15 +251,15 @@ class RequestStore:
 
     def notify(self, arc: OpenArc) -> None:
         """Wakes all who wait for news of `arc`."""
-        arc.news.set()
+        arc._news.set()
         for watcher in self.watchers:
             watcher(arc)
 
     async def changed(self, arc: OpenArc) -> None:
         """Waits for the next news; not at all where none is to come."""
         if arc.id in self.arcs or arc.id in self.moved or arc.id in self.expected:
-            arc.news.clear()
-            await arc.news.wait()
+            arc._news.clear()
+            await arc._news.wait()
 
     def take(self, arc: OpenArc, notice: Notice) -> None:
         """Applies a notice of the RCM about one of `arcs`."""
