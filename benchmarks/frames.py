@@ -19,7 +19,7 @@ import sys
 import tempfile
 import tty
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -88,7 +88,7 @@ class Pictures:
 
     async def _follow(self, framegrabber: str) -> None:
         robots: dict[Any, int] = {}
-        with self._client.mesh.frames(self._client.mesh.keys.frame(framegrabber)) as frames:
+        with closing(self._client.mesh.frames(self._client.mesh.keys.frame(framegrabber))) as frames:
             while True:
                 frame = await frames.next(1.0)
                 if frame is None or frame.head.grant is None:

@@ -88,7 +88,7 @@ HELD = said(2, ONE)
 
 
 @pytest.mark.parametrize(
-    ("heard", "now_holds", "outdated", "reread"),
+    ("heard", "now_holds", "announce", "reread"),
     [
         pytest.param(said(3, TWO), [3], False, False, id="another holder from now on"),
         pytest.param(said(3, ONE, TWO), [2, 3], False, False, id="one more holder"),
@@ -112,10 +112,10 @@ HELD = said(2, ONE)
         ),
     ],
 )
-def test_hear(heard: Grants, now_holds: list[int], outdated: bool, reread: bool) -> None:
+def test_hear(heard: Grants, now_holds: list[int], announce: bool, reread: bool) -> None:
     rc = holding(HELD)
     change = rc.apply_grants(heard, NOW)
-    assert (grants(rc), change.outdated, change.reread) == (now_holds, outdated, reread)
+    assert (grants(rc), change.announce, change.reread) == (now_holds, announce, reread)
     began = {held.grant.seq for held in change.began}
     stopped = {held.grant.seq for held in change.removed}
     assert {2} - stopped | began == set(now_holds)
@@ -149,7 +149,7 @@ def test_only_an_rcm_that_is_obeyed_keeps_holds_alive(heard: Grants, refreshed: 
         pytest.param(state(5, view(2), view(4)), True, [2, 4], False, id="one that was missed"),
         pytest.param(state(5, view(2), view(4, rc="robot/y")), True, [2], False, id="a hold elsewhere"),
         pytest.param(state(1, view(1)), True, [2], False, id="an older snapshot"),
-        pytest.param(state(9, view(4), term=OLD), True, [2], False, id="of an older term"),
+        pytest.param(state(9, view(4), term=OLD), True, [2], True, id="of an older term: it is told of the newer"),
         pytest.param(state(1, view(2), term=NEW), False, [2], False, id="of a new term"),
         pytest.param(state(1, term=NEW), False, [2], True, id="of a new term that knows nothing of it"),
         pytest.param(state(1, view(9), term=Term(10**9, "x")), True, [2], False, id="of a term that is absurd"),
@@ -159,7 +159,6 @@ def test_read(read: RcmState, sharable: bool, now_holds: list[int], presents: bo
     rc = holding(HELD)
     change = rc.apply_snapshot(read, NOW, sharable=sharable)
     assert (grants(rc), change.announce) == (now_holds, presents)
-    assert change.outdated == (read.term < TERM)
     assert not change.removed
 
 
@@ -195,7 +194,7 @@ def test_promises(term: Term, kept: bool) -> None:
     # A lower term than the one promised is not obeyed again; the promised one begins with any number.
     change = rc.apply_grants(said(3, TWO), NOW)
     assert grants(rc) == ([2] if kept and term > TERM else [3])
-    assert change.outdated is (kept and term > TERM)
+    assert change.announce is (kept and term > TERM)
     if kept and term > TERM:
         assert not rc.apply_grants(said(1, TWO, term=term, prev=0), NOW).reread
         assert grants(rc) == [3]

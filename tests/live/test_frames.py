@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -149,7 +149,7 @@ def test_who_looks_has_the_newest_frame_and_whoever_publishes_knows(tmp_path: Pa
             watch.close()
             await until(lambda: not publisher.watched)
             assert told == [True, False]
-            with there.frames(key):
+            with closing(there.frames(key)):
                 await until(lambda: publisher.watched)
             publisher.close()
 
@@ -274,7 +274,7 @@ def test_frames_are_published_while_somebody_holds_and_somebody_looks(
             assert at.two.connected == 1
             # Somebody looks again: at once there are frames, and not of those that gathered.
             sent = at.two.sent
-            with at.watch() as watch:
+            with closing(at.watch()) as watch:
                 assert number_of(picture_in(await frame_of(watch))) > BLUE + sent - 5
 
                 # Free again: it stays open for the next while somebody looks, and publishes nothing.

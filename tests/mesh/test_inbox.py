@@ -72,6 +72,7 @@ def test_a_handler_that_fails_stops_nothing(caplog: pytest.LogCaptureFixture) ->
         handled: list[str] = []
 
         def fail(error: Exception) -> None:
+            assert box.after is not None
             box.after.append(lambda: handled.append("after"))
             raise error
 

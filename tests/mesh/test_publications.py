@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import logging
 from collections.abc import Callable
+from contextlib import closing
 
 import pytest
 
@@ -167,7 +168,7 @@ def test_the_newest_frame_is_taken_and_its_publisher_knows_of_subscribers(play: 
         publisher.follow(changes.append)
         assert changes == []
         assert not publisher.watched
-        with a.frames("test/*") as watch:
+        with closing(a.frames("test/*")) as watch:
             await until(lambda: publisher.watched)
             sent = itertools.count()
 
@@ -193,7 +194,7 @@ def test_the_newest_frame_is_taken_and_its_publisher_knows_of_subscribers(play: 
                 return watch.malformed > 0
 
             await until(publish_malformed)
-        with a.frames("test/idle") as idle:
+        with closing(a.frames("test/idle")) as idle:
             assert await idle.next(0.01) is None
         await until(lambda: not publisher.watched)
         assert changes == [True, False]

@@ -127,21 +127,17 @@ def check_rc(rc: RcConfig, at: Where) -> None:
                     raise here.bad(f"is {channel}, as {channels[channel]} is", "give each its own channel")
                 channels[channel] = video
         case FramegrabberRc():
-            _check_sources(rc, at)
-
-
-def _check_sources(rc: FramegrabberRc, at: Where) -> None:
-    if rc.source is not None and rc.sources is not None:
-        raise (at / "sources").bad("stands beside source", "remove one of the two")
-    if rc.source is not None:
-        _check_source(rc.source, at / "source", A_SOURCE)
-    elif rc.sources is None:
-        raise (at / "source").bad("is missing", f"add it, as in {A_SOURCE}")
-    elif not rc.sources:
-        raise (at / "sources").bad("is empty", 'add one, as in "video/ch1" = "/dev/video0"')
-    for video, source in (rc.sources or {}).items():
-        check_rc_name(video, at / "sources" / video, "video")
-        _check_source(source, at / "sources" / video, f'"{video}" = "/dev/video0"')
+            if rc.source is not None and rc.sources is not None:
+                raise (at / "sources").bad("stands beside source", "remove one of the two")
+            if rc.source is not None:
+                _check_source(rc.source, at / "source", A_SOURCE)
+            elif rc.sources is None:
+                raise (at / "source").bad("is missing", f"add it, as in {A_SOURCE}")
+            elif not rc.sources:
+                raise (at / "sources").bad("is empty", 'add one, as in "video/ch1" = "/dev/video0"')
+            for video, source in (rc.sources or {}).items():
+                check_rc_name(video, at / "sources" / video, "video")
+                _check_source(source, at / "sources" / video, f'"{video}" = "/dev/video0"')
 
 
 def _check_source(text: str, at: Where, example: str) -> None:

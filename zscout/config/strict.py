@@ -159,23 +159,20 @@ def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msg
         raise where.bad(str(error), "mend it") from None
 
 
-def check_name(value: str, where: Where) -> str:
-    """Returns the name if it may stand in a mesh key (`[A-Za-z0-9_.-]+`, at most 64). Raises BadInput."""
+def check_name(value: str, where: Where) -> None:
+    """Refuses a name that may not stand in a mesh key (`[A-Za-z0-9_.-]+`, at most 64). Raises BadInput."""
     if not NAME.fullmatch(value):
         raise where.bad(f"{quoted(value)} is not a name", f"write {_NAME_RULE}")
-    return value
 
 
-def check_rc_name(value: str, where: Where, of: str = "") -> str:
-    """Returns the name of an RC if it is `kind/name`, both names by themselves, and of kind `of` if that is
-    given. Raises BadInput."""
+def check_rc_name(value: str, where: Where, of: str = "") -> None:
+    """Refuses what is not `kind/name`, both names by themselves, and of kind `of` if given. Raises BadInput."""
     kind, _, name = value.partition("/")
     if not (NAME.fullmatch(kind) and NAME.fullmatch(name)):
         remedy = f'write kind/name, as in "robot/scout33", each of {_NAME_RULE}'
         raise where.bad(f"{quoted(value)} is not the name of an RC", remedy)
     if of not in ("", kind):
         raise where.bad(f"{quoted(value)} is no {of}", f'name one, as in "{of}/..."')
-    return value
 
 
 def check_names(values: Iterable[str], where: Where) -> None:

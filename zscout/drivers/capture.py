@@ -29,7 +29,6 @@ log = logging.getLogger(__name__)
 
 PAUSES: Final = (0.2, 2.0)
 """Seconds between two attempts to open a source: the first, and the longest."""
-STOP_WAIT: Final = 1.0
 MAX_PIXELS: Final = 1 << 24
 """Of one picture; larger ones count as a failure of the source."""
 FILE_RATE: Final = 25.0
@@ -86,7 +85,7 @@ class Capture:
         self._thread.start()
         _LIVING.add(self)
 
-    def stop(self, wait: float = STOP_WAIT) -> None:
+    def stop(self, wait: float = 1.0) -> None:
         """Ends the reading, and waits at most `wait` seconds for it: a thread that OpenCV holds up ends by
         itself at the source's timeout."""
         self._stop.set()

@@ -12,14 +12,13 @@ from zscout.keyexpr import BadName, check_rc
 from zscout.mesh import Refused
 from zscout.types import MAX_CHANNEL, MAX_ROBOT
 
-MIN_LASTS: Final = 1 / TICKS
 MAX_LASTS: Final = 5.0
 """Seconds that the wheels may turn without another command."""
 
 RobotId: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=MAX_ROBOT)]
 VideoChannel: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=MAX_CHANNEL)]
 WheelSpeed: TypeAlias = Annotated[float, msgspec.Meta(ge=-1, le=1)]
-DriveDuration: TypeAlias = Annotated[float, msgspec.Meta(ge=MIN_LASTS, le=MAX_LASTS)]
+DriveDuration: TypeAlias = Annotated[float, msgspec.Meta(ge=1 / TICKS, le=MAX_LASTS)]
 
 
 class DeviceCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="name"):
@@ -94,8 +93,7 @@ def robot_command(do: Mapping[str, Any]) -> RobotCommand:
 def _read(do: Mapping[str, Any], kind: Any, names: tuple[str, ...]) -> Any:
     name = do.get("name")
     if name not in names:
-        what = f"this device does not know {str(name)[:64]!r}; it knows {', '.join(names)}"
-        raise Refused("unknown_command", what)
+        raise Refused("unknown_command", f"this device does not know {str(name)[:64]!r}; it knows {', '.join(names)}")
     try:
         return msgspec.convert(do, kind)
     except msgspec.ValidationError as error:

@@ -113,7 +113,6 @@ class RcDirectory:
         return self._mesh.watch(self._mesh.keys.alive_any(Role.RC), self.on_token)
 
     def on_token(self, token: Token, alive: bool) -> None:
-        """A token has come or gone."""
         if alive:
             self._tokens.setdefault(token.name, set()).add(token)
         else:

@@ -61,9 +61,6 @@ class FramegrabberDriver(Driver):
 
     Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state)."""
 
-    _rc: RcHandle
-    _publisher: FramePublisher
-
     def __init__(self, sources: Mapping[str, str], *, rate: float, quality: int) -> None:
         if not sources or not 0 < rate < math.inf or not 1 <= quality <= 100:
             raise ValueError("a framegrabber has a source, a rate above 0 and a quality of 1 to 100")
@@ -144,7 +141,6 @@ class FramegrabberDriver(Driver):
         }
 
     def _totals(self) -> Counter[str]:
-        """What all captures have counted."""
         own = {name: getattr(self._capture, name, 0) for name in ("number", "dropped", "opened", "stalls")}
         return self._before + Counter(own)
 

@@ -47,8 +47,6 @@ class VideoDriver(Driver):
 
     sharable = True
 
-    _rc: RcHandle
-
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc
 

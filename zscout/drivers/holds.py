@@ -46,12 +46,10 @@ class HoldChange:
     """Of the removed, those whose hold ended here by itself: by time, by lease, or as the device failed."""
     stayed: bool = False
     """Others hold the RC before and after."""
-    outdated: bool = False
-    """The RCM is behind: publish this RC's state, so that it sees the newer term."""
     reread: bool = False
     """Something was missed: read `rcm/state`."""
     announce: bool = False
-    """This RC holds what a snapshot does not know: publish its state."""
+    """The RCM does not know what this RC holds, or is behind its term: publish its state."""
 
     def __bool__(self) -> bool:
         return bool(self.began or self.removed)
@@ -69,8 +67,6 @@ class HoldChange:
 
 
 class HoldTable:
-    """The holds of one RC."""
-
     def __init__(self, rc: str, *, hold_lease: Ns) -> None:
         self.rc = rc
         self.hold_lease = hold_lease
@@ -134,7 +130,7 @@ class HoldTable:
     def _accept(self, update: Grants | RcmState, change: HoldChange, now: Ns) -> bool:
         """Whether this is obeyed: it is not older than what is known, and its term no absurd jump."""
         if (update.term, update.seq) < (self.term, self.seq):
-            change.outdated = update.term < self.term
+            change.announce = update.term < self.term
             return False
         if absurd(update.term, self.term):
             return False
@@ -170,7 +166,6 @@ class HoldTable:
         return min([self.last_contact + self.hold_lease, *ends])
 
     def fail(self, why: str) -> HoldChange:
-        """The device can't carry its holders any longer."""
         change = HoldChange()
         for grant in list(self.held):
             self._remove(grant, why, change, expired="failed")

@@ -160,7 +160,6 @@ class RadioDriver(Driver):
         """Hands the line what it has room for, and comes back when it has room again."""
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
         if self._down:
             return
         while self._outstanding < DEPTH:

@@ -196,6 +196,9 @@ class ResourceController:
         query.answer(self._rc_state([]))
 
     def _rc_state(self, ended: list[messages.EndedHold]) -> messages.RcState:
+        # A leader counts while it publishes: its token outlives a program that hangs. Half a hold lease is longer than
+        # a heartbeat, and leaves a successor time before holds end.
+        heard = self.mesh.now() - self.holds.last_contact < self.holds.hold_lease // 2
         return messages.RcState(
             rc=self.name,
             host=self.mesh.me.host,
@@ -207,16 +210,10 @@ class ResourceController:
             ended=ended,
             health=self.health,
             rules=self.rules,
-            leader=self._sees_leader(),
+            leader=heard and bool(self._leaders),
             capacity=self.driver.capacity(),
             figures=self.driver.figures(),
         )
-
-    def _sees_leader(self) -> bool:
-        """A leader counts while it publishes: its token outlives a program that hangs."""
-        # Half a hold lease is longer than a heartbeat, and leaves a successor time before holds end.
-        silence = self.mesh.now() - self.holds.last_contact
-        return bool(self._leaders) and silence < self.holds.hold_lease // 2
 
     def _on_proposal(self, query: IncomingQuery[messages.Proposal]) -> None:
         proposal = query.message
@@ -328,7 +325,7 @@ class ResourceController:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
             self.queue.put_change(change)
             self.queue.resume(lambda query: query.message.grant in self.holds.held)
-        if change.outdated or change.announce or change.expired_locally:
+        if change.announce or change.expired_locally:
             self.publish(change.expired_locally)
         self._missed |= change.reread
         self._set_timer()
@@ -368,7 +365,6 @@ class ResourceController:
     def _set_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
         at, now = self.holds.next_expiry(), self.mesh.now()
         if at is not None:
             delay = (at - now) / SECOND if at > now else MIN_DELAY

@@ -187,14 +187,11 @@ class RobotDriver(Driver):
         """A command for the wheels arrived: the dead man's clock begins anew, or is stopped."""
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
         self._stopped_at = None if turns else 0
         if turns:
             self._timer = self._rc.supervisor.call_later(self._dead_man, self._stop_unattended)
 
     def _stop_unattended(self) -> None:
-        """Commands ceased."""
-        self._timer = None
         if self._stopped_at is not None and self._stopped_at <= self._mesh.now():
             return
         self._counts["dead_man_stops"] += 1

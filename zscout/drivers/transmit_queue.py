@@ -217,11 +217,8 @@ class TransmitQueue:
     def send_urgent(self, robot: int, kind: type[StopPacket] | type[HaltPacket], now: Ns) -> Ns:
         """A stop or a halt, ahead of all that waits. Drive packets that wait for this robot are void, with a
         halt camera packets too. Returns in about how many ns it is through."""
-        self.replaced += self._remove(
-            lambda waiting: (
-                waiting.command.robot == robot and (kind is HaltPacket or isinstance(waiting.command, RadioDrive))
-            )
-        )
+        void = (RadioDrive,) if kind is StopPacket else (RadioDrive, RadioCamera)
+        self.replaced += self._remove(lambda one: one.command.robot == robot and isinstance(one.command, void))
         first, since = self._urgent.get(robot, (kind, now))
         self._urgent[robot] = (HaltPacket if HaltPacket in (first, kind) else StopPacket, since)
         return self._carried((list(self._urgent).index(robot) + 1) * OVERHEAD, now)

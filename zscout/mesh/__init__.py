@@ -21,7 +21,6 @@ from zscout.mesh.exchange import Refused as Refused
 from zscout.mesh.exchange import Reply as Reply
 from zscout.mesh.frames import FrameWatch as FrameWatch
 from zscout.mesh.session import Mesh as Mesh
-from zscout.mesh.supervision import StallWatch as StallWatch
 from zscout.mesh.supervision import Supervisor as Supervisor
 from zscout.mesh.supervision import clock as clock
 from zscout.mesh.zenoh_mesh import ZenohMesh as ZenohMesh

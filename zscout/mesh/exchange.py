@@ -41,18 +41,16 @@ class Reply(Generic[R]):
     problem: Problem | None = None
 
 
+@dataclass(slots=True, eq=False)
 class IncomingQuery(Generic[R]):
     """A query that arrived: answer it once, now or later. No answer at all reads as "unknown"."""
 
-    __slots__ = ("_query", "_reply_key", "arrived", "key", "message")
-
-    def __init__(self, query: TransportQuery, key: str, reply_key: str, message: R, arrived: Ns) -> None:
-        self._query: TransportQuery | None = query
-        self._reply_key = reply_key
-        self.key = key
-        self.message = message
-        self.arrived = arrived
-        """When it came out of the network, by `Mesh.now`."""
+    _query: TransportQuery | None
+    key: str
+    _reply_key: str
+    message: R
+    arrived: Ns
+    """When it came out of the network, by `Mesh.now`."""
 
     def answer(self, message: msgspec.Struct) -> None:
         query, self._query = self._query, None
@@ -88,8 +86,6 @@ class Backlog:
 
 
 class Declaration:
-    """A declaration, to be undeclared once."""
-
     def __init__(self, undeclare: Undeclare, state: Backlog | None = None) -> None:
         self._undeclare: Undeclare | None = undeclare
         self._state = state or Backlog()

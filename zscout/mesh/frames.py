@@ -12,7 +12,6 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Self
 
 from zscout import messages
 from zscout.mesh.transport import Transport, TransportPublisher
@@ -113,9 +112,3 @@ class FrameWatch:
                     await self._arrived.wait()
                 return frame
         return None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()

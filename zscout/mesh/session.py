@@ -60,9 +60,8 @@ class Inbox:
     items: deque[tuple[Backlog | None, Callable[..., None], tuple[Any, ...]]] = field(default_factory=deque)
     scheduled: bool = False
     closed: bool = False
-    draining: bool = False
-    after: list[Callable[[], None]] = field(default_factory=list)
-    """What is called once the present burst has been handled."""
+    after: list[Callable[[], None]] | None = None
+    """What is called once the present burst has been handled; None: there is none at present."""
 
     def offer(self, state: Backlog, call: Callable[..., None], *args: Any) -> bool:
         """Calls `call(*args)` in the event loop, unless too much waits there: whether it will."""
@@ -94,7 +93,7 @@ class Inbox:
         return True
 
     def drain(self) -> None:
-        self.draining = True
+        self.after = []
         try:
             for _ in range(BURST):
                 if not self.items or self.closed:
@@ -103,12 +102,11 @@ class Inbox:
                 if state is not None:
                     state.pending -= 1
                 guarded(call, *args)
-            self.draining = False
-            after, self.after = self.after, []
+            after, self.after = self.after, None
             for then in after:
                 guarded(then)
         finally:
-            self.draining = False
+            self.after = None
             # In this order: a thread that offers something now either sees that nobody is coming, or is seen.
             self.scheduled = False
             if self.items and not self.closed:
@@ -157,10 +155,10 @@ class Mesh:
 
     def after_burst(self, then: Callable[[], None]) -> None:
         """Calls `then` once all that has arrived together is handled: at once, where nothing arrives."""
-        if self._inbox.draining:
-            self._inbox.after.append(then)
-        else:
+        if self._inbox.after is None:
             then()
+        else:
+            self._inbox.after.append(then)
 
     # Queries
 

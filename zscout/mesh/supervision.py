@@ -195,7 +195,6 @@ class StallWatch:
     def stop(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
 
     def check(self) -> None:
         """Records a stall that has just ended."""

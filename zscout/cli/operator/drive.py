@@ -8,7 +8,7 @@ import os
 import struct
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -169,7 +169,7 @@ async def show_pictures(teleop: Teleop, stream: PictureRecording, console: _Cons
             await asyncio.sleep(REFRESH)
             continue
         stream.words((mesh.now() - zero) / SECOND, f"{robot.robot} is yours, seen through {robot.framegrabber}")
-        with mesh.frames(mesh.keys.frame(robot.framegrabber)) as frames:
+        with closing(mesh.frames(mesh.keys.frame(robot.framegrabber))) as frames:
             while teleop.robot is robot:
                 frame = await frames.next(REFRESH)
                 if frame is not None and frame.head.grant == held.grant:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextlib import closing
 from typing import Final
 
 from zscout import messages
@@ -234,7 +235,7 @@ class Recorder:
 
     async def _look(self, camera: str) -> None:
         """Shows a camera's pictures: the newest there is, whenever the next one is due."""
-        with self.mesh.frames(self.mesh.keys.frame(camera)) as watch:
+        with closing(self.mesh.frames(self.mesh.keys.frame(camera))) as watch:
             while True:
                 frame = await watch.next(NO_PICTURE)
                 if frame is None:
