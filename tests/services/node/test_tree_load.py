@@ -124,7 +124,7 @@ def test_a_real_tree_reports_itself_alone() -> None:
         pid = start(processes, PARENT)
         cores = Bounds(pid)
         with cores.look():
-            gauge = Gauge("anvil", load=TreeLoad(TreeMeter(pid)))
+            gauge = Gauge("anvil", load=TreeLoad(pid))
         compute(pid, 0.6)
         with cores.look():
             report = gauge.report()

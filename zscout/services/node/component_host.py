@@ -197,17 +197,15 @@ class ComponentHost:
         allowed = self._rules.kinds
         return sorted(kind for kind in kinds if allowed is None or kind in allowed)
 
-    def _find(
-        self, component: str, incarnation: int | None = None, *, old: str = "old_incarnation"
-    ) -> ComponentProcess:
+    def _find(self, name: str, incarnation: int | None = None, *, old: str = "old_incarnation") -> ComponentProcess:
         """`old` is the code where a higher incarnation was started here: the one that is meant has ended."""
-        process = self._living.get(component) or self._ended.get(component)
+        process = self._living.get(name) or self._ended.get(name)
         if process is None:
-            raise Refused("unknown_component", f"there is no component {component[:80]!r} on this host")
+            raise Refused("unknown_component", f"there is no component {name[:80]!r} on this host")
         own = process.start.incarnation
         if incarnation is not None and incarnation != own:
             code = old if incarnation < own else "unknown_component"
-            raise Refused(code, f"{component} is here as incarnation {own}, not {incarnation}")
+            raise Refused(code, f"{name} is here as incarnation {own}, not {incarnation}")
         return process
 
     def _on_over(self, process: ComponentProcess) -> None:

@@ -201,8 +201,7 @@ class Paced(Generic[T]):
 def cores(cgroup: Cgroup) -> float:
     """Cores that this process can use: the fewest of what there are, what it is bound to, and its limits."""
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    limit = cgroup.cores()
-    return float(bound) if limit is None else min(float(bound), limit)
+    return float(min(bound, cgroup.cores() or bound))
 
 
 def memory(cgroup: Cgroup) -> HostMemory:
@@ -222,12 +221,10 @@ def clock() -> tuple[float, float]:
 
 def temperature() -> float | None:
     """The hottest of the host's sensors in degrees Celsius; None where there is none."""
-    try:
+    with suppress(AttributeError, OSError, RuntimeError, ValueError):  # not every system has this function
         found = psutil.sensors_temperatures()
-    except (AttributeError, OSError, RuntimeError, ValueError):  # not every system has this function
-        return None
-    current = [one.current for group in found.values() for one in group if one.current]
-    return max(current, default=None)
+        return max((one.current for group in found.values() for one in group if one.current), default=None)
+    return None
 
 
 def speed(tries: int = TRIES) -> float:

@@ -77,7 +77,8 @@ class LoadReporter:
         loop = asyncio.get_running_loop()
         due = loop.time() + PERIOD
         # In a thread: it reads files, of which a sensor's may take its time.
-        gauge = await asyncio.to_thread(self._gauge)
+        load = await asyncio.to_thread(TreeLoad) if self._tree else None
+        gauge = await asyncio.to_thread(Gauge, self.mesh.me.host, self._labels, self._running, load=load)
         failed = False
         while True:
             await asyncio.sleep(due - loop.time())
@@ -94,16 +95,12 @@ class LoadReporter:
                 self._publisher.put(report)
                 self._pause = RESTARTS[0]
 
-    def _gauge(self) -> Gauge:
-        load = TreeLoad(TreeMeter()) if self._tree else None
-        return Gauge(self.mesh.me.host, self._labels, self._running, load=load)
-
 
 class TreeLoad:
-    """The load of one process tree, as if there were no other programs."""
+    """The load of the process `root` (this one, if not given) and its descendants, as if there were no others."""
 
-    def __init__(self, meter: TreeMeter) -> None:
-        self._meter = meter
+    def __init__(self, root: int | None = None) -> None:
+        self._meter = TreeMeter(root)
         self._averages = 0.0, 0.0, 0.0
         self._uses = host_figures.Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
 
