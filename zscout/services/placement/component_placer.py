@@ -135,9 +135,8 @@ class ComponentPlacer:
                     self._wake_at(at)
                 case _:
                     self._supervisor.spawn(self._command(effect))
-        cordoned = self._core.cordoned
-        if changed or self._cordoned != cordoned:
-            self._publish(changed, cordoned)
+        if changed or self._cordoned != self._core.cordoned:
+            self._publish(changed)
         return refusals
 
     async def _command(self, command: events.HostCommand) -> bool:
@@ -161,13 +160,13 @@ class ComponentPlacer:
         else:
             self._feed()
 
-    def _publish(self, changed: dict[str, Placement | None], cordoned: frozenset[HostName]) -> None:
-        self._cordoned = cordoned
+    def _publish(self, changed: dict[str, Placement | None]) -> None:
+        self._cordoned = self._core.cordoned
         statuses = [status for status in changed.values() if status is not None]
         forgotten = [name for name, status in changed.items() if status is None]
         for first in range(0, max(1, len(statuses)), PUBLISH_AT_ONCE):
             some = statuses[first : first + PUBLISH_AT_ONCE]
-            self._publisher.put(Placements(self.term, some, sorted(cordoned), forgotten))
+            self._publisher.put(Placements(self.term, some, sorted(self._cordoned), forgotten))
             forgotten = []
         for status in statuses:
             log.info("%s", describe(status))

@@ -17,7 +17,7 @@ from zscout.mesh.supervision import Supervisor
 from zscout.placement.events import PlacementRefused, PlacerEvent
 from zscout.placement.placer import Placer
 from zscout.placement.state import OVER
-from zscout.types import Term
+from zscout.types import HostName, Term
 
 MAX_WAIT: Final = 60.0
 MAX_WAITING: Final = 1_000
@@ -30,10 +30,10 @@ SETTLED: Final = OVER | {"running", "waiting"}
 
 @dataclass(slots=True)
 class _Waiting:
-    """An operation that has not come to its end; `before` is the status when it was requested."""
+    """An operation that has not come to its end; `host` is where its component was when it was requested."""
 
     operation: messages.PlacementOperation
-    before: messages.Placement | None
+    host: HostName | None
     timer: TimerHandle
 
 
@@ -82,7 +82,7 @@ class PlacerRequestHandler:
         if isinstance(operation, messages.PlacementOperation):
             before = self._placer.components.get(operation.component)
             timer = self._supervisor.call_later(min(operation.wait, MAX_WAIT), self._timed_out, query)
-            self._waiting[query] = _Waiting(operation, before, timer)
+            self._waiting[query] = _Waiting(operation, before.host if before is not None else None, timer)
         if refusals := self._feed(event):
             self._pop(query)
             query.refuse(Refused(refusals[0].code, refusals[0].message).problem)
@@ -102,7 +102,7 @@ class PlacerRequestHandler:
             self._pop(query)
             if status is None:
                 query.refuse(Refused("unknown_component", "nothing is known of it").problem)
-            elif isinstance(operation, messages.MigrateComponent) and _stayed(waiting.before, status, operation):
+            elif isinstance(operation, messages.MigrateComponent) and waiting.host == status.host != operation.to:
                 reason = status.reason or f"it goes on on {status.host}"
                 query.refuse(Refused("move_failed", reason).problem)
             else:
@@ -125,10 +125,6 @@ class PlacerRequestHandler:
         if waiting is not None:
             waiting.timer.cancel()
         return waiting
-
-
-def _stayed(before: messages.Placement | None, now: messages.Placement, move: messages.MigrateComponent) -> bool:
-    return before is not None and now.host == before.host and now.host != move.to
 
 
 def _event_of(operation: messages.PlacementOperation | messages.DrainHost | messages.UncordonHost) -> PlacerEvent:
