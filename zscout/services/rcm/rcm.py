@@ -101,7 +101,8 @@ class Rcm:
         """Begins to lead. Everything that is declared here is declared by the leader only."""
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
         joined = self.membership.join(recovered.rcs)
-        for request in recovered.requests:
+        requests = [*(hold.request for hold in recovered.holds), *(one.request for one in recovered.waiting)]
+        for request in requests:
             self.registry.enter(request.arc, request.name)
             self.membership.expect(request.client)
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))

@@ -7,7 +7,7 @@ does not ask for any more is not carried on: it gave it up while nobody led."""
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from decimal import Decimal
 from operator import attrgetter
@@ -28,11 +28,6 @@ class RecoveredState:
     rcs: dict[str, RcState] = field(default_factory=dict)
     holds: list[RecoveredHold] = field(default_factory=list)
     waiting: list[Requested] = field(default_factory=list)
-
-    @property
-    def requests(self) -> Iterator[ArcRequest]:
-        yield from (held.request for held in self.holds)
-        yield from (one.request for one in self.waiting)
 
 
 def recover(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:

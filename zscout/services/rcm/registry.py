@@ -52,7 +52,6 @@ def request_id(arc: ArcId) -> str:
 
 
 def client_id(arc: ArcId) -> ClientId:
-    """The client whose request it is."""
     return arc.rpartition("/")[0]
 
 
@@ -94,7 +93,6 @@ class RequestRegistry:
         return self._names.get(arc) or request_id(arc)
 
     def ended(self, arc: ArcId) -> bool:
-        """Whether `arc` ended lately."""
         return arc in self._ended
 
     # Notices

@@ -116,8 +116,7 @@ class RequestHandler:
             self._check_room(str(sender))
             request = admit(ask, sender, arc, self.core, self.limits)
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-            needs = ", ".join(sorted(ask.needs))
-            self._registry.record(arc, f"asked for {needs} at priority {ask.priority}")
+            self._registry.record(arc, f"asked for {', '.join(sorted(ask.needs))} at priority {ask.priority}")
             since = None if ask.place is None else self.mesh.now() - round(ask.waited * SECOND)
             self._gather(query, arc, Requested(request, ask.place, since))
 
