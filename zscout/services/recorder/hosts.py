@@ -99,8 +99,7 @@ class HostTracker:
         entities = clean_path("load", host), clean_path("cpu", host)
         known = self._hosts.get(host)
         if known is None:
-            others = "hosts: the load of the others is not drawn"
-            if not self._drawing.room(at, self._hosts, MAX_HOSTS, others):
+            if not self._drawing.room(at, self._hosts, MAX_HOSTS, "hosts: the load of the others is not drawn"):
                 return
             for entity in entities:
                 self._drawing.curve(entity, host, LINES[len(self._hosts) % len(LINES)], 2.0)

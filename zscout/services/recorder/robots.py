@@ -142,8 +142,7 @@ class RobotTracker:
         self._limiter = RateLimiter()
         self._reports: dict[BehaviorKey, BehaviorSaid] = {}
         """What each behavior does, the one that reported longest ago first."""
-        others = "behaviors: the others have no lane"
-        self._behaviors = Lanes(drawing, "behavior", MAX_LANES, others, depth=MAX_DEPTH)
+        self._behaviors = Lanes(drawing, "behavior", MAX_LANES, "behaviors: the others have no lane", depth=MAX_DEPTH)
         self._cameras: dict[str, _Camera] = {}
         self._health: dict[str, _Health] = {}
         self._figures: dict[tuple[str, str], tuple[float, float]] = {}
