@@ -67,14 +67,8 @@ class Where(NamedTuple):
     @property
     def key(self) -> str:
         """The path in TOML syntax: `arc[0].needs."robot/scout33".command_rate`."""
-        text = ""
-        for part in self.path:
-            if isinstance(part, int):
-                text += f"[{part}]"
-            else:
-                bare = part if _BARE_KEY.fullmatch(part) else quoted(part)
-                text += f".{bare}" if text else bare
-        return text
+        steps = (part if isinstance(part, int) or _BARE_KEY.fullmatch(part) else quoted(part) for part in self.path)
+        return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in steps).removeprefix(".")
 
     def bad(self, what: str, remedy: str) -> BadInput:
         """The error to raise about this place."""

@@ -207,8 +207,6 @@ class FramegrabberDriver(Driver):
         if self._holder is None and not self._publisher.watched and not self._lost:
             self._let_go()
 
-    # Watching over the source
-
     async def _watch_over(self) -> None:
         """Reports the RC lost, and back, by the pictures that come."""
         seen, last = (self._capture, 0), seconds()

@@ -339,8 +339,6 @@ class Mesh:
         """Keeps the latest `depth` publications on `key`, without waking the event loop, until they are taken."""
         return PolledSubscription(*self._transport.ring(key, depth), kind, depth)
 
-    # Frames
-
     def frame_publisher(self, key: str) -> FramePublisher:
         """A publisher of JPEG frames, which knows whether there are subscribers."""
         return FramePublisher(self._transport.publisher(key, None, Quality.FRAME), self._inbox.deliver)

@@ -51,9 +51,6 @@ class LoadReport(Message, frozen=True):
     components: Annotated[tuple[ComponentUse, ...], msgspec.Meta(max_length=MAX_COMPONENTS)] = ()
 
 
-# The load balancer
-
-
 class RankAsk(Message, frozen=True):
     """Which host is the best for a component of this kind? Only `hosts` where given, else all that report.
 

@@ -140,9 +140,6 @@ class Notice(_ArcParty, frozen=True):
     why: ReasonInfo | None = None
 
 
-# From the RCM to all
-
-
 class Holder(_ArcParty, frozen=True):
     """One holder of one RC, so complete that a new RCM can recover its ARC from the RCs' states alone.
 
@@ -183,9 +180,6 @@ class Grants(Message, frozen=True):
     every: Seconds
     rcs: dict[str, list[Holder]] = {}
     revoked: list[Revocation] = []
-
-
-# The state of the RCM
 
 
 class StateAsk(Message, frozen=True):
@@ -253,9 +247,6 @@ class RcmState(Message, frozen=True):
     rcs: list[RcView] = []
     story: list[StoryLine] = []
     more: int = 0
-
-
-# Clients
 
 
 class OpenRequest(_Wanted, frozen=True):
