@@ -137,20 +137,14 @@ async def supervised(name: str) -> AsyncIterator[Supervisor]:
     """A supervisor for the body of an `async with`, closed at its end: when something that it runs fails, the
     body is cancelled, and that error raised."""
     body = asyncio.current_task()
-    failures: list[Exception] = []
-
-    def fail(error: Exception) -> None:
-        failures.append(error)
-        if body is not None:
-            body.cancel()
-
-    supervisor = Supervisor(name, fail)
+    assert body is not None  # noqa: S101 - nothing but a task runs here
+    supervisor = Supervisor(name, lambda _error: body.cancel())
     try:
         yield supervisor
     except asyncio.CancelledError:
         # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
-        if failures and body is not None and body.uncancel() == 0:
-            raise failures[0] from None
+        if supervisor.error is not None and body.uncancel() == 0:
+            raise supervisor.error from None
         raise
     finally:
         await supervisor.close()
