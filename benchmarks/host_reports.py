@@ -17,7 +17,8 @@ from benchmarks.child import ready
 from benchmarks.loop import run
 from zscout.config.fleet import load_fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
-from zscout.mesh import Publisher, ZenohMesh
+from zscout.mesh import ZenohMesh
+from zscout.mesh.exchange import Publisher
 from zscout.messages import ComponentUse, LoadReport
 
 SESSIONS = 4

@@ -12,7 +12,7 @@ import zenoh
 
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.mesh import zenoh_config
+from zscout.mesh.zenoh_mesh import zenoh_config
 
 LIMITS = "[limits]\nmax_needs = 8\nmax_queued = 20\nmax_requests_per_client = 5\n"
 HIGH = 10**15

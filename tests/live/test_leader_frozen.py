@@ -17,7 +17,8 @@ from tests.live.lab import Lab, LeaderWatch
 from tests.live.test_leader_killed import APART, RUNNING, WAITING, grant_of
 from zscout.behaviors.client.client import CommandRefused
 from zscout.keyexpr import Role, Sender
-from zscout.mesh import clock, zenoh_config
+from zscout.mesh import clock
+from zscout.mesh.zenoh_mesh import zenoh_config
 from zscout.messages import Ask, Grants, Notice, RcState, Revocation, encode
 from zscout.types import SECOND, Grant, Term
 

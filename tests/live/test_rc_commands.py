@@ -17,7 +17,8 @@ from tests.live.lab import Lab
 from zscout.behaviors.client.arc import Revoked, hold
 from zscout.behaviors.client.client import Client
 from zscout.drivers.resource_controller import COMMAND_QUEUE, MAX_TTL
-from zscout.mesh import clock, zenoh_config
+from zscout.mesh import clock
+from zscout.mesh.zenoh_mesh import zenoh_config
 from zscout.messages import Done, EndedHold, Problem, RcState, decode
 from zscout.types import SECOND, Grant
 

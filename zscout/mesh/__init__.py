@@ -16,7 +16,6 @@ os.environ.setdefault(
 from zscout.mesh.exchange import Declaration as Declaration
 from zscout.mesh.exchange import IncomingQuery as IncomingQuery
 from zscout.mesh.exchange import MeshError as MeshError
-from zscout.mesh.exchange import Publisher as Publisher
 from zscout.mesh.exchange import Refused as Refused
 from zscout.mesh.exchange import Reply as Reply
 from zscout.mesh.frames import FrameWatch as FrameWatch
@@ -24,4 +23,3 @@ from zscout.mesh.session import Mesh as Mesh
 from zscout.mesh.supervision import Supervisor as Supervisor
 from zscout.mesh.supervision import clock as clock
 from zscout.mesh.zenoh_mesh import ZenohMesh as ZenohMesh
-from zscout.mesh.zenoh_mesh import zenoh_config as zenoh_config
