@@ -142,7 +142,10 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
 
     asyncio.run(story())
     path = the_file(tmp_path / "runs")
-    assert lane(path, "/rc/robot/a") == [[""], ["survey"], ["operator" + MARK], ["survey"], [""]]
+    robot = lane(path, "/rc/robot/a")
+    # Between two holders it may be free for a moment: votes of the radio may be asked again.
+    assert [held for (held,) in robot if held] == ["survey", "operator" + MARK, "survey"]
+    assert robot[0] == robot[-1] == [""]
     assert [held for held, _ in groupby(lane(path, "/rc/robot/b"))][:4] == [[""], ["survey"], ["later"], [""]]
     radio = lane(path, "/rc/radio/a")
     assert ["survey", "listen"] in radio
