@@ -104,6 +104,14 @@ class FleetView:
             return False
         return host.load is None or self.mesh.now() - host.reported > STALE
 
+    async def quiet(self) -> None:
+        """Returns when no host has come into sight for a while: links are made one after another."""
+        deadline = self.mesh.now() + round(FIND_LOADS * SECOND)
+        known = -1
+        while known < len(self.hosts) and self.mesh.now() < deadline:
+            known = len(self.hosts)
+            await common.until(lambda: len(self.hosts) > known, self.changed, QUIET)  # noqa: B023 - awaited
+
     async def settled(self, *, loads: bool = True) -> RcmState:
         """The RCM's state, once its RCs are seen, and the hosts with their `loads`. Raises NobodyThere."""
         await common.see_rcm(self.client)
@@ -131,13 +139,9 @@ class FleetView:
 
 
 async def see_hosts(client: Client) -> None:
-    """Returns when no host has come into sight for a while: links are made one after another."""
-    deadline = client.mesh.now() + round(FIND_LOADS * SECOND)
-    known = -1
+    """Waits until all hosts have been seen, whatever they show."""
     with FleetView(client) as seen:
-        while known < len(seen.hosts) and client.mesh.now() < deadline:
-            known = len(seen.hosts)
-            await common.until(lambda: len(seen.hosts) > known, seen.changed, QUIET)  # noqa: B023 - awaited
+        await seen.quiet()
 
 
 class Devices:

@@ -29,6 +29,7 @@ async def keys(as_json: bool) -> None:
     async with common.connected("keys", need_rcm=False) as client:
         sharable: set[str] | None = None
         with FleetView(client) as fleet_view:
+            await fleet_view.quiet()
             try:
                 state = await fleet_view.settled(loads=False)
                 sharable = {view.rc for view in state.rcs if view.sharable}
