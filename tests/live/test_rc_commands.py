@@ -77,6 +77,7 @@ def test_every_refusal(tmp_path: Path) -> None:
                 assert await answer(client.command("robot/warm", warming, ECHO)) == "warming"
 
                 await client.end(arc)
+                await lab.held_by(client, "robot/bench")
                 assert await answer(echo(grant)) == "ended"
                 await until(lambda: bench.calls == ["begin one", "safe"])
                 _, brief = await running(client, "brief", "robot/bench", min_runtime=0.2)
@@ -201,6 +202,7 @@ def test_one_of_two_holders_ends_and_the_device_serves_the_other(tmp_path: Path)
                 assert await answer(client.command("radio/bench", first, ECHO)) == "done"
                 assert await answer(client.command("radio/bench", second, ECHO)) == "done"
                 await client.end(arc)
+                await lab.held_by(client, "radio/bench", "first")
                 assert await answer(client.command("radio/bench", second, ECHO)) == "ended"
                 assert await answer(client.command("radio/bench", first, ECHO)) == "done"
                 assert bench.calls == ["begin first", "begin second"]
