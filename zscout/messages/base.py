@@ -17,9 +17,9 @@ import msgspec
 from zscout.types import NO_TERM, SECOND, Ns, Params, Term
 
 MAX_PAYLOAD = 65_536
-"""Bytes of one message that is not a state answer."""
+"""Bytes of one query."""
 MAX_STATE = 16_000_000
-"""Bytes of one answer about a whole fleet."""
+"""Bytes of one answer or publication, which may be about a whole fleet."""
 MAX_NEEDS = 64
 MAX_PARAMS = 16
 MAX_COUNTER = 10**12

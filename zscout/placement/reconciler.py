@@ -1,5 +1,5 @@
-"""Which incarnation of a component counts, by tokens, hosts' lists, and what the placer of the term before
-published. Of two that live the higher one counts; the lower is stopped.
+"""Which incarnation of a component counts, by tokens, hosts' lists, and what the placer of the term before published;
+and what follows when a host comes or dies. Of two that live the higher one counts; the lower is stopped.
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def conflict_groups(
 ) -> list[ConflictGroup]:
     """The groups in which there is a choice, best-ranked first; none if more than `limit` ARCs could start.
 
-    One newcomer is no choice where nobody has to end for it, or those have to whose exclusive RCs it needs:
+    There is no choice in a group of one ARC, or where one ARC is queued and none of the group needs a sharable RC:
     `priority` starts it, as any strategy would."""
     return [
         ConflictGroup(state, members, reserved)
@@ -171,9 +171,9 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
 
 
 def _level_key(arc: Arc, first: set[ArcId], now: Ns) -> tuple[int, int]:
-    """What sorts ARCs into levels, the best smallest: first their priority. A protected hold counts for more,
-    as only those from its protection upwards may end it. Where some are to go `first`, they go before their
-    equals, but not before running ones: equals are not preempted."""
+    """Sorts ARCs into levels, the best smallest, by priority. A protected hold counts at least as the highest priority
+    that may not end it. Among equals, those to go `first` and holds within their minimum runtime come before the
+    rest."""
     if (below := arc.protected_below(now)) is not None:
         return min(-arc.priority, 1 - below), 0
     later = arc.past_min_runtime(now) if arc.hold is not None else arc.id not in first

@@ -96,8 +96,8 @@ class AdmissionCheck:
         return union(arc.mask for arc in (self.arc, *self.exclusive_victims.values(), *self._preemptible_sharers()))
 
     def obstacle(self, off_limits: int) -> Inadmissible | None:
-        """What keeps the ARC out whatever becomes of what is `off_limits`, with an RC that does so by itself:
-        of several, one that will do so for long, so that the ARC is not checked in vain."""
+        """An RC that keeps the ARC out by itself, whatever becomes of the RCs `off_limits`; None if there is none. Of
+        several that are held, one that is likely to stay held for long: that saves checks."""
         for rc in self.arc.rcs:
             if not rc.present:
                 absent = [rc.name for rc in self.arc.rcs if not rc.present]
@@ -425,8 +425,8 @@ class Pass:
             heapq.heappush(self._heap, following)
 
     def _needs_check(self, rc: Rc, arc: Arc) -> bool:
-        """False ends it: `rc`, exclusive and not off limits, has a holder again that is preempted for nobody from
-        `arc` downwards."""
+        """False ends the walk along the watchers of `rc`: it is held again, nobody from `arc` downwards may preempt its
+        holder, and MAX_REPORTED of them have been told."""
         if rc.sharable or rc.bit & self.off_limits or not rc.non_preemptible_holders(arc, self.state.now):
             return True
         if not self._reports_left[rc.bit]:

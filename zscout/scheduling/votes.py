@@ -46,8 +46,7 @@ class RcVotes:
         self._accepted_with: dict[ArcId, dict[HolderSet, None]] = {}
         """The accepted sets that each ARC is in."""
         self._vetoed_at: dict[ArcId, dict[HolderSet, None]] = {}
-        """Each vetoed set once, under whichever of its ARCs had fewest: a veto is looked for among those of
-        the set in question, and most vetoes name a holder that is in many others."""
+        """Each vetoed set once, under the one of its ARCs that had the fewest entries: short lists are searched."""
 
     def known(self, holders: HolderSet) -> Answer | None:
         if holders in self.accepted:

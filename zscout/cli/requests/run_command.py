@@ -1,7 +1,8 @@
 """A command that runs under a grant: in a process group of its own, ended as a whole.
 
-At a terminal it has the foreground, so that Ctrl-C and job control are its own; it can't be suspended with
-Ctrl-Z, as what it holds would stand idle. In a pipeline it gets the terminal when it asks for it.
+At a terminal it has the foreground, so that Ctrl-C and job control are its own (else Ctrl-C reaches `cli/common.run`,
+which cancels the request); it can't be suspended with Ctrl-Z, as what it holds would stand idle. In a pipeline it gets
+the terminal when it asks for it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""What every candidate keeps of the placer's publications, so that it can go on when it leads: what runs, the nodes
-list; what ran on a host that died together with the leader, nobody else would know."""
+"""Each candidate's copy of what the placer publishes, for the time when it leads. Nodes list what runs; only this copy
+knows what ran on a host that died together with the leader."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ SETTLE = SECOND // 2
 TURN = SECOND // 4
 """The head start of each better-ranked candidate."""
 RETRY = SECOND // 10
-"""From one attempt that failed to the next: well within a turn, or else the next in rank tries at that moment
-when the RCs saw the old leader's end a little later than this candidate."""
+"""From one attempt that failed to the next. Well below TURN: where RCs see the old leader's end a little late, the next
+in rank would else try at the same moment."""
 
 
 class Election:

@@ -5,7 +5,7 @@
     effects,  which go
     out       as a publication, notices, answers and proposals, in this order.
 
-Nothing is decided here.
+Nothing is decided here. Queries for the state (`zscout status`, `why`) are answered here as well.
 """
 
 from __future__ import annotations
@@ -171,7 +171,8 @@ class Rcm:
             log.info("%s", line)
 
     def _set_wake(self, at: Ns | None) -> None:
-        """A timer that goes off too early is left alone: most ends are put off before they come."""
+        """Sets when the core is woken. A timer that is set for earlier stays, and is set anew when it goes off: most
+        ends are put off before they come."""
         self._wake_at = at
         if at is None or (self._wake is not None and self._armed <= at):
             return

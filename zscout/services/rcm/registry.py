@@ -140,8 +140,8 @@ class RequestRegistry:
         )
 
     def report(self, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]) -> None:
-        """Publishes what follows from an instant's effects. For the `answered` ARCs a grant, and for
-        the `given_up` ones the end of a hold, is the answer to an operation, and no notice."""
+        """Publishes the notices of an instant's effects, but where the answer to an operation says the same: the grant
+        of an `answered` ARC, the end of the hold of a `given_up` one."""
         for effect in effects:
             match effect:
                 case Granted(arc=arc, rcs=rcs):

@@ -93,7 +93,7 @@ class Drawing:
             self.warn(at, f"timeline: {text}")
 
     def room(self, at: float, known: Sized, limit: int, others: str) -> bool:
-        """Whether there may be one more; if not, that is noted: more than so many of what, and what of the others."""
+        """Whether `known` may have one more; if not, it is noted that there are "more than `limit` `others`"."""
         if len(known) < limit:
             return True
         self.note(at, f"more than {limit} {others}")
@@ -127,7 +127,7 @@ class _Lane:
 
 
 class Lanes:
-    """The lanes in one folder, at most `limit`; `others` says of what, and what of the others.
+    """The lanes in one folder, at most `limit`; `others` ends the note that there are more.
 
     `colours`: distinct texts of one lane that keep their colour; past it, the one longest unused loses it.
     `depth`: parts of a name, with `/` between, that have parts of the entity of their own."""
