@@ -15,7 +15,7 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.drivers.robot import RobotDriver
 from zscout.keyexpr import Sender
 from zscout.mesh import Mesh, ZenohMesh
-from zscout.mesh.supervision import StallWatch
+from zscout.mesh.supervision import StallWatch, clock
 from zscout.messages import Command, Done
 from zscout.types import SECOND, Grant
 
@@ -45,7 +45,7 @@ class Post:
         self.lab = lab
         self.meshes: dict[str, Mesh] = {}
         self.rcs: list[ResourceController] = []
-        self.stall = StallWatch()
+        self.stall = StallWatch(clock.now)
 
     async def mesh(self, host: str, client: str = "node") -> Mesh:
         name = f"{host}/{client}"

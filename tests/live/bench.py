@@ -14,7 +14,7 @@ from zscout.drivers.driver import Driver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.mesh import ZenohMesh
-from zscout.mesh.supervision import StallWatch
+from zscout.mesh.supervision import StallWatch, clock
 from zscout.messages import Done, Holder
 from zscout.types import SECOND, Grant
 
@@ -66,7 +66,7 @@ class Stand:
 
     async def __aenter__(self) -> Stand:
         fleet = self.lab.fleet
-        self.stall = StallWatch().start()
+        self.stall = StallWatch(clock.now).start()
         self.mesh = await ZenohMesh.open(fleet.name, Sender("bench", "node"), fleet.mesh)
         return self
 

@@ -22,7 +22,7 @@ from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.mesh import ZenohMesh
-from zscout.mesh.supervision import StallWatch
+from zscout.mesh.supervision import StallWatch, clock
 from zscout.messages import (
     ComponentList,
     ComponentSpec,
@@ -152,7 +152,7 @@ class WitnessRc:
 
     async def __aenter__(self) -> Self:
         fleet = self.lab.fleet
-        self._stall = StallWatch().start()
+        self._stall = StallWatch(clock.now).start()
         self._mesh = await ZenohMesh.open(fleet.name, Sender("devices", "node"), fleet.mesh)
         self._rc = ResourceController(
             self._mesh, self.name, self.witness, hold_lease=fleet.timing.hold_lease / SECOND, stall=self._stall

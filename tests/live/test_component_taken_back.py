@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from tests.behaviors.components.kit import ComponentLab, Hosts, counts, counts_on
+from tests.hang import HANG
 from zscout.behaviors.client.client import Client
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
@@ -46,7 +47,14 @@ class Target:
     async def there(cls, fleet: Fleet, incarnation: int, *, component: bool = True) -> Target:
         node = await Client.connect("node", fleet=fleet, host="b")
         client = await Client.connect(f"c.{incarnation}", fleet=fleet, host="b") if component else None
-        return cls(node, client, incarnation)
+        target, source = cls(node, client, incarnation), ("a", "c.1")
+        clients = node.mesh.keys.alive_any(Role.CLIENT)
+        linked = asyncio.Event()
+        watch = node.mesh.watch(clients, lambda one, _: linked.set() if (one.host, one.name) == source else None)
+        async with asyncio.timeout(HANG):  # it has a link to what is to move
+            await linked.wait()
+        watch.close()
+        return target
 
     def _asked(self, request: IncomingQuery[ComponentOperation]) -> None:
         match request.message:

@@ -111,13 +111,17 @@ class PlainProcess:
         self.process.stdin.write(json.dumps({"do": do, **details}).encode() + b"\n")
         await self.process.stdin.drain()
 
-    async def told_of(self, what: str, **like: Any) -> dict[str, Any]:
-        """Waits for the next event `what` whose fields are as given; events before it are passed over."""
+    async def told_of(self, what: str, *, since: int | None = None, **like: Any) -> dict[str, Any]:
+        """The next event `what` whose fields are as given, or one `since` so many were told; others are passed over."""
+        event: dict[str, Any]
+        for event in self.told[len(self.told) if since is None else since :]:
+            if event["what"] == what and like.items() <= event.items():
+                return event
         assert self.process.stdout is not None
         try:
             async with asyncio.timeout(HANG):
                 while line := await self.process.stdout.readline():
-                    event: dict[str, Any] = json.loads(line)
+                    event = json.loads(line)
                     self.told.append(event)
                     if event["what"] == what and like.items() <= event.items():
                         return event
@@ -201,9 +205,10 @@ def test_a_client_written_from_the_document_lives_a_whole_life(tmp_path: Path) -
         assert await plain.command("q1", "robot/r", {"name": "echo", "value": 1}) == {"result": 1}
 
         # It gives back, which gives the second its turn, and cancels that. Ending twice is no error.
+        told = len(plain.told)
         await plain.order("release", id="q1")
         assert (await plain.told_of("given_up"))["answer"]["outcome"] == "released"
-        await plain.told_of("entered", id="q2")
+        await plain.told_of("entered", since=told, id="q2")
         await plain.order("cancel", id="q2")
         assert (await plain.told_of("given_up"))["answer"]["outcome"] == "cancelled"
         await plain.order("release", id="q2")

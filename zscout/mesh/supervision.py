@@ -174,7 +174,7 @@ class StallWatch:
     """The last stall of this process, stopped, suspended or starved, on the clock `now`: how long it was, and
     when it ended. One watch per process."""
 
-    def __init__(self, now: Callable[[], Ns] = clock.now) -> None:
+    def __init__(self, now: Callable[[], Ns]) -> None:
         self.length: Ns = 0
         self.ended: Ns = 0
         self._now = now

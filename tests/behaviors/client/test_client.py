@@ -37,10 +37,10 @@ class SmallFleet:
         self.candidates: dict[str, Candidate] = {}
         self.clients: list[Client] = []
         self.devices = self.mesh("devices", "node")
-        stall = StallWatch()
+        self.stall = StallWatch(self.devices.now).start()
         self.rcs = [
             ResourceController(
-                self.devices, name, ExclusiveDriver(), hold_lease=FLEET.timing.hold_lease / SECOND, stall=stall
+                self.devices, name, ExclusiveDriver(), hold_lease=FLEET.timing.hold_lease / SECOND, stall=self.stall
             )
             for name in (RC, OTHER)
         ]
@@ -86,6 +86,7 @@ async def small_fleet(*clients: str) -> AsyncIterator[tuple[SmallFleet, list[Cli
             await candidate.stop()
         for rc in fleet.rcs:
             await rc.stop()
+        fleet.stall.stop()
 
 
 def test_a_request_is_granted_obeyed_and_given_back() -> None:
@@ -141,16 +142,19 @@ def test_who_is_preempted_goes_on_when_it_is_granted_again() -> None:
 def test_one_entry_that_is_preempted_raises() -> None:
     async def test() -> None:
         async with small_fleet("low", "high") as (_, (low, high)):
+            entered = asyncio.Event()
 
             async def work() -> None:
                 async with hold(low, "low", {RC: {}}, min_runtime=60):
-                    taker.append(await high.request("high", {RC: {}}, priority=5, min_runtime=60))
+                    entered.set()
                     await asyncio.sleep(3600)
 
-            taker: list[OpenArc] = []
+            working = asyncio.ensure_future(work())
+            await entered.wait()
+            taker = await high.request("high", {RC: {}}, priority=5, min_runtime=60)
             with pytest.raises(Revoked) as revoked:
-                await work()
-            assert (revoked.value.outcome, revoked.value.by) == ("preempted", f"h/high/{taker[0].id}")
+                await working
+            assert (revoked.value.outcome, revoked.value.by) == ("preempted", f"h/high/{taker.id}")
 
     run(test())
 

@@ -60,7 +60,7 @@ def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
         with pytest.raises(NotMoved, match="b did not answer"):
             await moving
         assert dies
-        assert (client.mesh.now() - began) / SECOND < 1
+        assert (client.mesh.now() - began) / SECOND < 4
         token.close()
 
     run(test())

@@ -56,7 +56,7 @@ def test_without_a_terminal_it_needs_yes(fleet: CliFleet) -> None:
     assert refused.returncode == 1
     assert "add --yes" in refused.stderr
     assert survey.poll() is None
-    taken = fleet.zscout("take", "robot/a", "--yes", "--no-keep", "--min-runtime", "0.2", "--json")
+    taken = fleet.zscout("take", "robot/a", "--yes", "--no-keep", "--min-runtime", "2", "--json")
     assert taken.returncode == 0
     preview, granted, ended = events(taken.stdout)
     assert [(hold["arc"], hold["priority"]) for hold in preview["preempts"]] == [("survey", 0)]
@@ -105,7 +105,7 @@ def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
 
 def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
-    taker = fleet.start("take", "robot/b", "--no-keep", "--min-runtime", "0.1")
+    taker = fleet.start("take", "robot/b", "--name", "operator", "--", "true")
     lines = read_until(taker, "operator waits: needs robot/b (held by peer, priority 10)")
     assert any("operator waits for peer (priority 10, " in line for line in lines)
     end(peer)

@@ -52,7 +52,7 @@ def test_a_command_is_told_which_device_meets_which_pattern(fleet: CliFleet) -> 
 @pytest.mark.live
 def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFleet) -> None:
     first, second = fleet.holder("first", F1), fleet.holder("second", ANY)
-    waiting = fleet.start("request", ANY, "--name", "next", "--min-runtime", "0.3", "--json")
+    waiting = fleet.start("request", ANY, "--name", "next", "--json", "--", "true")
     (line,) = read_until(waiting, '"waits"')
     (waits,) = events(line)
     (need,) = waits["needs"]
@@ -74,7 +74,7 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     end(second)
     granted, ended = events(out_of(waiting).read())
     assert (granted["event"], granted["rcs"], granted["bound"]) == ("granted", [F2], {ANY: F2})
-    assert (ended["event"], ended["outcome"]) == ("ended", "completed")
+    assert (ended["event"], ended["outcome"]) == ("ended", "released")
     assert waiting.wait(HANG) == 0
     end(first)
     assert fleet.idle(F1, F2, ANY)
@@ -151,7 +151,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     would = fleet.zscout("request", ANY, "--priority", "5", "--dry-run")
     assert would.stdout == "request would start at once\nit would preempt low\n"
     assert fleet.zscout("take", ANY).returncode == 1
-    taken = fleet.zscout("take", ANY, "--yes", "--no-keep", "--min-runtime", "0.2", "--json")
+    taken = fleet.zscout("take", ANY, "--yes", "--no-keep", "--min-runtime", "2", "--json")
     preview, granted, _ = events(taken.stdout)
     assert (preview["preempts"], preview["waits_for"], preview["absent"]) == ([], [], [])
     assert [hold["arc"] for hold in preview["may_preempt"]] == ["low", "high"]

@@ -15,7 +15,7 @@ from zscout.behaviors.components.component import Component, SafePointGate
 from zscout.keyexpr import Role, Sender
 from zscout.mesh.supervision import done_within
 from zscout.messages import MAX_CHECKPOINT, MAX_ERROR, MAX_MOVE, ComponentView, MoveComponent, OpenRequest, Problem
-from zscout.types import SECOND
+from zscout.types import SECOND, Ns
 
 R = TypeVar("R")
 Operation = messages.RestoreComponent | messages.ActivateComponent | messages.StopComponent | messages.ListComponents
@@ -23,6 +23,8 @@ Operation = messages.RestoreComponent | messages.ActivateComponent | messages.St
 RESTORE_TIMEOUT: Final = 10.0
 ASK_TIMEOUT: Final = 2.0
 LOOK_TIMEOUT: Final = 0.5
+GONE: Final = 2 * SECOND
+"""Since the other node was last seen, until it counts as gone."""
 PAUSES: Final = (0.02, 1.0)
 """Seconds between two askings of the other node: at first, and at most."""
 
@@ -57,15 +59,15 @@ class OutgoingMove:
         """To be set when the token of the other incarnation is seen: it runs, whatever else is known."""
         self.began = False
         """Whether the component is held for it."""
-        self._was_there = False
-        """Whether the other process, or its node, was seen before the component was held."""
+        self._seen: Ns | None = None
+        """When the other process, or its node, was last seen."""
         self.called_off = ""
         """Why it must not be, as long as it is not committed."""
 
     async def carry_out(self) -> float:
         """Returns how long (s) the component did not run, once the other one does: this process is to end
         then, and to give up nothing. Raises NotMoved where it goes on here."""
-        self._was_there = await self._lives()
+        await self._lives()
         if not await self._gate.hold(self._patience):
             raise NotMoved("not_safe", f"it came to no safe point within {self._patience:g} s")
         began, self.began = self._client.mesh.now(), True
@@ -111,11 +113,13 @@ class OutgoingMove:
         pause, longest = PAUSES
         left = RESTORE_TIMEOUT
         while (reply := await self._ask(order, ComponentView, left)) is None:
-            # No answer comes at once where there is no link yet to a node that has just come; one that has gone does
-            # not come back.
-            if self._was_there and not await self._lives():
+            # No answer comes at once where there is no link yet to a node that has just come; one that has been gone
+            # for a while does not come back.
+            await self._lives()
+            now = self._client.mesh.now()
+            if self._seen is not None and now - self._seen > GONE:
                 break
-            left = (deadline - self._client.mesh.now()) / SECOND - pause
+            left = (deadline - now) / SECOND - pause
             if left <= 0:
                 break
             await asyncio.sleep(pause)
@@ -167,7 +171,9 @@ class OutgoingMove:
         looks = (mesh.living(mesh.keys.alive_any(role), timeout=LOOK_TIMEOUT) for role in (Role.NODE, Role.CLIENT))
         nodes, clients = await asyncio.gather(*looks)
         its = self.to, f"{self._name}.{self.incarnation}"
-        return any(node.host == self.to for node in nodes) or any((one.host, one.name) == its for one in clients)
+        lives = any(node.host == self.to for node in nodes) or any((one.host, one.name) == its for one in clients)
+        self._seen = mesh.now() if lives else self._seen
+        return lives
 
     async def _ask(self, operation: Operation, kind: type[R], timeout: float) -> R | Problem | None:
         mesh = self._client.mesh
