@@ -185,7 +185,8 @@ class Stepper(Component):
                 async for attempt in holds(context.client, context.component, {self.rc: {}}, min_runtime=3600):
                     async with attempt as held:
                         while True:
-                            await held.command(self.rc, {"name": "echo", "value": self.count + 1})
+                            count = {"name": "echo", "value": self.count + 1}
+                            await context.client.command(self.rc, held.grant, count, ttl=60, timeout=60)
                             self.count += 1
                             await context.safe_point()
                             await asyncio.sleep(0.005)

@@ -85,7 +85,7 @@ def test_robots_hide_on_a_live_mesh_and_nothing_is_left(tmp_path: Path) -> None:
     shown = lanes(recording, "/rc/**")
     assert set(ROBOTS) <= {name.removeprefix("/rc/") for name in shown}
 
-    if not ended:
+    if not (ended or out):
         assert (demo.returncode, out) == (128 + signal.SIGINT, "")
         assert error == "the recording until then: mine/demo.rrd\n"
         return
@@ -93,7 +93,8 @@ def test_robots_hide_on_a_live_mesh_and_nothing_is_left(tmp_path: Path) -> None:
     assert told["recording"] == "mine/demo.rrd"
     assert told["robots"] == len(ROBOTS)
     assert set(told["hidden"]) | set(told["truly_dark"]) <= set(ROBOTS)
-    assert (demo.returncode, error) == (0 if told["placed_after"] is not None else 1, "")
+    if ended:  # else it had told all when the signal came
+        assert (demo.returncode, error) == (0 if told["placed_after"] is not None else 1, "")
     assert told["grants"] >= 2
     assert told["waits"] >= 1, "whose robot is taken over waits"
     assert 0 < told["median_wait"] <= told["longest_wait"] < told["seconds"]

@@ -188,6 +188,7 @@ def test_back_and_forth_without_end(tmp_path: Path) -> None:
             assert None not in seen
             assert seen == sorted(set(seen), key=seen.index)
             assert len(set(seen)) == ROUNDS + 1
+            await until(lambda: len(record.said) >= ROUNDS)
             assert len(record.said) == ROUNDS
             assert {tuple(one.arc for one in said.rcs["robot/x"]) for said in record.said} == {("drive",)}
             assert "safe" not in robot.calls
