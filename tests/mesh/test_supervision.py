@@ -12,10 +12,11 @@ import pytest
 import uvloop
 
 from tests.hang import HANG
+from tests.mesh.kit import run
 from zscout.keyexpr import BadName
 from zscout.mesh import supervision
 from zscout.mesh.exchange import Refused
-from zscout.mesh.supervision import Supervisor
+from zscout.mesh.supervision import Supervisor, done_within
 
 
 class Owner:
@@ -305,3 +306,16 @@ def test_an_owner_that_is_cancelled_while_it_closes_has_cancelled_its_tasks() ->
             assert task.cancelled()
 
     asyncio.run(story())
+
+
+def test_done_within_tells_its_own_timeout_from_the_work_s() -> None:
+    async def work() -> None:
+        raise TimeoutError("of the work")
+
+    async def story() -> None:
+        assert not await done_within(1, asyncio.sleep(2))
+        assert await done_within(1, asyncio.sleep(0.5))
+        with pytest.raises(TimeoutError, match="of the work"):
+            await done_within(1, work())
+
+    run(story())

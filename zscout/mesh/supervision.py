@@ -8,7 +8,7 @@ import functools
 import logging
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from typing import Any, Final, ParamSpec, Self, TypeVar
 from weakref import WeakSet
 
@@ -152,11 +152,14 @@ async def supervised(name: str) -> AsyncIterator[Supervisor]:
 
 async def done_within(seconds: float | None, work: Awaitable[object]) -> bool:
     """Waits for `work`, at most so long, and cancels it then; whether it was done."""
-    with suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
+    try:
+        async with asyncio.timeout(seconds) as limit:
             await work
-            return True
-    return False
+    except TimeoutError:
+        if not limit.expired():  # the work's own
+            raise
+        return False
+    return True
 
 
 class HostClock:
