@@ -121,6 +121,14 @@ def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
     os.close(theirs)
 
 
+@pytest.mark.parametrize(("command", "code"), [("--help", 0), ("replay nowhere.toml", 2)])
+@pytest.mark.parametrize("closed", [">&-", "2>&-"])
+def test_a_closed_stream_is_no_error(command: str, code: int, closed: str) -> None:
+    script = f"exec {shlex.join(tools.COMMAND)} {command} {closed}"
+    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, timeout=HANG)
+    assert (done.returncode, "Traceback" in done.stdout + done.stderr) == (code, False), done.stderr
+
+
 def test_completion_knows_the_commands_without_loading_them() -> None:
     script = zscout("completion", "bash")
     assert script.returncode == 0

@@ -92,6 +92,9 @@ class LazyGroup(click.Group):
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
+        for name in ("stdout", "stderr"):
+            if getattr(sys, name) is None:  # closed by whoever started it (`>&-`)
+                setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115 - open to the end
         try:
             code = super().main(args, "zscout", complete_var, standalone_mode=False, **extra)
             sys.stdout.flush()
