@@ -76,13 +76,14 @@ class World:
 
 class Zenoh(World):
     _ports: list[int]
+    lease = MeshConfig().lease
 
     async def _open(self, me: Sender) -> Mesh:
         self._ports = getattr(self, "_ports", [])
         endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in self._ports)
         while True:
             port = random.randint(20_000, 60_000)  # noqa: S311
-            config = MeshConfig(listen=(f"tcp/127.0.0.1:{port}",), connect=endpoints, multicast=False)
+            config = MeshConfig(listen=(f"tcp/127.0.0.1:{port}",), connect=endpoints, multicast=False, lease=self.lease)
             try:
                 mesh = await ZenohMesh.open("test", me, config)
             except MeshError:  # somebody else's port

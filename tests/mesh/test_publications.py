@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import threading
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import AsyncExitStack, closing
 
 import pytest
 
-from tests.mesh.both_meshes import FRAMES, LONG, NEWS, Ping, Play, Pong, World
+from tests.hang import HANG
+from tests.mesh.both_meshes import FRAMES, LONG, NEWS, Ping, Play, Pong, World, Zenoh
 from tests.mesh.kit import until
 from zscout.keyexpr import BadName
 from zscout.mesh.transport import Quality
@@ -35,6 +37,41 @@ def test_publications_arrive_in_order(play: Play) -> None:
         publisher.close()
 
     play(story)
+
+
+def test_a_peer_that_does_not_read_for_less_than_the_lease_misses_nothing() -> None:
+    # As on a host without processor time; a link that is closed for it takes the liveliness of all behind it along.
+    payload, count, sent = bytes(50_000), 640, 0  # more than the buffers of a connection take
+
+    def send(world: World) -> None:
+        nonlocal sent
+        for sent in range(1, count + 1):  # noqa: B007 - told to the story below
+            world.meshes[1]._transport.put(NEWS, payload, Ping)
+
+    async def story() -> None:
+        async with AsyncExitStack() as stack, asyncio.timeout(HANG):
+            world = Zenoh(stack)
+            world.lease = 30.0
+            a, _ = await world.open("a", "b")
+            go_on, heard = threading.Event(), list[int]()
+
+            def on_sample(_key: str, payload: bytes, _head: bytes | None) -> None:
+                go_on.wait(HANG)
+                heard.append(len(payload))
+
+            a._transport.subscriber(NEWS, on_sample)
+            await world.declared()
+            sending = asyncio.create_task(asyncio.to_thread(send, world))
+            before = -1
+            while sent != before:
+                before = sent
+                await asyncio.sleep(0.5)
+            assert 0 < sent < count
+            go_on.set()
+            await sending
+            await until(lambda: len(heard) == count)
+
+    asyncio.run(story())
 
 
 def test_what_is_published_before_a_subscription_is_not_kept(play: Play) -> None:

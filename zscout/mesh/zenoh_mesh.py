@@ -24,8 +24,6 @@ from zscout.mesh.transport import Collector, OnSample, Quality, Transport, Trans
 
 log = logging.getLogger(__name__)
 
-BLOCK_US = 100_000
-"""The longest that a publication waits for a peer that does not read, before that peer is given up."""
 CONTROL_BATCHES = 8
 """Control messages under way to one peer: with fewer, an answer waits until the message before it is out."""
 SCOUTING_DELAY_MS = 200
@@ -50,7 +48,9 @@ def zenoh_config(config: MeshConfig) -> zenoh.Config:
         "scouting/multicast/interface": config.interface,
         "scouting/delay": SCOUTING_DELAY_MS,
         "transport/link/tx/lease": round(config.lease * 1000),
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_US,
+        # A peer is given up no sooner for not reading than for being silent: on a host that stalls, or is short of
+        # processor time, Zenoh's own sending threads stand still as well, and any burst would cost a sound link.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(config.lease * 1_000_000),
         "transport/link/tx/queue/size": {"interactive_high": CONTROL_BATCHES},
         "transport/shared_memory/enabled": False,
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
