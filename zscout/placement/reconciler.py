@@ -140,7 +140,8 @@ class Reconciler:
             self.migrations.target_listed(record, move, listed.phase)
         elif incarnation == record.incarnation and not record.superseded:
             self._listed_alive(record, host, listed)
-        elif listed.phase != "standby":
+        elif listed.phase in RUNNING or (listed.phase == "starting" and incarnation < record.incarnation):
+            # One that only starts may be going to stand by for a move: its token tells, once it runs.
             self._other_runs(record, incarnation, host, token=False)
 
     def _adopt(self, host: HostName, listed: ComponentView) -> None:

@@ -17,6 +17,7 @@ from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
+from zscout.lab.faults.virtual_time import START
 from zscout.mesh import ZenohMesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import Grants
@@ -113,6 +114,22 @@ def test_a_hold_ends_after_its_minimum_runtime_without_an_error() -> None:
                 await asyncio.sleep(3600)
             assert 5 <= (one.mesh.now() - began) / SECOND < 5.1
             assert await fleet.holders() == []
+
+    run(test())
+
+
+def test_a_timer_that_goes_off_early_ends_a_hold_without_an_error() -> None:
+    # A loop's timers may be counted in ms, and on another clock than the host's.
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, _):
+            mesh, loop = fleet.mesh("h", "slow"), asyncio.get_running_loop()
+            mesh.now = lambda: round((START + (loop.time() - START) * 0.999) * SECOND)
+            slow = Client(mesh, FLEET).start()
+            fleet.clients.append(slow)
+            async with hold(slow, "first", {RC: {}}, min_runtime=2) as held:
+                fleet.network.link(fleet.leader(), mesh).loss = 1.0  # it does not hear that its hold is over
+                await asyncio.sleep(3600)
+            assert held.completed
 
     run(test())
 

@@ -96,9 +96,10 @@ class Held:
 
     async def over(self) -> None:
         """Waits until the hold is over; for bodies that work elsewhere."""
-        with suppress(TimeoutError):
-            while self.active:
-                async with asyncio.timeout(None if self.arc.keep else max(0.0, self.remaining)):
+        # A timer may go off a little before its time by this host's clock.
+        while self.active and not self.completed:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(None if self.arc.keep else self.remaining):
                     await self._client.changed(self.arc)
 
 
