@@ -73,10 +73,9 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
                     for number in range(1, 41)
                 )
             )
+            # Where this process stood still meanwhile, what follows the newest comes in the same reading.
             last = await line.until(
-                lambda packets: (
-                    packets and isinstance(packets[-1], DrivePacket) and packets[-1].left > 0.99 and packets
-                ),
+                lambda packets: any(isinstance(p, DrivePacket) and p.left > 0.99 for p in packets) and packets,
                 since=since,
             )
             replaced = sum(answered.result == {"replaced": True} for answered in done)
