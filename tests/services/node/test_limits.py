@@ -167,13 +167,14 @@ def test_memory_is_limited_by_the_process_itself_where_no_group_does_it() -> Non
 
 
 def test_a_family_is_killed_whatever_groups_it_is_in() -> None:
+    tag = f"t-{os.getpid()}-1"  # no other suite's on this machine
     code = (
         "import os; from zscout.behaviors.components.processes import kill_family\n"
-        "print(kill_family('t-1', spare=os.getpid()), kill_family('t-1', spare=os.getpid()))"
+        f"print(kill_family('{tag}', spare=os.getpid()), kill_family('{tag}', spare=os.getpid()))"
     )
-    env = os.environ | {"ZSCOUT_COMPONENT": "t-1"}
+    env = os.environ | {"ZSCOUT_COMPONENT": tag}
     family = [subprocess.Popen(["sleep", "60"], env=env, start_new_session=apart) for apart in (True, False)]
-    other = subprocess.Popen(["sleep", "60"], env=os.environ | {"ZSCOUT_COMPONENT": "t-11"})
+    other = subprocess.Popen(["sleep", "60"], env=os.environ | {"ZSCOUT_COMPONENT": f"{tag}1"})
     try:
         done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=HANG)
         assert done.stdout == "2 0\n"
