@@ -177,9 +177,12 @@ async def kill(lab: Lab, host: str, victim: str) -> None:
     """Kills a node with all it started, as if its host had lost power, or only the component there."""
     children = psutil.Process(lab.nodes[host].pid).children(recursive=True)
     if victim == "node":
-        lab.signal(host, signal.SIGKILL)
+        # It sees nothing of its children's end; and a child that was stopped would go on at its node's.
+        lab.signal(host, signal.SIGSTOP)
     for child in children:
         child.kill()
+    if victim == "node":
+        lab.signal(host, signal.SIGKILL)
     await asyncio.to_thread(psutil.wait_procs, children, HANG)
 
 
