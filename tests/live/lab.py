@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import random
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -49,7 +49,9 @@ class Lab:
         self.holders: list[HolderProcess] = []
         self.fleet_file = folder / "fleet.toml"
         names = ", ".join(f'"{name}"' for name in candidates)
-        port = random.randint(20_000, 60_000)  # noqa: S311
+        self._port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._port.bind(("127.0.0.1", 0))  # held, so that no other lab on this machine is given its number
+        port = self._port.getsockname()[1]
         if lease is None:
             lease = 1.0 if "hold_lease" in extra else PATIENT
         if "[placement]" not in extra:
@@ -192,6 +194,7 @@ class Lab:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        self._port.close()
 
 
 class HolderProcess:

@@ -155,7 +155,9 @@ class Rcm:
         """One instant. RCs that are `named` are published, whatever becomes of them."""
         for event in events:
             match event:
-                case Requested(ArcRequest(client=client)) | HandedOver(to=client):
+                case Requested(ArcRequest(client=client)) | HandedOver(to=client) if (
+                    client not in self.membership.clients
+                ):
                     self.membership.expect(client)
         effects = self.core.handle(self.mesh.now(), *events)
         self._publish(effects, named)
