@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -12,10 +15,12 @@ import pytest
 
 from tests.behaviors.components.kit import ROOT, gone
 from tests.hang import HANG
+from zscout.behaviors.components import channel
+from zscout.behaviors.components.channel import EndReport, Order
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import new_instance
 from zscout.mesh import Refused, Supervisor
-from zscout.messages import ComponentSpec, StartComponent
+from zscout.messages import ComponentSpec, StartComponent, StopComponent
 from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.types import SECOND
@@ -113,5 +118,34 @@ def test_who_is_stopped_before_it_is_ready_ends(tmp_path: Path) -> None:
         assert asyncio.get_running_loop().time() - began < fleet.placement.start_timeout / SECOND
         assert (process.phase, process.ended) == ("ended", "stopped")
         assert process.settled.is_set()
+
+    asyncio.run(story())
+
+
+def test_the_last_word_of_who_has_left_counts_though_an_order_to_it_fails(tmp_path: Path) -> None:
+    async def story() -> None:
+        start, last = StartComponent("c", 1, ComponentSpec("counter")), EndReport("moved")
+        process = ComponentProcess("h", default_fleet(), ControlGroups(tmp_path), start, "x:y", lambda _: None)
+        process._supervisor = Supervisor("test", lambda _: None)
+        ours, theirs = socket.socketpair()
+        code = (
+            "import os, socket, sys\n"
+            "node = socket.socket(fileno=int(sys.argv[1]))\n"
+            "node.makefile('rb').readline()\n"
+            "sys.stdin.readline()\n"
+            "node.sendall(bytes.fromhex(sys.argv[2]))\n"
+            "os._exit(0)\n"
+        )
+        command = [sys.executable, "-c", code, str(theirs.fileno()), channel.pack(last).hex()]
+        with theirs:
+            child = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.PIPE)  # noqa: ASYNC220
+        serving = asyncio.create_task(process._serve_connection(ours, child))
+        while process._orders is None or not process._orders.empty():  # noqa: ASYNC110 - a test waits for any state
+            await asyncio.sleep(0.001)
+        # Nothing is read before it has left.
+        child.communicate(b"\n")
+        process._send(Order(0, StopComponent("c")))
+        await serving
+        assert process._end_report == last
 
     asyncio.run(story())

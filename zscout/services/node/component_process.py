@@ -67,7 +67,8 @@ class ComponentProcess:
         self._lasted: Ns | None = None
         self._tag = f"{start.component}.{start.incarnation}-{new_instance()}"
         self._child: subprocess.Popen[bytes] | None = None
-        self._writer: asyncio.StreamWriter | None = None
+        self._orders: asyncio.Queue[bytes] | None = None
+        """What is to be sent to its process, while there is a connection."""
         self._group = ComponentGroup(0, 0)
         self._verdict: EndReport | None = None
         """How it ends if it is this node that ends it."""
@@ -180,8 +181,8 @@ class ComponentProcess:
         return answer
 
     def _send(self, message: msgspec.Struct) -> None:
-        if self._writer is not None and not self._writer.is_closing():
-            self._writer.write(channel.pack(message))
+        if self._orders is not None:
+            self._orders.put_nowait(channel.pack(message))
 
     # Its life
 
@@ -232,8 +233,12 @@ class ComponentProcess:
     async def _serve_connection(self, connection: socket.socket, child: subprocess.Popen[bytes]) -> None:
         """Gives a child its job, and returns when it has ended."""
         loop = asyncio.get_running_loop()
+        # Orders go by a socket of their own: where one can't be sent any more, asyncio would close the connection with
+        # all that has arrived and was not read, the last report of who has just left.
+        sending = connection.dup()
         stream, writer = await asyncio.open_unix_connection(sock=connection, limit=channel.MAX_FRAME)
-        self._writer = writer
+        self._orders = asyncio.Queue()
+        speaking = loop.create_task(_speak(sending, self._orders))
         self._send(channel.ComponentJob(self.start, self._where, self._host, self._fleet, self._tag, self._group.each))
         if self.phase == "stopping":
             self._send(Order(0, messages.StopComponent(self.start.component)))
@@ -252,7 +257,11 @@ class ComponentProcess:
             loop.remove_reader(handle)
             os.close(handle)
             receiving.cancel()
+            speaking.cancel()
+            self._orders = None
             writer.close()
+            await asyncio.gather(speaking, return_exceptions=True)
+            sending.close()
 
     def _spawn(self, connection: int, writing: int) -> subprocess.Popen[bytes]:
         return subprocess.Popen(  # noqa: S603 - nothing of it comes over the mesh
@@ -333,3 +342,12 @@ class ComponentProcess:
             known = {number.value: number.name for number in signal.Signals}
             return EndReport("failed", f"killed by {known.get(-code, f'signal {-code}')}")
         return EndReport("failed", f"its process left with code {code} and without a word")
+
+
+async def _speak(connection: socket.socket, frames: asyncio.Queue[bytes]) -> None:
+    """Sends what is put into `frames`, until the other side has closed."""
+    loop = asyncio.get_running_loop()
+    connection.setblocking(False)
+    with suppress(OSError):
+        while True:
+            await loop.sock_sendall(connection, await frames.get())
