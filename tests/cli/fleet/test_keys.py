@@ -95,8 +95,7 @@ def test_at_a_narrow_terminal_every_key_can_be_copied(tmp_path: Path) -> None:
 
 def test_where_nobody_is_it_says_so(tmp_path: Path) -> None:
     async def story() -> None:
-        # Another suite's lab may have drawn the same multicast port.
-        async with Lab(tmp_path, extra="multicast = false\n") as lab:
+        async with Lab(tmp_path) as lab:
             shown = await zscout_soon("keys", env=lab.env)
             assert (shown.returncode, shown.stdout) == (3, "")
             assert "no other program either" in shown.stderr

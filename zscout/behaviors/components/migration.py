@@ -172,7 +172,8 @@ class OutgoingMove:
         nodes, clients = await asyncio.gather(*looks)
         its = self.to, f"{self._name}.{self.incarnation}"
         lives = any(node.host == self.to for node in nodes) or any((one.host, one.name) == its for one in clients)
-        self._seen = mesh.now() if lives else self._seen
+        if lives:
+            self._seen = mesh.now()
         return lives
 
     async def _ask(self, operation: Operation, kind: type[R], timeout: float) -> R | Problem | None:

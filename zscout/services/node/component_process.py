@@ -257,11 +257,13 @@ class ComponentProcess:
             loop.remove_reader(handle)
             os.close(handle)
             receiving.cancel()
-            speaking.cancel()
             self._orders = None
             writer.close()
-            await asyncio.gather(speaking, return_exceptions=True)
+            speaking.cancel()
+            await asyncio.wait({speaking})
             sending.close()
+            if not speaking.cancelled():
+                speaking.result()
 
     def _spawn(self, connection: int, writing: int) -> subprocess.Popen[bytes]:
         return subprocess.Popen(  # noqa: S603 - nothing of it comes over the mesh

@@ -66,8 +66,8 @@ class Membership:
     # Clients
 
     def expect(self, client: ClientId) -> None:
-        """A client with requests must live; one that was not seen yet gets a lease to show itself."""
-        if client not in self.clients and client not in self._unseen:
+        """A client with requests must live: one that is not among `clients` yet gets a lease to show itself."""
+        if client not in self._unseen:
             self._unseen[client] = self._supervisor.call_later(self._lease, self._client_lost, client)
 
     def find(self, client: ClientId, then: Callable[[bool], None]) -> None:

@@ -153,11 +153,10 @@ class Rcm:
 
     def _decide(self, events: Sequence[Event], named: Collection[RcName] | None = None) -> None:
         """One instant. RCs that are `named` are published, whatever becomes of them."""
+        seen = self.membership.clients
         for event in events:
             match event:
-                case Requested(ArcRequest(client=client)) | HandedOver(to=client) if (
-                    client not in self.membership.clients
-                ):
+                case Requested(ArcRequest(client=client)) | HandedOver(to=client) if client not in seen:
                     self.membership.expect(client)
         effects = self.core.handle(self.mesh.now(), *events)
         self._publish(effects, named)
