@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
 from typing import IO
 
@@ -16,9 +17,9 @@ import pytest
 
 from tests.hang import HANG
 from tests.services.recorder.paper_run import RCS, TABLE2, colours, events, lanes, rows
-from zscout.lab.demo.tables import Observed, differences, paper
+from zscout.lab.demo.tables import ArcBody, Observed, differences, paper
 from zscout.services.recorder.timeline import OPERATOR_MARK
-from zscout.types import SECOND
+from zscout.types import SECOND, Ns
 
 pytestmark = pytest.mark.live
 
@@ -49,6 +50,11 @@ def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
     return psutil.Process(process.pid).children(recursive=True)
 
 
+def turns(cells: list[str], *, free: str) -> list[str]:
+    """Who held it, one after the other."""
+    return [cell for cell, _ in groupby(cells) if cell != free]
+
+
 def gone(processes: list[psutil.Process]) -> bool:
     _, alive = psutil.wait_procs(processes, timeout=HANG)
     return not alive
@@ -59,9 +65,10 @@ def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
     out, error = demo.communicate(timeout=HANG)
     assert demo.returncode == 0, out + error
     result = json.loads(out)
-    expected = {rc: row.split() for rc, row in TABLE2.items()}
-    assert result["paper"] == result["published"] == result["bodies"] == expected
-    assert result["differences"] == []
+    # Cells are who held what in the middle of each second: on a busy machine some are late. Exit code 0 says that
+    # all came in the paper's order.
+    assert result["paper"] == {rc: row.split() for rc, row in TABLE2.items()}
+    assert result["published"].keys() == result["bodies"].keys() == TABLE2.keys()
     assert set(result["loads"]) == {"anvil", "bellows", "crucible"}
     assert all(load["number"] >= 10 for load in result["loads"].values())
     assert list((tmp_path / "tmp").iterdir()) == []
@@ -70,13 +77,9 @@ def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*.rrd")) == [path]
     assert path.parent == tmp_path / "runs"
     shown = lanes(path, "/rc/**")
-    zero = shown["/rc/robot/scout33"][1][0]
     for rc in RCS:
-        cells = []
-        for second in range(18):
-            (state,) = [states for at, states in shown[f"/rc/{rc}"] if at <= zero + second + 0.5][-1]
-            cells.append(state.removesuffix(OPERATOR_MARK).removeprefix("arc") or "-")
-        assert " ".join(cells) == TABLE2[rc]
+        holders = [state.removesuffix(OPERATOR_MARK).removeprefix("arc") for _, (state,) in shown[f"/rc/{rc}"]]
+        assert turns(holders, free="") == turns(TABLE2[rc].split(), free="-")
     used = {text: colour for lane in colours(path, "/rc/**").values() for text, colour in lane.items()}
     assert set(used) == {"arc0", "arc1", "arc2", "arc3", "arc4" + OPERATOR_MARK}
     assert len(set(used.values())) == 5
@@ -132,19 +135,25 @@ def test_a_place_that_cannot_be_written_is_one_line_at_once(tmp_path: Path) -> N
     )
 
 
+LATE = SECOND * 3 // 100
+
+
 def happened() -> Observed:
     """The paper's example as it should be seen, 30 ms late throughout."""
     expected, seen = paper(), Observed(zero=1000 * SECOND)
     assert seen.zero is not None
-    late = SECOND * 3 // 100
     for rc, row in expected.table.items():
-        for second, cell in enumerate(row):
+        second = 0
+        for cell, cells in groupby(row):
             arcs = [] if cell == "-" else [f"arc{cell}"]
-            seen.published(rc, arcs, seen.zero + second * SECOND + late)
-            for arc in arcs:
-                seen.entered(arc, [rc], seen.zero + second * SECOND + late)
-                seen.bodies[-1].end = seen.zero + (second + 1) * SECOND + late
+            seen.published(rc, arcs, at(second))
+            begin, second = second, second + len(list(cells))
+            seen.bodies += [ArcBody(arc, (rc,), at(begin), at(second)) for arc in arcs]
     return seen
+
+
+def at(second: int) -> Ns:
+    return (1000 + second) * SECOND + LATE
 
 
 Spoil = Callable[[Observed], None]
@@ -155,31 +164,52 @@ def lose_a_body(seen: Observed) -> None:
 
 
 def enter_twice(seen: Observed) -> None:
-    assert seen.zero is not None
-    seen.entered("arc1", ["robot/scout33"], seen.zero + 12 * SECOND)
-    seen.left("arc1", seen.zero + 13 * SECOND)
+    seen.entered("arc1", ["robot/scout33"], at(12))
+    seen.left("arc1", at(13))
 
 
 def publish_late(seen: Observed) -> None:
-    at, _ = seen.changes["robot/scout35"][5]
-    seen.changes["robot/scout35"][5] = (at + SECOND // 2, ("arc1",))
+    for rc, changes in seen.changes.items():
+        seen.changes[rc] = [(since + SECOND // 2 if since == at(5) else since, arcs) for since, arcs in changes]
+
+
+def enter_late(seen: Observed) -> None:
+    for body in seen.bodies:
+        body.begin += SECOND // 2 if body.arc == "arc4" else 0
+
+
+def publish_alone(seen: Observed) -> None:
+    """For an instant the next holder has one of its two RCs."""
+    changes = seen.changes["robot/scout33"]
+    seen.changes["robot/scout33"] = [(since + 1 if since == at(5) else since, arcs) for since, arcs in changes]
+
+
+def hold_before(seen: Observed) -> None:
+    seen.published("framegrabber/fgrab2", ["arc3"], at(0))
+    seen.changes["framegrabber/fgrab2"].sort()
 
 
 @pytest.mark.parametrize(
-    ("spoil", "wrong"),
+    ("spoil", "wrong", "same_order"),
     [
-        (lambda _: None, set()),
-        (lose_a_body, {(rc, s) for rc in RCS for s in (11, 12, 13) if rc != "framegrabber/fgrab2"}),
-        (enter_twice, {("robot/scout33", 12)}),
-        (publish_late, {("robot/scout35", 5)}),
+        (lambda _: None, set(), True),
+        (lose_a_body, {(rc, s) for rc in RCS for s in (11, 12, 13) if rc != "framegrabber/fgrab2"}, False),
+        (enter_twice, {("robot/scout33", 12)}, False),
+        (publish_late, {(rc, 5) for rc in RCS}, True),
+        (enter_late, {(rc, 11) for rc in RCS if rc != "framegrabber/fgrab2"}, True),
+        (publish_alone, set(), False),
+        (hold_before, {("framegrabber/fgrab2", s) for s in range(5)}, False),
     ],
 )
-def test_every_cell_that_differs_is_named(spoil: Spoil, wrong: set[tuple[str, int]]) -> None:
+def test_every_cell_that_differs_is_named_and_what_is_only_late_is_told_apart(
+    spoil: Spoil, wrong: set[tuple[str, int]], same_order: bool
+) -> None:
     seen, table = happened(), paper().table
     spoil(seen)
     now = 1018 * SECOND
     found = differences(table, seen.by_rcm(list(table), 18, now), seen.by_bodies(list(table), 18, now))
     assert {(item.rc, item.second) for item in found} == wrong
+    assert seen.same_order(table) == same_order
 
 
 def test_the_shipped_tables_are_the_paper_s() -> None:

@@ -86,7 +86,8 @@ def table1(out: Path | None, as_json: bool) -> int:
     """Play Table 1 of the paper on a live mesh, and compare what happens with Table 2.
 
     It starts three nodes with four devices and five programs on this machine, apart from every other fleet,
-    for about 25 seconds, and records them. Nothing is left but the recording. Exit code 1: a cell differs.
+    for about 25 seconds, and records them. Nothing is left but the recording. Exit code 1: not all came in
+    the order of Table 2; cells that are only late, on a busy machine, are named.
 
     \b
     Examples:

@@ -29,6 +29,8 @@ STYLES: Final = {
 }
 """The colours of the recording, by ARC."""
 SOURCES: Final = {"RCM": "what the RCM published", "ARCs": "what the ARCs' bodies saw", "paper": "Table 2 of the paper"}
+LATE: Final = "all came in the order of the paper's Table 2, but late: this machine is busy"
+DIFFERENT: Final = "not in the order of the paper's Table 2"
 WIDE: Final = 26
 """Columns left of the first second."""
 
@@ -48,7 +50,7 @@ async def play(out: Path | None, *, as_json: bool) -> int:
     seen, now = demo.seen, clock.now()
     published, bodies = seen.by_rcm(rcs, seconds, now), seen.by_bodies(rcs, seconds, now)
     wrong = differences(expected.table, published, bodies)
-    took = (now - began) / SECOND
+    as_paper, took = seen.same_order(expected.table), (now - began) / SECOND
     if as_json:
         terminal.print_json(
             {
@@ -63,7 +65,11 @@ async def play(out: Path | None, *, as_json: bool) -> int:
         )
     else:
         _report({"RCM": published, "ARCs": bodies, "paper": expected.table}, wrong, seen, path, took)
-    return 1 if wrong else 0
+        if wrong or not as_paper:
+            terminal.print_line(LATE if as_paper else DIFFERENT)
+        for words in how_to_view(path):
+            terminal.print_line(words)
+    return 0 if as_paper else 1
 
 
 def _report(tables: dict[str, Table], wrong: list[Difference], seen: Observed, path: Path, took: float) -> None:
@@ -84,12 +90,9 @@ def _report(tables: dict[str, Table], wrong: list[Difference], seen: Observed, p
         for item in wrong:
             words = f"the RCM {item.published}, the ARCs {item.bodies}, the paper {item.paper}"
             terminal.print_line(f"differs: {item.rc} in second {item.second}: {words}")
-        terminal.print_line("a very busy machine can do that; try again")
     else:
         cells = sum(len(row) for row in tables["paper"].values())
         terminal.print_line(f"All {cells} cells are those of the paper's Table 2 ({took:.0f} s).")
-    for words in how_to_view(path):
-        terminal.print_line(words)
 
 
 def _lines(tables: dict[str, Table], wrong: Set[tuple[str, int]] = frozenset()) -> Iterator[Text]:

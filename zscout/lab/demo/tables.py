@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import NamedTuple, TypeAlias
+from itertools import groupby
+from typing import Final, NamedTuple, TypeAlias
 
 from zscout.lab.workload import Workload, parse_workload
 from zscout.messages import LoadReport
 from zscout.types import SECOND, Ns
 
+FREE: Final = "-"
 Table: TypeAlias = dict[str, list[str]]
-"""By RC, who holds it in each second: the ARC's name without "arc", "-" for nobody."""
+"""By RC, who holds it in each second: the ARC's name without "arc", FREE for nobody."""
 
 
 class Paper(NamedTuple):
@@ -81,17 +83,21 @@ class Observed:
         """Whether nobody holds anything, by the RCM's word."""
         return all(not changes[-1][1] for changes in self.changes.values())
 
+    def same_order(self, expected: Table) -> bool:
+        """Whether everything came as in a table, however late: all that the RCM published, one state of all RCs
+        after the other, and on each RC the bodies, one after the other."""
+        instants = sorted({at for changes in self.changes.values() for at, _ in changes})
+        published = zip(*([self._held(rc, at) for at in instants] for rc in expected), strict=True)
+        return _order(published) == _order(zip(*expected.values(), strict=True)) and all(
+            [_cell([body.arc]) for body in sorted(self.bodies, key=lambda body: body.begin) if rc in body.rcs]
+            == [cell for cell, _ in groupby(row) if cell != FREE]
+            for rc, row in expected.items()
+        )
+
     def by_rcm(self, rcs: Sequence[str], seconds: int, now: Ns) -> Table:
         """Who held each RC in the middle of each second until `now`, by what the RCM published."""
 
-        def cell(rc: str, at: Ns) -> str:
-            held: tuple[str, ...] = ()
-            for since, arcs in self.changes.get(rc, []):
-                if since <= at:
-                    held = arcs
-            return _cell(held)
-
-        return {rc: [cell(rc, at) for at in self._middles(seconds, now)] for rc in rcs}
+        return {rc: [self._held(rc, at) for at in self._middles(seconds, now)] for rc in rcs}
 
     def by_bodies(self, rcs: Sequence[str], seconds: int, now: Ns) -> Table:
         """The same, by the bodies that were entered and left."""
@@ -106,6 +112,9 @@ class Observed:
             )
 
         return {rc: [cell(rc, at) for at in self._middles(seconds, now)] for rc in rcs}
+
+    def _held(self, rc: str, at: Ns) -> str:
+        return _cell(next((arcs for since, arcs in reversed(self.changes.get(rc, [])) if since <= at), ()))
 
     def _middles(self, seconds: int, now: Ns) -> list[Ns]:
         """The middle of each second; of the one that goes on, the present."""
@@ -129,4 +138,12 @@ def differences(expected: Table, published: Table, bodies: Table) -> list[Differ
 
 
 def _cell(arcs: Sequence[str]) -> str:
-    return "+".join(arc.removeprefix("arc") for arc in arcs) or "-"
+    return "+".join(arc.removeprefix("arc") for arc in arcs) or FREE
+
+
+def _order(states: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """The states of all RCs one after the other, without those before the first hold and after the last."""
+    order = [state for state, _ in groupby(states)]
+    while order and set(order[-1]) == {FREE}:
+        order.pop()
+    return order[1:] if order and set(order[0]) == {FREE} else order
