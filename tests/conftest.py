@@ -8,6 +8,10 @@ import sys
 import tempfile
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 BYTECODE = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
 

@@ -168,7 +168,7 @@ def run(queue: TransmitQueue, until: Ns, actions: Iterable[Action] = (), begin: 
             told.written.append(now)
 
 
-@settings(max_examples=times(30), deadline=None)
+@settings(max_examples=times(30))
 @given(shares, bauds, st.integers(0, 2**32), st.booleans())
 def test_no_packet_waits_longer_than_the_bound_however_holders_time_it(
     wanted: list[Share], baud: int, seed: int, greedy: bool

@@ -236,7 +236,6 @@ def toml(workload: Workload) -> str:
 
 
 @given(workloads())
-@settings(deadline=None)
 def test_whatever_is_written_is_read_back_the_same(workload: Workload) -> None:
     assert parse_workload(toml(workload), "w") == workload
 
@@ -251,7 +250,7 @@ ODD = ["", "0", "-1", "nan", "1e999", "true", '""', '"x"', "[]", "[{}]", "{}", "
         st.sampled_from(ODD) | st.text(max_size=5),
     ),
 )
-@settings(deadline=None, max_examples=times(200))
+@settings(max_examples=times(200))
 def test_no_file_ends_in_another_error(heads: list[str], keys: dict[str, str]) -> None:
     text = "\n".join([*heads, *(f"{key} = {value}" for key, value in keys.items())])
     try:

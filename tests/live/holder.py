@@ -12,17 +12,35 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.request import OpenArc
-from zscout.mesh import clock
+from zscout.keyexpr import Role, Token
+from zscout.mesh import Mesh, clock
 from zscout.types import Grant
 
 
 def say(event: str, **details: Any) -> None:
     sys.stdout.write(json.dumps({"event": event, "at": clock.now(), **details}) + "\n")
     sys.stdout.flush()
+
+
+async def linked(mesh: Mesh, rcs: Iterable[str]) -> None:
+    """Waits until `mesh` sees these RCs: a link to their hosts may come later than that to the RCM."""
+    missing, complete = set(rcs), asyncio.Event()
+
+    def seen(token: Token, alive: bool) -> None:
+        if alive:
+            missing.discard(token.name)
+        if not missing:
+            complete.set()
+
+    if missing:
+        watch = mesh.watch(mesh.keys.alive_any(Role.RC), seen)
+        await complete.wait()
+        watch.close()
 
 
 class Holder:
@@ -48,6 +66,7 @@ class Holder:
                 say("given_up")
 
     async def _ask(self, arc: str, needs: dict[str, Any], **how: Any) -> None:
+        await linked(self.client.mesh, needs)
         try:
             self.arc = await self.client.request(arc, needs, **how)
         except RequestRefused as refused:

@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from tests.hang import HANG
+from tests.live.holder import linked
 from zscout.behaviors.client.client import Client
 from zscout.config.fleet import Fleet, load_fleet
 from zscout.config.scheduling_policy import StrategyName
@@ -171,8 +172,11 @@ class Lab:
             raise AssertionError(f"waited in vain; last seen {seen}\n{logs}") from None
 
     async def ready(self, client: Client, *rcs: str) -> RcmState:
-        """Waits until somebody leads and all these RCs are there."""
-        return await self.state(client, lambda state: set(rcs) <= {view.rc for view in state.rcs if view.present})
+        """Waits until somebody leads and all these RCs are there, for the RCM and for `client`."""
+        state = await self.state(client, lambda state: set(rcs) <= {view.rc for view in state.rcs if view.present})
+        async with asyncio.timeout(HANG):
+            await linked(client.mesh, rcs)
+        return state
 
     async def __aenter__(self) -> Self:
         return self

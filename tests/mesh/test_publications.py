@@ -76,9 +76,13 @@ def test_a_peer_that_does_not_read_for_less_than_the_lease_misses_nothing() -> N
 
 def test_what_is_published_before_a_subscription_is_not_kept(play: Play) -> None:
     async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        b.put(NEWS, Ping(1))
+        a, b, witness = await world.open("a", "b", "c")
         heard: list[int] = []
+        witnessed: list[int] = []
+        witness.subscribe(NEWS, Ping, lambda _, ping: witnessed.append(ping.number))
+        await world.declared()
+        b.put(NEWS, Ping(1))
+        await until(lambda: witnessed)  # what is put goes out a little later
         a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
         await world.declared()
         b.put(NEWS, Ping(2))

@@ -268,7 +268,7 @@ REPORTS = st.builds(
 )
 
 
-@settings(max_examples=times(80), deadline=None)
+@settings(max_examples=times(80))
 @given(
     reports=st.lists(st.tuples(st.integers(0, 8), REPORTS), max_size=12),
     cordoned=st.sets(st.sampled_from("abcdef"), max_size=2),

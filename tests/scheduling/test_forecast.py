@@ -63,7 +63,7 @@ def test_a_kept_hold_is_foretold_to_yield_after_its_time() -> None:
     assert forecast(core, 0).starts == {"next": 5 * SECOND}
 
 
-@settings(max_examples=times(60), deadline=None)
+@settings(max_examples=times(60))
 @given(workloads(keep=False))
 def test_what_is_foretold_comes(workload: Workload) -> None:
     """After the last arrival, the forecast's starts are those of the run itself."""

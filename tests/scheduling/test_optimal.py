@@ -95,7 +95,7 @@ def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
     assert [len(one.holders) for one in proposed(effects)] == [8]
 
 
-@settings(max_examples=times(60), deadline=None)
+@settings(max_examples=times(60))
 @given(workloads())
 def test_promises_hold_in_replay(workload: Workload) -> None:
     ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])
@@ -103,7 +103,7 @@ def test_promises_hold_in_replay(workload: Workload) -> None:
     assert not ledger.open
 
 
-@settings(max_examples=times(60), deadline=None)
+@settings(max_examples=times(60))
 @given(workloads(keep=False))
 def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
     """All ask at once; the RCs' own sums, not their votes, say which sets are ruled out."""

@@ -12,6 +12,7 @@ from typing import Any, cast
 import msgspec
 import pytest
 
+from tests.mesh import kit
 from zscout.behaviors.client.arc import Held, Revoked
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import OpenArc, RequestStore
@@ -258,3 +259,21 @@ def test_a_grant_is_confirmed_again_where_its_rc_has_not_heard_of_it_yet(
             assert (answers, ended) == ([], [known])
 
     asyncio.run(story())
+
+
+def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> None:
+    async def story() -> None:
+        loop = asyncio.get_running_loop()
+        mesh = SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: round(loop.time() * SECOND))
+        client, known = Client(cast("Mesh", mesh), default_fleet()), arc()
+        known.take(runs({}), mesh.now())
+        linked = loop.time() + 0.99
+
+        async def command(rc: str, *_: Any, **__: Any) -> None:
+            if loop.time() < linked:
+                raise CommandRefused(rc, Problem("unknown", "no answer, at once"))
+
+        client.command = command  # type: ignore[assignment,method-assign]
+        assert await client.granted(known) == FIRST
+
+    kit.run(story())

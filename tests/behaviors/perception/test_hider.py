@@ -80,7 +80,7 @@ def test_every_act_is_one_that_a_packet_carries(story: list[Frame]) -> None:
     assert {"search", "approach", "enter", "turn"} <= {frame.act.doing for frame in story}
 
 
-@settings(max_examples=times(4), deadline=None)
+@settings(max_examples=times(4))
 @given(cuts=st.sets(st.integers(1, 400), min_size=1, max_size=4))
 def test_a_checkpoint_changes_nothing(story: list[Frame], cuts: set[int]) -> None:
     hider = Hider()

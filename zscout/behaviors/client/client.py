@@ -182,18 +182,19 @@ class Client(MovableClient):
         deadline = self.mesh.now() + round(CONFIRM_TIMEOUT * SECOND)
 
         async def one(rc: str) -> CommandRefused | None:
-            pause, longest = BACKOFF
+            pause = BACKOFF[0]
             while True:
                 left = (deadline - self.mesh.now()) / SECOND
                 try:
-                    await self.command(rc, grant, {"name": "confirm"}, timeout=max(pause, left))
+                    await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
                 except CommandRefused as refused:
-                    if arc.grant != grant or refused.code not in CONFIRM_AGAIN or left <= pause:
+                    if arc.grant != grant or refused.code not in CONFIRM_AGAIN or left <= 0:
                         return refused
                 else:
                     return None
-                await asyncio.sleep(pause)
-                pause = min(longest, pause * 2)
+                # The last time when all is over: a link to the RC may take that long.
+                await asyncio.sleep(max(0.0, min(pause, (deadline - self.mesh.now()) / SECOND)))
+                pause *= 2
 
         refusals = await asyncio.gather(*(one(rc) for rc in arc.rcs))
         return next((refused for refused in refusals if refused is not None), None)
