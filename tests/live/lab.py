@@ -14,6 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import psutil
+
 from tests.hang import HANG
 from tests.live.holder import linked
 from zscout.behaviors.client.client import Client
@@ -103,6 +105,21 @@ class Lab:
         """Sends a signal to a node; returns when, on this host's clock."""
         self.nodes[host].send_signal(number)
         return clock.now()
+
+    async def candidates(self, client: Client, *hosts: str) -> None:
+        """Waits until these hosts may lead, and have links to all other nodes and to all clients: one that has none to
+        an RC yet would lead without it."""
+        await self.living(client, Role.CANDIDATE, lambda found: set(hosts) <= set(found))
+        async with asyncio.timeout(HANG):
+            while True:
+                if all(self._is_linked(host) for host in hosts):
+                    return
+                await asyncio.sleep(0.02)
+
+    def _is_linked(self, host: str) -> bool:
+        ends = {one.raddr for one in _connections(self.nodes[host].pid)}
+        wanted = {node.pid: 1 for name, node in self.nodes.items() if name != host} | {os.getpid(): len(self.clients)}
+        return all(sum(one.laddr in ends for one in _connections(pid)) >= number for pid, number in wanted.items())
 
     async def logged(self, host: str, text: str) -> None:
         """Waits until a node has written `text` to its log."""
@@ -199,6 +216,11 @@ class Lab:
                 process.kill()
                 process.wait()
         self._port.close()
+
+
+def _connections(pid: int) -> list[Any]:
+    found = psutil.Process(pid).net_connections("tcp")
+    return [one for one in found if one.status == psutil.CONN_ESTABLISHED]
 
 
 class HolderProcess:

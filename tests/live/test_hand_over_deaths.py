@@ -31,7 +31,7 @@ def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
             await lab.ready(old, "robot/x", "radio/f")
             for host in ("b", "c"):
                 lab.node(host)
-            await lab.living(old, "candidate", lambda hosts: {"b", "c"} <= set(hosts))
+            await lab.candidates(old, "b", "c")
             before = await claimed(old, list(NEEDS))
 
             place = before["later"].place
@@ -70,7 +70,7 @@ def test_the_leader_dies_in_a_hand_over(tmp_path: Path, delay: float) -> None:
             old, new = await lab.client("old"), await lab.client("new")
             await lab.ready(old, "robot/x", "radio/f")
             lab.node("b")
-            await lab.living(old, "candidate", lambda hosts: "b" in hosts)
+            await lab.candidates(old, "b")
             before = await claimed(old, list(NEEDS))
             old.pause()
             new.expect(old.open_requests())

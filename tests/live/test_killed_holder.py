@@ -9,7 +9,7 @@ from statistics import median, quantiles
 
 import pytest
 
-from tests.live.lab import HolderProcess, Lab
+from tests.live.lab import PATIENT, HolderProcess, Lab
 from tests.thorough import times
 from zscout.types import SECOND
 
@@ -22,7 +22,7 @@ ROUNDS = 10
 
 def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, lease=1.0) as lab:
+        async with Lab(tmp_path) as lab:
             lab.node("a")
             lab.node("b", "robot/x", extra="candidate = false")
             client = await lab.client()
@@ -51,6 +51,7 @@ def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Path) ->
                 )
             assert len(took) == BATCHES * ROUNDS
             assert min(took) > 0
+            assert max(took) < PATIENT, "it was noticed by the lease, not by the death"
 
     asyncio.run(story())
 

@@ -39,7 +39,7 @@ def test_a_frozen_leader_is_followed_and_steps_down_when_it_wakes(tmp_path: Path
             leaders = LeaderWatch(client)
             crew = Crew()
             await crew.assemble(lab, ROBOTS, waiting=WAITING)
-            await lab.living(client, Role.CANDIDATE, lambda hosts: "b" in hosts)
+            await lab.candidates(client, "b")
             # Its time is over while the leader sleeps; at its waking the leader would give the RC away.
             short = await client.request("short", {"robot/short": {}}, min_runtime=0.3)
             heir = await client.request("heir", {"robot/short": {}}, min_runtime=600)

@@ -12,7 +12,6 @@ from tests.live.bench import running, until
 from tests.live.crew import Crew, Stand
 from tests.live.lab import Lab, LeaderWatch
 from zscout.behaviors.client.client import Client
-from zscout.keyexpr import Role
 from zscout.mesh import clock
 from zscout.types import SECOND, Ns
 
@@ -48,7 +47,7 @@ def test_a_successor_carries_everything_on(tmp_path: Path) -> None:
             stood = Stand(before)
             assert before.host == "a"
             assert len(stood.holds) == RUNNING
-            await lab.living(client, Role.CANDIDATE, lambda hosts: "b" in hosts)
+            await lab.candidates(client, "b")
 
             killed = lab.signal("a", signal.SIGKILL)
             ended = await leaders.lost("a")

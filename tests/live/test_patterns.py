@@ -84,7 +84,7 @@ def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_a_loss
             client = await lab.client("asker")
             await lab.ready(client, *BOTH)
             lab.node("b")
-            await lab.living(client, "candidate", lambda hosts: {"a", "b"} <= set(hosts))
+            await lab.candidates(client, "a", "b")
             async with Stand(lab) as stand:
                 rc = await stand.rc("framegrabber/f3", Bench())
                 blockers = [(await running(client, f"block-{name[-1]}", name))[0] for name in BOTH]
