@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
-from typing import IO
 
 import psutil
 import pytest
@@ -36,14 +35,15 @@ def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     )
 
 
-def read_until(stream: IO[str] | None, words: str) -> None:
-    assert stream is not None
+def read_until(demo: subprocess.Popen[str], words: str) -> None:
+    assert demo.stdout is not None
     seen = []
-    for line in stream:
+    for line in demo.stdout:
         seen.append(line)
         if words in line:
             return
-    raise AssertionError(f"{words!r} was not said: {seen}")
+    _, error = demo.communicate(timeout=HANG)
+    raise AssertionError(f"{words!r} was not said: {seen}; it ended with {demo.returncode}: {error}")
 
 
 def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
@@ -97,7 +97,7 @@ def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
 def test_nothing_runs_on_when_it_is_stopped(tmp_path: Path, number: signal.Signals) -> None:
     demo = start(tmp_path, "--out", "mine/demo.rrd")
-    read_until(demo.stdout, "arc0 runs on")
+    read_until(demo, "arc0 runs on")
     others = children(demo)
     assert len(others) == 3 + 1 + 5
     demo.send_signal(number)
@@ -114,7 +114,7 @@ def test_nothing_runs_on_when_it_is_stopped(tmp_path: Path, number: signal.Signa
 
 def test_a_node_that_dies_ends_it_with_one_line(tmp_path: Path) -> None:
     demo = start(tmp_path)
-    read_until(demo.stdout, "arc0 runs on")
+    read_until(demo, "arc0 runs on")
     others = children(demo)
     (bellows,) = (other for other in others if any("bellows.toml" in part for part in other.cmdline()))
     bellows.kill()
