@@ -60,7 +60,7 @@ class Lab:
         if "[placement]" not in extra:
             extra += f"\n[placement]\nstart_timeout = {HANG}"
         if "[timing]" not in extra:  # as much longer as in the default fleet
-            extra += f"\n[timing]\nhold_lease = {3 * lease}"
+            extra += f"\n[timing]\nhold_lease = {3 * lease}\nrebuild = {lease / 5}"
         self.fleet_file.write_text(
             f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\nstrategy = "{strategy}"\n'
             f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\n'
