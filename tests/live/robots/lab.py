@@ -15,7 +15,7 @@ from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.tree import BehaviorContext
-from zscout.drivers.packets import DrivePacket, HaltPacket, Packet
+from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet
 from zscout.lab.building.node_file import node_file
 from zscout.lab.building.plan import Furniture, Light, Noise, Plan, Robot
 from zscout.lab.building.serve import Served
@@ -107,6 +107,20 @@ class Building(Served):
 
     async def halts(self, robot: str, *, since: int) -> None:
         await comes_true(lambda: bool(self.packets(HaltPacket, robot, since=since)), f"{robot} to be halted")
+
+    async def turned_over(self, robot: str, *, since: int) -> None:
+        """Waits until one holder's end has halted a robot, and the next holder has switched its camera on: no halt of
+        an end before that is still under way."""
+
+        number = self.world.bodies[robot].id
+
+        def switched_on() -> bool:
+            packets = [one.packet for one in self.heard[since:] if one.packet.robot == number]
+            told = [packet for packet in packets if isinstance(packet, HaltPacket | CameraPacket)]
+            halted = any(isinstance(packet, HaltPacket) for packet in told)
+            return halted and isinstance(told[-1], CameraPacket) and told[-1].channel > 0
+
+        await comes_true(switched_on, f"{robot} to be turned over")
 
     async def stands(self, robot: str) -> float:
         """Waits until its wheels stand; returns since when, in the building's seconds."""

@@ -76,9 +76,14 @@ def test_a_net_at_work(tmp_path: Path) -> None:
             # An operator has it for a while: it goes on by itself.
             teleop = Teleop(client, RobotNeeds(ROBOTS[0]), Pilot(), priority=10)
             driving = asyncio.create_task(teleop.run())
+            heard = len(building.heard)
             teleop.take()
             await comes_true(lambda: teleop.state == "driving" and net.watching == 0, "the operator's turn")
+            await building.turned_over("scout33", since=heard)
+            heard = len(building.heard)
             teleop.give_back()
+            # What was said may be of before: the robot shows whose turn it is.
+            await building.turned_over("scout33", since=heard)
             await comes_true(lambda: net.watching == 1, "it to watch on")
             driving.cancel()
 
