@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 PEERS := .venv-peers
 PEERS_READY := $(PEERS)/.ready
 
-.PHONY: help setup demo test docs lint bench bench-peers lock clean
+.PHONY: help setup demo test docs lint bench bench-peers model lock clean
 
 help:
 	@echo "make demo   four robots in a simulated building hide and watch, on a live mesh"
@@ -14,6 +14,7 @@ help:
 	@echo "make docs   the documentation as a site, in site/"
 	@echo "make lint   formatting, linting, strict types, the rooms' contracts, links of the docs"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"
+	@echo "make model  what the model checker TLC says of formal/ownership.tla; needs a Java runtime"
 	@echo "make bench-peers   the same work done by Dask, Redis, etcd, labgrid and Ray"
 
 $(READY): requirements/dev.txt pyproject.toml
@@ -44,6 +45,9 @@ lint: $(READY) docs
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
+
+model: $(READY)
+	$(BIN)/python -m formal
 
 # What the peers need stands apart from what zscout needs.
 $(PEERS_READY): benchmarks/peers/requirements.txt requirements/dev.txt pyproject.toml

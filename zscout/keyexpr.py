@@ -5,12 +5,13 @@ receiver reads it from there and refuses wildcards in its place."""
 
 from __future__ import annotations
 
+import random
 import re
-import secrets
 from collections.abc import Callable
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 MAX_NAME = 64
 NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
@@ -102,9 +103,13 @@ def valid_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]", "-", text)[:64] or "unnamed"
 
 
+RANDOM: Final[ContextVar[random.Random]] = ContextVar("RANDOM", default=random.SystemRandom())  # noqa: B039
+"""Where names, pauses and lots come from: the system's, or, for each process of a simulation, one of its seed."""
+
+
 def new_instance() -> str:
     """A name for one life of a process or an RC: two holders of one liveliness key would hide each other."""
-    return secrets.token_hex(6)
+    return f"{RANDOM.get().getrandbits(48):012x}"
 
 
 def incarnation_of(instance: str) -> int:
@@ -227,6 +232,10 @@ class Keys:
         check_name(token.instance, "instance")
         name = check_rc(token.name) if token.role == Role.RC else check_name(token.name)
         return f"{self.base}/alive/{token.host}/{token.role}/{name}/{token.instance}"
+
+    def alive_rc(self, rc: str) -> str:
+        """Tokens of all instances of one RC."""
+        return f"{self.base}/alive/*/{Role.RC}/{check_rc(rc)}/*"
 
     def alive_any(self, role: str = "*") -> str:
         """Tokens of a role, or of all."""

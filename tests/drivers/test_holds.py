@@ -140,12 +140,13 @@ def test_only_an_rcm_that_is_obeyed_keeps_holds_alive(heard: Grants, refreshed: 
 
 
 @pytest.mark.parametrize(
-    ("read", "sharable", "now_holds", "presents"),
+    ("read", "carries", "now_holds", "presents"),
     [
         pytest.param(state(2, view(2)), False, [2], False, id="what is known"),
         pytest.param(state(2), False, [2], True, id="a snapshot alone ends nothing"),
         pytest.param(state(5, view(4)), False, [2], True, id="another holder: it is presented, not believed"),
-        pytest.param(state(5, view(4)), True, [2, 4], True, id="one more of a sharable RC"),
+        pytest.param(state(5, view(4)), True, [2, 4], True, id="one more, and the device carries both"),
+        pytest.param(state(5, view(2), view(4)), False, [2], True, id="one more than the device carries: presented"),
         pytest.param(state(5, view(2), view(4)), True, [2, 4], False, id="one that was missed"),
         pytest.param(state(5, view(2), view(4, rc="robot/y")), True, [2], False, id="a hold elsewhere"),
         pytest.param(state(1, view(1)), True, [2], False, id="an older snapshot"),
@@ -155,22 +156,22 @@ def test_only_an_rcm_that_is_obeyed_keeps_holds_alive(heard: Grants, refreshed: 
         pytest.param(state(1, view(9), term=Term(10**9, "x")), True, [2], False, id="of a term that is absurd"),
     ],
 )
-def test_read(read: RcmState, sharable: bool, now_holds: list[int], presents: bool) -> None:
+def test_read(read: RcmState, carries: bool, now_holds: list[int], presents: bool) -> None:
     rc = holding(HELD)
-    change = rc.apply_snapshot(read, NOW, sharable=sharable)
+    change = rc.apply_snapshot(read, NOW, lambda holders: carries)
     assert (grants(rc), change.announce) == (now_holds, presents)
     assert not change.removed
 
 
 def test_what_is_read_of_a_free_rc_is_held_whole() -> None:
     rc = holding()
-    change = rc.apply_snapshot(state(4, view(4, remaining=7)), NOW, sharable=False)
+    change = rc.apply_snapshot(state(4, view(4, remaining=7)), NOW)
     (told,) = rc.holders(NOW + SECOND)
     assert (told.client, told.params, told.remaining) == ("h/one", {"rate": Decimal(2)}, 6.0)
     assert [held.grant for held in change.began] == [told.grant]
     # What ended here is not taken up again, whoever believes in it.
     rc.apply_grants(said(5), NOW)
-    assert not rc.apply_snapshot(state(5, view(4)), NOW, sharable=False).began
+    assert not rc.apply_snapshot(state(5, view(4)), NOW).began
     assert not rc.apply_grants(said(6, holder(4)), NOW).began
     assert grants(rc) == []
 
@@ -188,7 +189,7 @@ def test_what_is_read_of_a_free_rc_is_held_whole() -> None:
 )
 def test_promises(term: Term, kept: bool) -> None:
     rc = holding(HELD)
-    assert rc.promise(term) is kept
+    assert rc.promise(term, NOW) is kept
     assert rc.term == (term if kept else TERM)
     assert grants(rc) == [2], "a promise ends nothing"
     # A lower term than the one promised is not obeyed again; the promised one begins with any number.
@@ -201,9 +202,22 @@ def test_promises(term: Term, kept: bool) -> None:
 
 
 def test_who_has_heard_of_nobody_promises_much_but_not_everything() -> None:
-    assert HoldTable(RC, hold_lease=LEASE).promise(Term(10**9, "x"))
-    assert not HoldTable(RC, hold_lease=LEASE).promise(Term(10**15, "x"))
+    assert HoldTable(RC, hold_lease=LEASE).promise(Term(10**9, "x"), NOW)
+    assert not HoldTable(RC, hold_lease=LEASE).promise(Term(2**52, "x"), NOW)
     assert HoldTable(RC, hold_lease=LEASE).term == NO_TERM
+
+
+def test_who_heard_no_rcm_for_the_hold_lease_or_must_follow_the_fleet_believes_a_far_jump() -> None:
+    far = Term(10**9, "x")
+    rc = holding(HELD)
+    assert not rc.promise(far, NOW + LEASE - 1)
+    assert rc.promise(far, NOW + LEASE)
+    rc = holding(HELD)
+    assert rc.promise(far, NOW, above=True)
+    assert not rc.promise(Term(2**52, "x"), NOW, above=True)
+    rc = holding(HELD)
+    rc.apply_grants(said(1, TWO, term=far), NOW + LEASE)
+    assert rc.term == far
 
 
 @pytest.mark.parametrize(
@@ -307,7 +321,7 @@ def test_a_grant_that_a_snapshot_names_is_not_refused_before_its_publication_com
     codes = []
     for step in (
         lambda: None,
-        lambda: rc.apply_snapshot(state(3, view(3, "h/two")), NOW, sharable=False),
+        lambda: rc.apply_snapshot(state(3, view(3, "h/two")), NOW),
         lambda: rc.apply_grants(said(3, holder(3, "h/two", place=2)), NOW),
         lambda: rc.apply_grants(said(4), NOW),
     ):

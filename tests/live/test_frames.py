@@ -194,7 +194,7 @@ async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
         )
         leader = await ZenohMesh.open(lab.fleet.name, Sender("leader", "node"), lab.fleet.mesh)
         stack.push_async_callback(leader.close)
-        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: None, lambda _: None)
+        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
         rcm.start(RecoveredState())
         stack.callback(rcm.stop)
         sources = {"video/ch1": one.url, "video/ch2": two.url}

@@ -25,7 +25,7 @@ def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(tmp_pat
             rc = await stand.rc("robot/real", Bench())
             client = await lab.client()
             leader = await ZenohMesh.open(lab.fleet.name, Sender("leader", "node"), lab.fleet.mesh)
-            rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: None, lambda _: None)
+            rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
             try:
                 # Both answered when they were asked; then one of them died, and nobody saw its token go.
                 ghost = RcState(rc="robot/ghost", host="h", instance="gone", sharable=False)

@@ -34,7 +34,9 @@ class Ledger:
     def will_move(self, core: Core, arc: ArcId, to: ClientId, renamed: ArcId) -> None:
         """The next batch will hand over `arc`."""
         self.requests[renamed] = replace(self.requests[arc], arc=renamed, client=to)
-        self._moves[renamed] = copy(core._state.running.get(arc) or core._state.queued[arc])
+        moving = core._state.arc(arc)
+        assert moving is not None
+        self._moves[renamed] = copy(moving)
         self._renamed[arc] = renamed
 
     def take(self, now: Ns, core: Core, effects: list[Effect]) -> None:

@@ -29,6 +29,7 @@ from zscout.scheduling.model import (
     Released,
     Requested,
     Tick,
+    Unconfirmed,
     Vote,
     VoteOverdue,
     WakeAt,
@@ -45,6 +46,7 @@ OPS = (
     "rc back",
     "rules",
     "rc ends",
+    "unconfirmed",
     "client lost",
     "hand over",
     "hand over all",
@@ -109,7 +111,7 @@ class Chaos:
     def do(self, op: str, pick: int) -> None:
         """One operation of `OPS`, on the `pick`-th of what it applies to; nothing if there is none."""
         running = sorted(self.core._state.running)
-        arcs = sorted([*running, *self.core._state.queued])
+        arcs = sorted([*running, *self.core._state.queued, *self.core._state.held_back])
         absent = [rc for rc in self.fleet if rc.name not in self.present]
         voters = [name for name in self.present if self.sharable[name]]
         answerable = self.waiting + self.late
@@ -139,6 +141,10 @@ class Chaos:
         elif op == "rc ends" and running:
             arc = running[pick % len(running)]
             self.send(RcReported(min(self.ledger.requests[arc].needs), ended=(arc,)))
+        elif op == "unconfirmed" and running:
+            held = self.core._state.running[running[pick % len(running)]]
+            assert held.hold is not None
+            self.send(Unconfirmed(held.id, held.hold.grant, (min(held.needs),)))
         elif op == "client lost":
             self.send(ClientLost(f"host/{pick % 3}"))
         elif op == "hand over" and arcs:
@@ -163,7 +169,9 @@ class Chaos:
         _, lead = old.as_events(term)
         joins = [RcJoined(name, self.sharable[name]) for name in self.present]
         self.send(*joins, lead)
-        assert self.ledger.open == before, "a change of RCM disturbed somebody"
+        # The next RCM does not know whose RCs did not confirm.
+        others = {arc: grant for arc, grant in self.ledger.open.items() if arc not in old._state.held_back}
+        assert others == before, "a change of RCM disturbed somebody"
 
     def settle(self) -> None:
         """All is well again: RCs are back, questions are answered (those overdue never), time goes on."""
@@ -171,22 +179,24 @@ class Chaos:
         self.late = []
         while self.to_ask:
             self.send(Requested(self.to_ask.pop()))
+        state = self.core._state
         for _ in range(MAX_SETTLING_STEPS):
+            waiting = [*state.queued.values(), *state.held_back.values()]
             if self.waiting:
                 self.send(self.vote(self.waiting.pop()))
-            elif not self.core._state.queued:
+            elif not waiting:
                 return
-            elif any(arc.request.keep and arc.past_min_runtime(self.now) for arc in self.core._state.running.values()):
-                kept = [arc for arc in self.core._state.running.values() if arc.past_min_runtime(self.now)]
+            elif any(arc.request.keep and arc.past_min_runtime(self.now) for arc in state.running.values()):
+                kept = [arc for arc in state.running.values() if arc.past_min_runtime(self.now)]
                 self.send(*[Released(arc.id) for arc in kept])
-            elif all(self.unservable(arc) for arc in self.core._state.queued.values()):
+            elif all(self.unservable(arc) for arc in waiting):
                 return
             else:
                 assert self.wake is not None, "somebody waits, and nothing is to happen"
                 self.now = max(self.now, self.wake)
                 self.send(Tick())
-        left = [arc.id for arc in self.core._state.queued.values() if not self.unservable(arc)]
-        raise AssertionError(f"never served: {left}, {[self.core._state.queued[arc].reason for arc in left]}")
+        left = {arc.id: arc.reason for arc in waiting if not self.unservable(arc)}
+        raise AssertionError(f"never served: {left}")
 
     def unservable(self, arc: Arc) -> bool:
         """Whether it needs an RC that is not there, or more than an RC can give to it alone."""

@@ -7,6 +7,7 @@
     vote N yes|no [REASON]                     overdue N
     rules RC            ended RC ARC,...
     standing ARC ... grant=TERM.N start=S      waiting ARC ...              for the `lead` that follows
+    adopt ARC ... grant=TERM.N start=S         place ARC TERM.N             unconfirmed ARC TERM.N RC,...
     lead TERM
 
 A NEED is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
@@ -22,6 +23,7 @@ from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
+    Adopted,
     ArcRequest,
     Cancelled,
     ClientLost,
@@ -32,6 +34,7 @@ from zscout.scheduling.model import (
     HandedOver,
     HoldEnded,
     LeadTaken,
+    PlaceShown,
     Propose,
     Queued,
     RcJoined,
@@ -41,6 +44,7 @@ from zscout.scheduling.model import (
     Released,
     Requested,
     Tick,
+    Unconfirmed,
     Vote,
     VoteOverdue,
     WakeAt,
@@ -81,12 +85,15 @@ class CorePlayer:
                 request, options = _request(rest)
                 return Requested(request, _place(options["place"]) if "place" in options else None)
             case "standing":
-                request, options = _request(rest)
-                start = ns(options["start"])
-                grant = Grant(*_place(options["grant"]))
-                place = _place(options["place"])
-                self.standing.append(RecoveredHold(request, place, grant, start, start + request.min_runtime))
+                self.standing.append(_held(rest))
                 return None
+            case "adopt":
+                return Adopted(_held(rest))
+            case "place":
+                return PlaceShown(first, _place(second))
+            case "unconfirmed":
+                grant, rcs = second.split()
+                return Unconfirmed(first, Grant(*_place(grant)), tuple(rcs.split(",")))
             case "waiting":
                 request, options = _request(rest)
                 self.waiting.append(Requested(request, _place(options["place"])))
@@ -121,6 +128,13 @@ class CorePlayer:
                 return Tick()
             case _:
                 raise ValueError(f"no such command: {verb}")
+
+
+def _held(text: str) -> RecoveredHold:
+    request, options = _request(text)
+    start = ns(options["start"])
+    grant, place = Grant(*_place(options["grant"])), _place(options["place"])
+    return RecoveredHold(request, place, grant, start, start + request.min_runtime)
 
 
 def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:

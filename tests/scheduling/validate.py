@@ -60,7 +60,12 @@ def _check_state(state: SchedulerState) -> None:
     by_pattern = {arc.id for arc in state.queued.values() if arc.patterns}
     assert by_pattern == state.by_pattern.keys(), "those queued by pattern are not those known"
     known = {arc.id for arcs in state._clients.values() for arc in arcs.values()}
-    assert known == state.queued.keys() | state.running.keys(), "the clients' ARCs are not those known"
+    assert not state.held_back.keys() & (state.queued.keys() | state.running.keys()), (
+        "an ARC is held back and considered"
+    )
+    assert known == state.queued.keys() | state.running.keys() | state.held_back.keys(), (
+        "the clients' ARCs are not those known"
+    )
 
 
 def _check_index(state: SchedulerState, index: QueueIndex) -> None:

@@ -10,6 +10,9 @@ from typing import Final
 _STARTS_IN: Final = "a notice carries its estimate, so that who waits need not ask for the fleet's state"
 _CONTEXT: Final = "the field's word for what a component is given; Stage is the same class. It is given by position"
 _WHY: Final = "what `reason` says in words, as data: no program need read English"
+_UNCONFIRMED: Final = "a grant that its RCs do not confirm is queued again at its place, instead of thrown away"
+_PLACE: Final = "a place is kept though the first question, without it, came late"
+_TERM: Final = "a client that promised a higher term tells a leader that has not heard of it"
 _TABLE1: Final = (
     "commands > zscout demo table1 > text > It starts three nodes with four devices and five programs on this machine,"
     " apart from every other fleet, for about 25 seconds, and records them. Nothing is left but the recording."
@@ -34,6 +37,12 @@ ADDED: Final[dict[str, str]] = {
     "python > what Client.request gives > attributes > why": _WHY,
     "live > status > .queue[].why": _WHY,
     "live > why waiter > .arcs[].why": _WHY,
+    "messages > zscout.Ask.v1 > fields > grant": _UNCONFIRMED,
+    "messages > zscout.Ask.v1 > fields > unconfirmed": _UNCONFIRMED,
+    "messages > zscout.Ask.v1 > fields > term": _TERM,
+    "python > what Client.request gives > attributes > unconfirmed": _UNCONFIRMED,
+    "python > what Client.request gives > attributes > shown": _PLACE,
+    "python > zscout.CommandRefused > attributes > rc": "which RC refused",
     _TABLE1 + "not all came in the order of Table 2; cells that are only late, on a busy machine, are named.": _LATE,
     "python > zscout.Held > methods > now": "the clock by which the hold ends, for bodies that keep a pace",
 }

@@ -4,7 +4,8 @@ The rules, all of them:
 
 - What an RCM publishes is ordered by (term, seq). Older than the newest received or promised: ignored. So
   is a term absurdly far above it: it would silence every RCM to come.
-- A publication that touches this RC lists all its holders from then on.
+- A publication that touches this RC lists all its holders from then on. If it names another instance of the RC, this
+  one holds nothing.
 - A gap, or a new term, means that something was missed: the RC reads `rcm/state` and presents its hold. A
   snapshot may add a hold that was missed; it ends nothing.
 - A command is obeyed only under exactly a grant that is held now, from the client that holds it.
@@ -15,13 +16,14 @@ The rules, all of them:
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
 from msgspec import structs
 
 from zscout.messages import EndedHold, Grants, Holder, Problem, RcmState, absurd
-from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
+from zscout.types import NO_TERM, SECOND, Grant, HostName, Ns, Term
 
 REMEMBERED = 64
 """Grants that ended lately, kept to say why a command under one of them is refused."""
@@ -48,6 +50,10 @@ class HoldChange:
     """Others hold the RC before and after."""
     reread: bool = False
     """Something was missed: read `rcm/state`."""
+    named: str | None = None
+    """The instance of this RC that the RCM means."""
+    named_host: HostName | None = None
+    """Its host, where that was said."""
     announce: bool = False
     """The RCM does not know what this RC holds, or is behind its term: publish its state."""
 
@@ -67,8 +73,8 @@ class HoldChange:
 
 
 class HoldTable:
-    def __init__(self, rc: str, *, hold_lease: Ns) -> None:
-        self.rc = rc
+    def __init__(self, rc: str, *, hold_lease: Ns, instance: str = "") -> None:
+        self.rc, self.instance = rc, instance
         self.hold_lease = hold_lease
         self.term: Term = NO_TERM
         """The newest term received or promised."""
@@ -92,6 +98,11 @@ class HoldTable:
         holders = grants.rcs.get(self.rc)
         if holders is None:
             return change
+        # An RCM that names none means whoever hears it.
+        change.named = grants.instances.get(self.rc, self.instance)
+        if change.named != self.instance:
+            self._end_all("another instance of this RC serves", change)
+            return change
         if len(holders) > 1 and not sharable:
             holders = [max(holders, key=lambda holder: holder.grant)]
             change.announce = True
@@ -107,10 +118,19 @@ class HoldTable:
                 self._begin(holder, change, now)
         return change
 
-    def apply_snapshot(self, state: RcmState, now: Ns, *, sharable: bool) -> HoldChange:
-        """Takes a snapshot: what was missed is added, what the snapshot does not know is announced."""
+    def apply_snapshot(
+        self, state: RcmState, now: Ns, carries: Callable[[Collection[Holder]], bool] = lambda _: False
+    ) -> HoldChange:
+        """Takes a snapshot: what was missed is added, what the snapshot does not know is announced.
+
+        It ends nothing, so what is still held here may be over: beside that only such a holder begins with whom the
+        device `carries` them all, and an exclusive one carries no second."""
         change = HoldChange()
         if not self._accept(state, change, now):
+            return change
+        change.named, change.named_host = state.instances.get(self.rc, (None, None))
+        if change.named not in (None, self.instance):
+            self._end_all("another instance of this RC serves", change)
             return change
         known = {view.grant for view in state.holds if self.rc in view.needs}
         change.announce = any(grant not in known for grant in self.held)
@@ -118,13 +138,14 @@ class HoldTable:
         for view in state.holds:
             if self.rc not in view.needs or view.grant in self.held or view.grant in self._ended:
                 continue
-            if self.held and not sharable:
-                change.announce = True
-                self._awaited.add(view.grant)
-                continue
             own: dict[str, Any] = {"rcs": sorted(view.needs), "params": view.needs[self.rc]}
             shared = {name: getattr(view, name) for name in Holder.__struct_fields__ if name not in own}
-            self._begin(Holder(**shared, **own), change, now)
+            holder = Holder(**shared, **own)
+            if self.held and not carries([*(held.holder for held in self.held.values()), holder]):
+                change.announce = True
+                self._awaited.add(view.grant)
+            else:
+                self._begin(holder, change, now)
         return change
 
     def _accept(self, update: Grants | RcmState, change: HoldChange, now: Ns) -> bool:
@@ -132,14 +153,22 @@ class HoldTable:
         if (update.term, update.seq) < (self.term, self.seq):
             change.announce = update.term < self.term
             return False
-        if absurd(update.term, self.term):
+        if not self.believes(update.term, now):
             return False
         self.term, self.seq, self.last_contact = update.term, update.seq, now
         return True
 
-    def promise(self, term: Term) -> bool:
-        """Obeys no lower term again. False: a higher one is known, or the jump is absurd."""
-        if term < self.term or absurd(term, self.term):
+    def believes(self, term: Term, now: Ns) -> bool:
+        """Whether `term` is no absurd jump."""
+        return not absurd(term, self.term, heard=self._heard(now))
+
+    def _heard(self, now: Ns) -> bool:
+        return now - self.last_contact < self.hold_lease
+
+    def promise(self, term: Term, now: Ns, *, above: bool = False) -> bool:
+        """Obeys no lower term again. False: a higher one is known, or the jump is absurd, unless the fleet must go
+        `above` one that an RC obeys already."""
+        if term < self.term or absurd(term, self.term, heard=self._heard(now) and not above):
             return False
         if term != self.term:
             self.term, self.seq = term, 0
@@ -167,8 +196,7 @@ class HoldTable:
 
     def fail(self, why: str) -> HoldChange:
         change = HoldChange()
-        for grant in list(self.held):
-            self._remove(grant, why, change, expired="failed")
+        self._end_all(why, change, expired="failed")
         return change
 
     # Commands
@@ -205,6 +233,10 @@ class HoldTable:
         self.held[holder.grant] = HoldEntry(holder, now + round(holder.remaining * SECOND))
         change.began.append(holder)
         change.stayed = len(self.held) > len(change.began)
+
+    def _end_all(self, why: str, change: HoldChange, expired: str | None = None) -> None:
+        for grant in list(self.held):
+            self._remove(grant, why, change, expired)
 
     def _remove(self, grant: Grant, why: str, change: HoldChange, expired: str | None = None) -> None:
         holder = self.held.pop(grant).holder

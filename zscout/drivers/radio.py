@@ -7,7 +7,6 @@ system there is a packet or two, and a halt sent now goes out now."""
 from __future__ import annotations
 
 import asyncio
-import random
 from collections import Counter, deque
 from collections.abc import Mapping
 from decimal import Decimal
@@ -20,7 +19,7 @@ from zscout.drivers.driver import Driver, RcHandle
 from zscout.drivers.packets import MAX_PACKET, HaltPacket, StopPacket, encode
 from zscout.drivers.serial_line import CLOSE_TIMEOUT, DEPTH, SerialLine
 from zscout.drivers.transmit_queue import TransmitQueue
-from zscout.keyexpr import Sender
+from zscout.keyexpr import RANDOM, Sender
 from zscout.mesh import Refused, Supervisor
 from zscout.mesh.supervision import done_within
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder
@@ -45,7 +44,7 @@ class RadioDriver(Driver):
         self._rate = line_rate(baud)
         self._bound = Fraction(str(bound))
         # Not 0: the last radio of these robots may have begun there.
-        self._air = TransmitQueue(self._rate, first_number=random.randrange(256))  # noqa: S311
+        self._air = TransmitQueue(self._rate, first_number=RANDOM.get().randrange(256))
         self._robots: dict[int, str] = {}
         """Which robot RC an id belongs to: the first that commanded it, while it is there."""
         self._down = "its line is not open yet"

@@ -8,12 +8,13 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 from typing import Any, TypeAlias
 
-from zscout import messages
+from zscout import messages, trace
 from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
+from zscout.drivers.instances import Instances, Standing
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.supervision import StallWatch
@@ -106,15 +107,20 @@ class ResourceController:
         on_failure: Callable[[Exception], object] = lambda _error: None,
     ) -> None:
         self.mesh, self.name, self.driver = mesh, name, driver
-        self.holds = HoldTable(name, hold_lease=round(hold_lease * SECOND))
         self.instance = new_instance()
+        self.holds = HoldTable(name, hold_lease=round(hold_lease * SECOND), instance=self.instance)
         self.rules = 0
         self.health = "ok"
         self.queue = WorkQueue()
         self.directory = RcDirectory(mesh) if driver.relays else None
         self.stall, self._on_failure = stall, on_failure
         self.supervisor = Supervisor(name, self._failed)
+        self.instances = Instances(mesh, name, self.instance, self.supervisor, self._on_standing, hold_lease=hold_lease)
         self._leaders: set[Token] = set()
+        self._is_open = False
+        """Whether its driver is."""
+        self._served: list[Declaration] = []
+        """What it answers, by its standing among the instances of this RC."""
         self._declared: list[Declaration] = []
         self._warm_at: Ns = 0
         self._reading: asyncio.Task[None] | None = None
@@ -128,6 +134,7 @@ class ResourceController:
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
         self._state = mesh.publisher(keys.rc_state(self.name), messages.RcState)
         self._declared.append(mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)))
+        self._declared.append(self.instances.watch())
         self._declared.append(mesh.subscribe(keys.grants, messages.Grants, guard(self._on_grants)))
         await asyncio.wait({self._read_state()})
         if self.directory is not None:
@@ -135,12 +142,28 @@ class ResourceController:
         await self.driver.open(self)
         self.supervisor.spawn(self._worker())
         self.supervisor.spawn(self._publish_figures())
-        self._declared.append(mesh.serve(keys.rc_state(self.name), messages.RcAsk, self._on_state_query))
-        if self.driver.sharable:
-            self._declared.append(mesh.serve(keys.vote(self.name), messages.Proposal, self._on_proposal))
-        command = keys.command_any(self.name)
-        self._declared.append(mesh.serve(command, messages.Command, self._on_command, depth=COMMAND_QUEUE))
+        self.instances.begin()
+        self._is_open = True
+        self._serve()
         self._declared.append(mesh.alive(Token(mesh.me.host, Role.RC, self.name, self.instance)))
+
+    def _serve(self) -> None:
+        for declared in self._served:
+            declared.close()
+        keys, mesh, standing = self.mesh.keys, self.mesh, self.instances.standing
+        self._served = []
+        if standing is not Standing.STANDS_BY:
+            self._served.append(mesh.serve(keys.rc_state(self.name), messages.RcAsk, self._on_state_query))
+        if standing is Standing.SERVES:
+            if self.driver.sharable:
+                self._served.append(mesh.serve(keys.vote(self.name), messages.Proposal, self._on_proposal))
+            command = keys.command_any(self.name)
+            self._served.append(mesh.serve(command, messages.Command, self._on_command, depth=COMMAND_QUEUE))
+
+    def _on_standing(self) -> None:
+        if self._is_open:
+            self._serve()
+            self.publish()
 
     async def stop(self) -> None:
         """Leaves the mesh and puts the device into its safe state; once, however often it is called."""
@@ -149,10 +172,12 @@ class ResourceController:
         await asyncio.shield(self._stopping)
 
     async def _stop(self) -> None:
-        for declared in reversed(self._declared):
+        self._is_open = False
+        for declared in (*self._served, *reversed(self._declared)):
             declared.close()
         await self.supervisor.close()
         await self._guard(self.driver.safe())
+        self._state.put(self._rc_state([], leaving=True))
         await self._guard(self.driver.close())
         self._state.close()
 
@@ -169,7 +194,10 @@ class ResourceController:
 
     def fail(self, why: str) -> None:
         self.health = why
-        self._apply(self.holds.fail(why))
+        change = self.holds.fail(why)
+        if change:
+            self._trace("end")
+        self._apply(change)
         self.publish()
 
     def recover(self) -> None:
@@ -185,17 +213,36 @@ class ResourceController:
         (self._leaders.add if alive else self._leaders.discard)(token)
 
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
-        self._apply(self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable))
+        before = self.holds.term, self.holds.seq
+        change = self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable)
+        if change or before != (self.holds.term, self.holds.seq):
+            self._trace("hear")
+        self._apply(change)
         if self._missed:
             self._read_state()
 
     def _on_state_query(self, query: IncomingQuery[messages.RcAsk]) -> None:
+        if query.message.above is None:
+            self._promise(query, above=False)
+        else:
+            self.supervisor.spawn(self._promise_above(query, query.message.above))
+
+    async def _promise_above(self, query: IncomingQuery[messages.RcAsk], host: str) -> None:
+        seen = await self.mesh.living(self.mesh.keys.alive_any(Role.CANDIDATE), timeout=REREAD_TIMEOUT)
+        try:
+            self._promise(query, above=any(token.host == host for token in seen))
+        except Refused as refused:
+            query.refuse(refused.problem)
+
+    def _promise(self, query: IncomingQuery[messages.RcAsk], *, above: bool) -> None:
         promise = query.message.promise
-        if promise is not None and not self.holds.promise(promise):
+        if promise is not None and not self.holds.promise(promise, self.mesh.now(), above=above):
             raise Refused("old_term", f"{self.name} obeys term {self.holds.term.counter}", self.holds.term)
+        if promise is not None:
+            self._trace("promise", promised=promise)
         query.answer(self._rc_state([]))
 
-    def _rc_state(self, ended: list[messages.EndedHold]) -> messages.RcState:
+    def _rc_state(self, ended: list[messages.EndedHold], *, leaving: bool = False) -> messages.RcState:
         # A leader counts while it publishes: its token outlives a program that hangs. Half a hold lease is longer than
         # a heartbeat, and leaves a successor time before holds end.
         heard = self.mesh.now() - self.holds.last_contact < self.holds.hold_lease // 2
@@ -213,6 +260,8 @@ class ResourceController:
             leader=heard and bool(self._leaders),
             capacity=self.driver.capacity(),
             figures=self.driver.figures(),
+            duplicate_of=self.instances.duplicate_of,
+            leaving=leaving,
         )
 
     def _on_proposal(self, query: IncomingQuery[messages.Proposal]) -> None:
@@ -259,6 +308,7 @@ class ResourceController:
             return await self.driver.command_without_grant(sender, command.do)
         if problem := self._refusal(query):
             raise Refused(problem.code, problem.message, problem.term)
+        self._trace("command", grant=command.grant)
         warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
         if command.do.get("name") == "confirm":
             return messages.Done(warming=warming)
@@ -320,6 +370,8 @@ class ResourceController:
             self.fail(f"its driver failed: {error}")
 
     def _apply(self, change: HoldChange) -> None:
+        if change.named is not None:
+            self.instances.take(change.named, change.named_host)
         if change:
             if change.began and change.interrupts:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
@@ -342,12 +394,15 @@ class ResourceController:
             replies = await self.mesh.ask(key, ask, messages.RcmState, timeout=REREAD_TIMEOUT, enough=self._is_current)
             # One absurd answer must not hide the true one.
             answers = (reply.message for reply in replies if reply.message is not None)
-            states = [state for state in answers if not messages.absurd(state.term, self.holds.term)]
+            states = [state for state in answers if self.holds.believes(state.term, self.mesh.now())]
             if not states:
                 break
             newest = max(states, key=lambda state: (state.term, state.seq))
             overtaken = (newest.term, newest.seq) < (self.holds.term, self.holds.seq)
-            self._apply(self.holds.apply_snapshot(newest, self.mesh.now(), sharable=self.driver.sharable))
+            change = self.holds.apply_snapshot(newest, self.mesh.now(), self._carries)
+            if not overtaken:
+                self._trace("read")
+            self._apply(change)
             # What was published while the answer was on its way may have hidden the very gap it was for.
             if not overtaken:
                 self._missed = False
@@ -357,10 +412,23 @@ class ResourceController:
             if problem := self._refusal(query):
                 query.refuse(problem)
 
+    def _carries(self, holders: Collection[messages.Holder]) -> bool:
+        proposed = [messages.ProposedHolder(one.id, one.arc, one.client, one.params) for one in holders]
+        try:
+            return self.driver.sharable and not self.driver.vote(proposed)
+        except ValueError:
+            return False
+
     def _is_current(self, reply: Reply[messages.RcmState]) -> bool:
         """Whether no other answer is needed: this one is of an RCM that is obeyed already."""
         state, holds = reply.message, self.holds
         return state is not None and state.term == holds.term and state.seq >= holds.seq
+
+    def _trace(self, do: str, **what: Any) -> None:
+        if trace.enabled():
+            known = {"rc": self.name, "instance": self.instance, "sharable": self.driver.sharable}
+            holds = sorted(self.holds.held)
+            trace.write(self.mesh.now(), do, **known, term=self.holds.term, seq=self.holds.seq, holds=holds, **what)
 
     def _set_timer(self) -> None:
         if self._timer is not None:
@@ -372,7 +440,10 @@ class ResourceController:
 
     def _expire(self) -> None:
         # After a stall of our own, what the RCM published meanwhile may wait in the inbox: it goes first.
-        self._apply(self.holds.expire(self.mesh.now(), lease=not self.stall.fresh()))
+        change = self.holds.expire(self.mesh.now(), lease=not self.stall.fresh())
+        if change:
+            self._trace("end")
+        self._apply(change)
 
     async def _publish_figures(self) -> None:
         while True:

@@ -45,13 +45,13 @@ class Supervisor:
         self._on_failure = on_failure
         self.active = True
         """Whether it neither failed nor was cancelled."""
-        self._tasks: set[asyncio.Task[Any]] = set()
+        self._tasks: dict[asyncio.Task[Any], None] = {}
         self._timers: WeakSet[asyncio.TimerHandle] = WeakSet()
 
     def spawn(self, coro: Coroutine[Any, Any, T], name: str | None = None) -> asyncio.Task[T]:
         """Runs `coro` as a task, cancelled before it starts if the supervisor is no longer active."""
         task = asyncio.create_task(coro, name=f"{self.name}: {name or getattr(coro, '__name__', 'task')}")
-        self._tasks.add(task)
+        self._tasks[task] = None
         task.add_done_callback(self._done)
         if not self.active:
             task.cancel()
@@ -114,7 +114,7 @@ class Supervisor:
         """Cancels all, and returns when all tasks have ended, but for the one that calls; after CLOSE_TIMEOUT
         those that still run are logged."""
         self.cancel()
-        tasks = self._tasks - {asyncio.current_task()}
+        tasks = self._tasks.keys() - {asyncio.current_task()}
         if tasks:
             _, stuck = await asyncio.wait(tasks, timeout=CLOSE_TIMEOUT)
             for task in stuck:
@@ -127,7 +127,7 @@ class Supervisor:
             self.fail(error)
 
     def _done(self, task: asyncio.Task[Any]) -> None:
-        self._tasks.discard(task)
+        self._tasks.pop(task, None)
         if not task.cancelled() and isinstance(error := task.exception(), Exception):
             self.fail(error)
 

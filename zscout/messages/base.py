@@ -22,7 +22,7 @@ MAX_STATE = 16_000_000
 """Bytes of one answer or publication, which may be about a whole fleet."""
 MAX_NEEDS = 64
 MAX_PARAMS = 16
-MAX_COUNTER = 10**12
+MAX_COUNTER = 2**52 - 1
 """A term whose counter is above this is rejected."""
 MAX_JUMP = 1_000_000
 """A term whose counter is this far above all that were received is an error, not an election."""
@@ -72,10 +72,10 @@ class Malformed(ValueError):
     """A payload that is not the message it should be; the text names what and where."""
 
 
-def absurd(term: Term, known: Term) -> bool:
-    """Whether `term` is too far above `known`, the newest received, to be accepted. Before the first one
-    (`NO_TERM`) any up to MAX_COUNTER is accepted: a fleet may be old."""
-    bound = MAX_COUNTER if known == NO_TERM else min(MAX_COUNTER, known.counter + MAX_JUMP)
+def absurd(term: Term, known: Term, *, heard: bool = True) -> bool:
+    """Whether `term` is too far above `known`, the newest received, to be accepted. Where no RCM that is believed is
+    `heard`, as before the first one (`NO_TERM`), any up to MAX_COUNTER is accepted: a fleet may be old."""
+    bound = min(MAX_COUNTER, known.counter + MAX_JUMP) if heard and known != NO_TERM else MAX_COUNTER
     return term.counter > bound
 
 

@@ -59,6 +59,9 @@ class RcAsk(Message, frozen=True):
     """Queries the state of an RC. With `promise`, an RC that answers obeys no lower term again."""
 
     promise: Term | None = None
+    above: str | None = None
+    """The host of the candidate that asks, where others were refused to it for a term far above: the jump is no reason
+    to refuse it then, if its token is seen."""
 
 
 class EndedHold(Message, frozen=True):
@@ -89,6 +92,10 @@ class RcState(Message, frozen=True):
     capacity: Amounts = {}
     figures: Figures = {}
     """Rates, drops, latency and the like of the device, by name; for people, they decide nothing."""
+    duplicate_of: str = ""
+    """For which other instance of the RC this one stands by, in words: it holds nothing and is not granted."""
+    leaving: bool = False
+    """Its device is in its safe state for good: another instance may be taken at once."""
 
 
 class FrameHead(Message, frozen=True):

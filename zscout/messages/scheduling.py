@@ -42,6 +42,15 @@ class Ask(_Wanted, frozen=True, tag_field="op", tag="request"):
     waited: Elapsed = 0.0
     estimate: bool = False
     """Whether notices are to carry `starts_in` while it is queued."""
+    term: Term | None = None
+    """What its client has promised, where an RCM of a lower term answered: that RCM steps down."""
+    grant: Grant | None = None
+    """What its client believes to hold, or did not enter. A later RCM that was never told of it answers `queued`."""
+    rcs: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
+    """The RCs of `grant`."""
+    unconfirmed: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
+    """Those of them that did not confirm it. If it is still in force, it is revoked, and the ARC is queued with its
+    place."""
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -169,7 +178,8 @@ class Revocation(_ArcParty, frozen=True):
 
 
 class Grants(Message, frozen=True):
-    """A publication of the leading RCM. For each RC touched, all its holders from now on.
+    """A publication of the leading RCM. For each RC touched, all its holders from now on, and the `instance` of it that
+    is meant: another one that hears this holds nothing.
 
     `prev` is the seq of the publication before: a receiver whose last one was another has missed some. Without `rcs`
     and `revoked` it is a heartbeat; one comes at least every `every` seconds."""
@@ -180,6 +190,7 @@ class Grants(Message, frozen=True):
     every: Seconds
     rcs: dict[str, list[Holder]] = {}
     revoked: list[Revocation] = []
+    instances: dict[str, str] = {}
 
 
 class StateAsk(Message, frozen=True):
@@ -237,7 +248,8 @@ class StoryLine(Message, frozen=True):
 
 
 class RcmState(Message, frozen=True):
-    """The state of the RCM. `seq` is the last that it published; `more` counts queued ARCs left out."""
+    """The state of the RCM. `seq` is the last that it published; `more` counts queued ARCs left out. `instances` has
+    the instance that is meant of each RC that is held, and its host."""
 
     term: Term
     seq: int
@@ -247,6 +259,7 @@ class RcmState(Message, frozen=True):
     rcs: list[RcView] = []
     story: list[StoryLine] = []
     more: int = 0
+    instances: dict[str, tuple[str, str]] = {}
 
 
 class OpenRequest(_Wanted, frozen=True):
@@ -255,6 +268,8 @@ class OpenRequest(_Wanted, frozen=True):
     place: Place | None = None
     waited: Elapsed = 0.0
     grant: Grant | None = None
+    rcs: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
+    """The RCs of `grant`."""
 
 
 class ClientRequests(Message, frozen=True):

@@ -19,9 +19,21 @@ from dataclasses import replace
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.keyexpr import is_pattern
 from zscout.scheduling import model
-from zscout.scheduling.model import QUANTUM, Arc, ArcState, ArcStatus, Hold, Outcome, Rc, RcStatus, Status
+from zscout.scheduling.model import (
+    HOLD_BACK,
+    MAX_HOLD_BACK,
+    QUANTUM,
+    Arc,
+    ArcState,
+    ArcStatus,
+    Hold,
+    Outcome,
+    Rc,
+    RcStatus,
+    Status,
+)
 from zscout.scheduling.priority import AdmissionCheck, Priority
-from zscout.scheduling.reason import Reason, ReasonCode
+from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
@@ -41,6 +53,8 @@ class Core:
         """How many batches of events were handled."""
         self._arrivals = 0
         self._effects: list[model.Effect] = []
+        self._over: set[Grant] = set()
+        """Grants of earlier terms that ended in this one."""
         self._wake: Ns | None = None
         self._run_again = False
         """Whether the strategy asked for another pass at once."""
@@ -59,6 +73,7 @@ class Core:
         self._effects = []
         self._run_again = False
         self._expire()
+        self._state.let_in()
         for event in events:
             self._apply(event)
         if self._state.queued:
@@ -71,10 +86,9 @@ class Core:
     def status(self, limit: int | None = None) -> Status:
         """The whole fleet as of the last batch, with the best-ranked `limit` of the queue (all: None)."""
         state = self._state
-        ranks = state.index.ranks[:limit]
         return Status(
             running=tuple(self._arc_status(arc) for arc in state.running.values()),
-            queued=tuple(self._arc_status(state.queued[rank[-1]]) for rank in ranks),
+            queued=tuple(map(self._arc_status, self._best_ranked(limit))),
             waiting=self.waiting,
             rcs=tuple(
                 RcStatus(name, rc.present, rc.sharable, tuple(rc.holders)) for name, rc in sorted(state.rcs.items())
@@ -86,13 +100,20 @@ class Core:
         arc = self._state.arc(arc_id)
         return None if arc is None else self._arc_status(arc)
 
+    def _best_ranked(self, limit: int | None) -> list[Arc]:
+        state = self._state
+        arcs = [state.queued[rank[-1]] for rank in state.index.ranks[:limit]]
+        if state.held_back:
+            arcs = sorted((*arcs, *state.held_back.values()), key=lambda arc: arc.rank)[:limit]
+        return arcs
+
     def is_queued(self, arc_id: ArcId) -> bool:
-        return arc_id in self._state.queued
+        return arc_id in self._state.queued or arc_id in self._state.held_back
 
     @property
     def waiting(self) -> int:
         """How many ARCs are queued."""
-        return len(self._state.queued)
+        return len(self._state.queued) + len(self._state.held_back)
 
     def holders(self, rc: RcName) -> list[ArcStatus]:
         """Who holds an RC."""
@@ -106,7 +127,8 @@ class Core:
     def at_place(self, place: Place) -> list[ArcId]:
         """The ARCs of this place: one, or more where clients claim the same after a takeover."""
         state = self._state
-        return [arc.id for arc in (*state.running.values(), *state.queued.values()) if arc.place == place]
+        arcs = (*state.running.values(), *state.queued.values(), *state.held_back.values())
+        return [arc.id for arc in arcs if arc.place == place]
 
     def could_have_issued(self, place: Place) -> bool:
         """Whether this core may have given out `place`; True for other terms, of which it does not know."""
@@ -121,7 +143,8 @@ class Core:
             for arc in state.running.values()
             if arc.hold is not None
         )
-        waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in state.queued.values())
+        queued = (*state.queued.values(), *state.held_back.values())
+        waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in queued)
         return joined, model.LeadTaken(term, recovered_holds, waiting)
 
     def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
@@ -166,6 +189,7 @@ class Core:
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
                 self._state.join(rc, sharable=sharable)
+                self._state.let_in(rc)
             case model.RcReported(rc, ended, rules_changed):
                 for arc in ended:
                     if arc in self._state.rc(rc).holders:
@@ -177,10 +201,16 @@ class Core:
             case model.ClientLost(client, reason):
                 for lost in self.arcs_of(client):
                     self._end_request(lost, Outcome.CLIENT_LOST, Reason(ReasonCode.CLIENT_LOST, detail=reason))
+            case model.PlaceShown(arc, place):
+                self._show_place(arc, place)
+            case model.Unconfirmed(arc, grant, rcs):
+                self._not_confirmed(arc, grant, rcs)
             case model.HandedOver(arc, to, renamed):
                 self._hand_over(arc, to, renamed)
             case model.LeadTaken():
                 self._take_lead(event)
+            case model.Adopted(held):
+                self._adopt(held)
             case model.Tick():
                 pass
 
@@ -223,6 +253,26 @@ class Core:
         self._state.leave(name)
         self._votes.forget_rc(name)
 
+    def _show_place(self, arc_id: ArcId, place: Place) -> None:
+        arc = self._state.queued.get(arc_id)
+        if arc is not None and place < arc.place:
+            self._state.dequeue(arc)
+            arc.place = place
+            arc.take(arc.request)
+            self._state.enqueue(arc, arc.since)
+
+    def _not_confirmed(self, arc_id: ArcId, grant: Grant, rcs: tuple[RcName, ...]) -> None:
+        """That hold ends, and no other. Its ARC keeps its place, and is held back, longer each time in a row."""
+        arc = self._state.running.get(arc_id)
+        if arc is None or arc.hold is None or arc.hold.grant != grant:
+            return
+        reason, times = of_rcs(ReasonCode.UNCONFIRMED, rcs), arc.unconfirmed
+        self._end_hold(arc, Outcome.LOST, reason)
+        if arc.id in self._state.queued:
+            arc.unconfirmed = times + 1
+            self._state.hold_back(arc, self._state.now + min(HOLD_BACK << min(times, 8), MAX_HOLD_BACK), rcs)
+            self.wait(arc, reason)
+
     def _hand_over(self, arc_id: ArcId, to: str, renamed: ArcId) -> None:
         arc, existing = self._state.arc(arc_id), self._state.arc(renamed)
         if arc is None or arc is existing:
@@ -256,27 +306,47 @@ class Core:
         self.term, self.seq, self._arrivals = lead.term, 0, 0
         # The newest grant is the truth where two claim one exclusive RC.
         for held in sorted(lead.recovered_holds, key=lambda held: held.grant, reverse=True):
-            if self._state.arc(held.request.arc) is not None:
-                continue
-            arc = self._new_arc(held.request, held.place)
-            if arc.patterns:
-                self._state.bind(arc, held.bound)
-            hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc))
-            absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
-            taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
-            over = held.end <= self._state.now
-            if not over or not (absent or taken):
-                self._state.enqueue(arc, self._state.now)
-            if absent or taken:
-                code = ReasonCode.RC_LOST if absent else ReasonCode.SUPERSEDED
-                reason = Reason(code, (*absent, *taken)[:1])
-                outcome = Outcome.COMPLETED if over and not arc.request.keep else Outcome.LOST
-                self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=not over))
-            else:
-                self._state.start(arc, hold)
+            if self._state.arc(held.request.arc) is None:
+                self._take_up(held)
         self._expire()
         for asked in lead.waiting:
             self._ask(asked)
+
+    def _adopt(self, held: model.RecoveredHold) -> None:
+        """An ARC that waits here under the same id is the one that holds."""
+        known = self._state.arc(held.request.arc)
+        # What this RCM granted and does not know any more it has ended.
+        over = held.grant in self._over or held.grant.term == self.term
+        if over or (known is not None and known.hold is not None):
+            return
+        if known is not None:
+            self._state.dequeue(known)
+            self._forget(known)
+            held = replace(held, place=min(known.place, held.place))
+        arc = self._take_up(held)
+        if arc.hold is not None and (arc.request.keep or not arc.past_min_runtime(self._state.now)):
+            self._effects.append(self._granted(arc, arc.hold))
+        self._expire()
+
+    def _take_up(self, held: model.RecoveredHold) -> Arc:
+        """A hold of an earlier term goes on, if all its RCs are there and free; else it ends, and its ARC is queued."""
+        arc = self._new_arc(held.request, held.place)
+        if arc.patterns:
+            self._state.bind(arc, held.bound)
+        hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc))
+        absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
+        taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
+        over = held.end <= self._state.now
+        if not over or not (absent or taken):
+            self._state.enqueue(arc, self._state.now)
+        if absent or taken:
+            code = ReasonCode.RC_LOST if absent else ReasonCode.SUPERSEDED
+            reason = Reason(code, (*absent, *taken)[:1])
+            outcome = Outcome.COMPLETED if over and not arc.request.keep else Outcome.LOST
+            self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=not over))
+        else:
+            self._state.start(arc, hold)
+        return arc
 
     def _expire(self) -> None:
         for arc in self._state.expired_arcs():
@@ -324,6 +394,7 @@ class Core:
         requeue = requeue and not arc.past_min_runtime(self._state.now)
         hold = self._state.stop(arc)
         self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))
+        arc.unconfirmed = 0
         if requeue:
             arc.preemptions += outcome is Outcome.PREEMPTED
             self._state.enqueue(arc, self._state.now)
@@ -347,12 +418,16 @@ class Core:
 
     def _revocation(self, arc: Arc, hold: Hold, outcome: Outcome, reason: Reason, *, requeued: bool) -> model.HoldEnded:
         self.number()
+        if hold.grant.term != self.term:
+            self._over.add(hold.grant)
         rcs = tuple(sorted(arc.needs))
         by = reason.by[0].arc if reason.by else None
         return model.HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
 
     def _set_wake(self) -> None:
-        at = self._state.next_end()
+        at = min((arc.held_back[0] for arc in self._state.held_back.values() if arc.held_back), default=None)
+        if (end := self._state.next_end()) is not None:
+            at = end if at is None else min(at, end)
         if self._state.queued:
             at = min(self._state.now + QUANTUM, at) if at is not None else self._state.now + QUANTUM
         if self._run_again:

@@ -21,6 +21,10 @@ from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place
 
 QUANTUM: Ns = SECOND
 """The paper's quantum: while anything waits, a pass runs at least this often."""
+HOLD_BACK: Final[Ns] = SECOND
+"""From a hold that was not confirmed to the next one of its ARC: twice as long each time in a row,"""
+MAX_HOLD_BACK: Final[Ns] = 30 * SECOND
+"""and at most."""
 
 Rank: TypeAlias = tuple[int, Ns, Place, ArcId]
 """Sorts contenders, best first: priority (negated), minimum runtime, place, id."""
@@ -83,6 +87,8 @@ class ArcState(StrEnum):
     """One RC alone keeps it out."""
     PARKED = "parked"
     """An RC that does not answer proposals keeps it out."""
+    HELD_BACK = "held_back"
+    """An RC did not confirm its last hold: it is not considered for a while."""
     RUNNING = "running"
     ENDED = "ended"
 
@@ -91,12 +97,13 @@ _CHECKED: Final = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.
 _LEAVES: Final = (ArcState.RUNNING, ArcState.ENDED)
 TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
     ArcState.NEW: (ArcState.READY,),
-    ArcState.READY: (*_CHECKED, *_LEAVES),
+    ArcState.READY: (*_CHECKED, ArcState.HELD_BACK, *_LEAVES),
     ArcState.VOTING: (*_CHECKED, *_LEAVES),
     ArcState.DEFERRED: (*_CHECKED, *_LEAVES),
     ArcState.WATCHING: (*_CHECKED, *_LEAVES),
     # It is made ready before it is checked.
     ArcState.PARKED: (ArcState.READY, *_LEAVES),
+    ArcState.HELD_BACK: (ArcState.READY, ArcState.ENDED),
     # Preempted, or an RC was lost: queued again.
     ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),
     ArcState.ENDED: (),
@@ -147,6 +154,10 @@ class Arc:
     """While VOTING or DEFERRED: bits of the RCs whose obstacle was off limits, so that it did not count."""
     watched: Rc | None = None
     """The RC that it is WATCHING."""
+    unconfirmed: int = 0
+    """How many of its holds in a row were not confirmed."""
+    held_back: tuple[Ns, tuple[RcName, ...]] | None = None
+    """While it is HELD_BACK: until when, and for which RCs."""
     starving: bool = False
     """Whether it has waited for too long (`reservations.py`)."""
     bound: Mapping[Need, RcName] = field(default_factory=dict)
@@ -306,6 +317,23 @@ class ClientLost:
 
 
 @dataclass(frozen=True, slots=True)
+class PlaceShown:
+    """A client shows the place that its ARC was given before; it has entered without."""
+
+    arc: ArcId
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class Unconfirmed:
+    """A client could not confirm a grant: these RCs know nothing of it, or do not answer."""
+
+    arc: ArcId
+    grant: Grant
+    rcs: tuple[RcName, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class HandedOver:
     """An ARC goes on in another client (migration), by the name `renamed`: same place; if it runs, same RCs,
     same end, new grant."""
@@ -332,6 +360,10 @@ class RecoveredHold:
         if patterns != self.bound.keys() or not all(matcher(need)(rc) for need, rc in self.bound.items()):
             raise ValueError(f"what ARC {self.request.arc} holds for its patterns is not told, or told wrong")
 
+    @property
+    def rcs(self) -> list[RcName]:
+        return [self.bound.get(need, need) for need in self.request.needs]
+
 
 @dataclass(frozen=True, slots=True)
 class LeadTaken:
@@ -340,6 +372,14 @@ class LeadTaken:
     term: Term
     recovered_holds: tuple[RecoveredHold, ...] = ()
     waiting: tuple[Requested, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Adopted:
+    """RCs have joined with a hold of an earlier term, which goes on if all of its gang have, unless this RCM has ended
+    it, or its ARC holds something newer."""
+
+    held: RecoveredHold
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,8 +397,11 @@ Event: TypeAlias = (
     | RcReported
     | RcLost
     | ClientLost
+    | PlaceShown
+    | Unconfirmed
     | HandedOver
     | LeadTaken
+    | Adopted
     | Tick
 )
 

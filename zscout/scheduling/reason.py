@@ -22,6 +22,8 @@ class ReasonCode(StrEnum):
     """`rcs` are held by `by`, one each, who are not preempted for it."""
     VETOED = "vetoed"
     """The RC refuses it beside those who hold it; `detail` in the RC's own words."""
+    UNCONFIRMED = "unconfirmed"
+    """`rcs` did not confirm a grant: it is not granted again for a while."""
     SILENT = "silent"
     """`rcs` do not answer proposals."""
     RESERVED = "reserved"
@@ -100,6 +102,7 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ),
     ReasonCode.VETOED: lambda one: f"{one.rcs[0]} refuses" + (f": {one.detail}" if one.detail else ""),
     ReasonCode.SILENT: lambda one: f"{_listed(one)} does not answer",
+    ReasonCode.UNCONFIRMED: lambda one: f"{_listed(one)} did not confirm the grant",
     ReasonCode.RESERVED: lambda one: (
         f"{one.rcs[0]} is kept for {one.by[0].name}, whose time to wait is over before this ends"
     ),

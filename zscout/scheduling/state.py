@@ -127,6 +127,8 @@ class SchedulerState:
         self.rcs: dict[RcName, Rc] = {}
         self.queued: dict[ArcId, Arc] = {}
         self.running: dict[ArcId, Arc] = {}
+        self.held_back: dict[ArcId, Arc] = {}
+        """ARCs that are queued, but not considered for a while."""
         self.present = 0
         """Bits of the RCs that are there."""
         self.sharable = 0
@@ -206,7 +208,7 @@ class SchedulerState:
         return rc.watchers[at], rc.bit, self.queued[rc.watchers[at][3]], rc
 
     def arc(self, arc: ArcId) -> Arc | None:
-        return self.running.get(arc) or self.queued.get(arc)
+        return self.running.get(arc) or self.queued.get(arc) or self.held_back.get(arc)
 
     def join(self, name: RcName, *, sharable: bool) -> None:
         rc = self.rc(name)
@@ -235,10 +237,27 @@ class SchedulerState:
 
     def dequeue(self, arc: Arc) -> None:
         """A queued ARC waits no more, and runs neither."""
+        if self.held_back.pop(arc.id, None) is not None:
+            arc.held_back = None
+            return
         del self.queued[arc.id]
         self.by_pattern.pop(arc.id, None)
         self._count_demand(arc, -1)
         self.index.remove(arc)
+
+    def hold_back(self, arc: Arc, until: Ns, rcs: tuple[RcName, ...]) -> None:
+        """A queued ARC is not considered before then, unless `let_in` lets it."""
+        self.dequeue(arc)
+        arc.move_to(ArcState.HELD_BACK)
+        arc.held_back = until, rcs
+        self.held_back[arc.id] = arc
+
+    def let_in(self, rc: RcName | None = None) -> None:
+        """Considers again who was held back until now, and for this RC."""
+        for arc in list(self.held_back.values()):
+            if arc.held_back is not None and (arc.held_back[0] <= self.now or rc in arc.held_back[1]):
+                self.dequeue(arc)
+                self.enqueue(arc, arc.since)
 
     def forget(self, arc: Arc) -> None:
         """An ARC that neither waits nor runs is over for good."""

@@ -228,19 +228,23 @@ def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_lat
 
 
 @pytest.mark.parametrize(
-    ("answers", "result"),
-    [(["not_yet", "stale", "not_yet", None], FIRST), (["not_yet", "ended"], "ended"), (["not_holder"], "not_holder")],
+    ("answers", "told"),
+    [
+        (["not_yet", "stale", "not_yet", None], None),
+        (["not_yet", "ended", None], (FIRST, ["robot/a"])),
+        (["not_holder", None], (FIRST, ["robot/a"])),
+        (["failed"], "failed"),
+    ],
 )
-def test_a_grant_is_confirmed_again_where_its_rc_has_not_heard_of_it_yet(
-    answers: list[str | None], result: Grant | str
-) -> None:
+def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(answers: list[str | None], told: Any) -> None:
     async def story() -> None:
         client = Client(
             cast("Mesh", SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)), default_fleet()
         )
-        known = arc()
+        known = arc("robot/a")
         known.take(runs({}), NOW)
         ended: list[OpenArc] = []
+        asked: list[Any] = []
 
         async def command(rc: str, *_: Any, **__: Any) -> None:
             if (code := answers.pop(0)) is not None:
@@ -249,14 +253,22 @@ def test_a_grant_is_confirmed_again_where_its_rc_has_not_heard_of_it_yet(
         async def end(given_up: OpenArc) -> None:
             ended.append(given_up)
 
-        client.command, client.end = command, end  # type: ignore[assignment,method-assign]
-        if isinstance(result, Grant):
-            assert await client.granted(known) == result
-            assert (answers, ended) == ([], [])
-        else:
-            with pytest.raises(CommandRefused, match=result):
+        async def submit(again: OpenArc) -> None:
+            assert (again.state, again.grant) == ("asking", None)
+            ask = again.ask(NOW)
+            asked.append((ask.grant, ask.unconfirmed))
+            again.take(runs({}, 3, SECOND_GRANT), NOW)
+            assert again.ask(NOW).unconfirmed == []
+
+        client.command, client.end, client._rcm.submit = command, end, submit  # type: ignore[assignment,method-assign]
+        if told == "failed":
+            with pytest.raises(CommandRefused, match="failed"):
                 await client.granted(known)
-            assert (answers, ended) == ([], [known])
+            assert (ended, asked) == ([known], [])
+        else:
+            assert await client.granted(known) == (FIRST if told is None else SECOND_GRANT)
+            assert (ended, asked) == ([], [] if told is None else [told])
+        assert answers == []
 
     asyncio.run(story())
 

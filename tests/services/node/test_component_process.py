@@ -6,6 +6,7 @@ import asyncio
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,13 @@ def play(
     async def run() -> ComponentProcess:
         start = StartComponent("c", 1, spec)
         process = ComponentProcess(
-            "h", rules, ControlGroups(folder), start, f"tests.behaviors.components.odd:{kind}", ends.append
+            "h",
+            rules,
+            time.monotonic_ns,
+            ControlGroups(folder),
+            start,
+            f"tests.behaviors.components.odd:{kind}",
+            ends.append,
         )
         process.begin(Supervisor("test", failures.append))
         async with asyncio.timeout(HANG):
@@ -109,7 +116,13 @@ def test_who_is_stopped_before_it_is_ready_ends(tmp_path: Path) -> None:
         fleet = default_fleet()
         start = StartComponent("c", 1, ComponentSpec("Never"))
         process = ComponentProcess(
-            "h", fleet, ControlGroups(tmp_path), start, "tests.behaviors.components.odd:Never", lambda _: None
+            "h",
+            fleet,
+            time.monotonic_ns,
+            ControlGroups(tmp_path),
+            start,
+            "tests.behaviors.components.odd:Never",
+            lambda _: None,
         )
         failures: list[Exception] = []
         process.begin(Supervisor("test", failures.append))
@@ -125,7 +138,9 @@ def test_who_is_stopped_before_it_is_ready_ends(tmp_path: Path) -> None:
 def test_the_last_word_of_who_has_left_counts_though_an_order_to_it_fails(tmp_path: Path) -> None:
     async def story() -> None:
         start, last = StartComponent("c", 1, ComponentSpec("counter")), EndReport("moved")
-        process = ComponentProcess("h", default_fleet(), ControlGroups(tmp_path), start, "x:y", lambda _: None)
+        process = ComponentProcess(
+            "h", default_fleet(), time.monotonic_ns, ControlGroups(tmp_path), start, "x:y", lambda _: None
+        )
         process._supervisor = Supervisor("test", lambda _: None)
         ours, theirs = socket.socketpair()
         code = (

@@ -55,6 +55,8 @@ class FakeRc:
     proposals: list[Proposal] = field(default_factory=list)
     asked: list[RcAsk] = field(default_factory=list)
     rules: int = 0
+    deaf: bool = False
+    """Whether it answers no question of its state."""
     unanswered: list[IncomingQuery[Proposal]] = field(default_factory=list)
 
     def start(self) -> None:
@@ -93,6 +95,8 @@ class FakeRc:
 
     def _on_asked(self, query: IncomingQuery[RcAsk]) -> None:
         self.asked.append(query.message)
+        if self.deaf:
+            return
         promise = query.message.promise
         if promise is not None and promise < self.term:
             raise Refused("old_term", f"obeys term {self.term.counter}", self.term)
@@ -196,7 +200,7 @@ class FakeFleet:
         """A leader without a candidate, on a host of its own."""
         mesh = self.mesh("leader")
         term = Term(counter, "rcm")
-        rcm = Rcm(mesh, self.fleet, term, self.newer.append, self.failures.append)
+        rcm = Rcm(mesh, self.fleet, term, lambda newer, _: self.newer.append(newer), self.failures.append)
         rcm.start(recovered or RecoveredState())
         return rcm
 

@@ -13,10 +13,13 @@ import pytest
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, Refusal
+from zscout.drivers.generic import ExclusiveDriver
+from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role
+from zscout.mesh.supervision import StallWatch
 from zscout.messages import Notice, OpenRequest, Release
 from zscout.services.rcm.candidate import BACKOFF, MAX_BACKOFF, Candidate
-from zscout.types import Term
+from zscout.types import SECOND, Term
 
 
 def open_request(notice: Notice) -> OpenRequest:
@@ -198,5 +201,35 @@ def test_a_term_that_is_over_asks_nothing_more() -> None:
         await asyncio.sleep(5)
         assert len(robot.asked) == count
         assert fleet.failures == []
+
+    run(story())
+
+
+@pytest.mark.parametrize("has_token", [True, False])
+def test_the_fleet_goes_above_the_term_that_an_rc_obeys_however_high(has_token: bool) -> None:
+    """But not at the word of who has no token."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1")
+        mesh = fleet.mesh("h2")
+        lease = fleet.fleet.timing.hold_lease / SECOND
+        stall = StallWatch(mesh.now).start()
+        robot = ResourceController(mesh, "robot/a", ExclusiveDriver(), hold_lease=lease, stall=stall)
+        await robot.start()
+        candidate = fleet.candidate("h1")
+        await until(lambda: candidate.rcm and candidate.rcm.core.status().rcs)
+        far = Term(10**9, "mad")
+        mad = fleet.rc("robot/b", term=far)
+        if not has_token:
+            mad.token.close()
+        if has_token:
+            await until(lambda: candidate.rcm is None)
+        await asyncio.sleep(5)
+        assert candidate.rcm is not None
+        joined = {one.name for one in candidate.rcm.core.status().rcs if one.present}
+        wanted = (far.counter + 1, {"robot/a", "robot/b"}) if has_token else (1, {"robot/a"})
+        assert (candidate.rcm.term.counter, joined) == wanted
+        assert robot.holds.term == candidate.rcm.term
+        await candidate.stop()
 
     run(story())

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from zscout.services.rcm.election import RETRY, SETTLE, TURN, Election
+from zscout.services.rcm.election import CALM, RETRY, SETTLE, TURN, Election
 from zscout.types import SECOND, Ns, Term
 
 SILENCE = 2 * SECOND
@@ -33,7 +33,7 @@ def heard(instance: str, now: Ns) -> Sight:
 
 
 def candidate(host: str, *, alive: bool = True) -> Sight:
-    return lambda seen: seen.candidate(host, alive=alive)
+    return lambda seen: seen.candidate(host, alive=alive, now=START)
 
 
 def failed(now: Ns) -> Sight:
@@ -118,7 +118,7 @@ def test_without_a_ranking_hosts_take_turns_by_name() -> None:
     for host in ("a", "b", "c"):
         seen = election(host, ranking=())
         for other in ("a", "b", "c"):
-            seen.candidate(other, alive=True)
+            seen.candidate(other, alive=True, now=START)
         turns[host] = seen.next_try(START)
     settled = START + SETTLE
     assert turns == {"a": settled, "b": settled + TURN, "c": settled + 2 * TURN}
@@ -134,3 +134,63 @@ def test_a_leader_counts_while_it_has_a_token_and_speaks() -> None:
     assert seen.sees_leader(LATER + SILENCE)
     seen.leader("x", alive=False, now=LATER + SILENCE)
     assert not seen.sees_leader(LATER + SILENCE)
+
+
+JITTER = 0.7
+
+
+def test_who_is_deposed_waits_twice_as_long_each_time_until_all_is_calm() -> None:
+    """While it hears of the other: it goes on speaking."""
+    seen, waits, at = election(), [], LATER
+    for _ in range(3):
+        seen.deposed(at, JITTER)
+        waited = at
+        while True:
+            seen.published(Term(7, "x"), waited)
+            if not seen.must_wait([False, False], [], waited, "a"):
+                break
+            waited += SECOND // 10
+        waits.append((waited - at) / SILENCE)
+        at = waited
+    assert waits == pytest.approx([JITTER, 2 * JITTER, 4 * JITTER], abs=0.06)
+    at += CALM + 1
+    seen.deposed(at, JITTER)
+    seen.published(Term(7, "x"), at + SILENCE)
+    assert not seen.must_wait([False], [], at + SILENCE, "a")
+
+
+@pytest.mark.parametrize(
+    ("others", "waits"),
+    [
+        pytest.param([False, False], False, id="and its leader is gone: at once"),
+        pytest.param([False, True, False], True, id="and an RC elsewhere still sees one"),
+    ],
+)
+def test_who_was_deposed_waits_only_for_a_leader_that_is_there(others: list[bool], waits: bool) -> None:
+    seen = election()
+    seen.deposed(LATER, JITTER)
+    assert seen.must_wait(others, [], LATER + SILENCE // 2, "a") == waits
+
+
+@pytest.mark.parametrize(
+    ("others", "own", "lost", "waits"),
+    [
+        pytest.param([True, True, False], [], [], True, id="most of them see a leader"),
+        pytest.param([True, False], [True, True], [], False, id="half of them do not, and its own do not count"),
+        pytest.param([], [True], [], True, id="only its own answer, and see one: once more a silence"),
+        pytest.param([], [False], [], False, id="only its own answer, and see none"),
+        pytest.param([], [], [], False, id="there are none"),
+        pytest.param([], [], ["a"], False, id="the leader's host has gone"),
+        pytest.param([], [], ["a", "c"], True, id="others have gone with the leader's: it may be this host"),
+    ],
+)
+def test_who_may_be_cut_off_waits(others: list[bool], own: list[bool], lost: list[str], waits: bool) -> None:
+    seen = election()
+    for host in ("a", "c"):
+        seen.candidate(host, alive=True, now=START)
+    for host in lost:
+        seen.candidate(host, alive=False, now=LATER)
+    assert seen.must_wait(others, own, LATER, "a") == waits
+    if not others:
+        # Nobody else will tell: it is as long as a leader may be silent.
+        assert not seen.must_wait(others, own, LATER + SILENCE, "a")

@@ -1,14 +1,22 @@
-"""What an RC reports, compared with what the RCM believes: what is lost, and what is published again."""
+"""RCs that join with holds of earlier terms, and what RCs report, compared with what the RCM believes."""
 
 from __future__ import annotations
 
-from zscout.messages import RcState
+import asyncio
+from decimal import Decimal
+from typing import Any
+
+import pytest
+
+from tests.mesh.kit import run, until
+from tests.services.rcm.kit import FakeFleet, FakeRc
+from zscout.messages import Holder, OpenRequest, RcState
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined, Requested
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rcm.membership import discrepancies
 from zscout.services.rcm.rcm import holders_of
-from zscout.types import SECOND, Term
+from zscout.types import SECOND, Grant, Place, Term
 
 RC = "robot/x"
 TERM = Term(1, "m")
@@ -41,3 +49,120 @@ def test_an_rc_that_presents_what_was_handed_over_has_not_heard_of_it_yet() -> N
     core.handle(NOW, HandedOver("h/one/id", "h/two", "h/two/id"))
     assert discrepancies(before, core.holders(RC), NOW, current=True) == ((), True)
     assert discrepancies(reports(core), core.holders(RC), NOW, current=True) == ((), False)
+
+
+HELD = Holder(
+    "tally",
+    "tally",
+    "desk/one",
+    grant=Grant(Term(4, "before"), 9),
+    place=Place(Term(4, "before"), 7),
+    rcs=["robot/a", "robot/b"],
+    min_runtime=Decimal(60),
+    remaining=50.0,
+)
+"""What robot/a and robot/b hold together since an earlier term."""
+BELIEVED: dict[str, Any] = {"grant": HELD.grant, "rcs": HELD.rcs, "place": HELD.place}
+"""What its client says of it when it asks again."""
+
+
+def holding(fleet: FakeFleet, name: str, **how: bool) -> FakeRc:
+    return fleet.rc(name, term=HELD.grant.term, holders=[HELD], **how)
+
+
+def test_rcs_that_join_one_after_the_other_keep_what_they_hold_together() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm(5)
+        client = fleet.client("one")
+        first = holding(fleet, "robot/a")
+        await until(lambda: first.asked)
+        await asyncio.sleep(0.1)
+        second = holding(fleet, "robot/b")
+        await fleet.joined(first, second)
+        assert (await client.ask("tally", *HELD.rcs, **BELIEVED)).grant == HELD.grant
+        assert [one.revoked for one in fleet.published] == [[]]
+        assert [holder.grant for holder in (*first.holders, *second.holders)] == [HELD.grant] * 2
+        assert rcm.core.waiting == 0
+
+    run(story())
+
+
+def test_without_one_of_its_rcs_a_hold_ends_by_name_and_keeps_its_place() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm(5)
+        client = fleet.client("one")
+        await fleet.joined(holding(fleet, "robot/a"))
+        await until(lambda: client.notices)
+        (revoked,) = fleet.published[-1].revoked
+        assert (revoked.grant, revoked.outcome) == (HELD.grant, "lost")
+        assert (client.notices[0].state, client.notices[0].grant) == ("queued", HELD.grant)
+        assert (await client.ask("tally", *HELD.rcs)).place == HELD.place
+
+    run(story())
+
+
+@pytest.mark.parametrize("hears_again", [0.5, None])
+def test_an_rc_that_answers_a_new_leader_late_keeps_the_hold_of_its_gang(hears_again: float | None) -> None:
+    """For a lease: then the RC that is seen and does not answer counts as gone."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1")
+        client = fleet.client("one")
+        client.open = [OpenRequest("tally", "tally", {rc: {} for rc in HELD.rcs}, 0, Decimal(60), **BELIEVED)]
+        first, late = holding(fleet, "robot/a"), holding(fleet, "robot/b", deaf=True)
+        candidate = fleet.candidate("h1")
+        await until(lambda: candidate.rcm)
+        # Its client is not told anything before it is known.
+        answer = asyncio.create_task(client.ask("tally", *HELD.rcs, **BELIEVED))
+        if hears_again is not None:
+            await asyncio.sleep(hears_again)
+            assert not answer.done()
+            late.deaf = False
+            await fleet.joined(first, late)
+            assert (await answer).grant == HELD.grant
+            assert [one.revoked for one in fleet.published if one.revoked] == []
+        else:
+            notice = await answer
+            assert (notice.state, notice.outcome, notice.place) == ("queued", "lost", HELD.place)
+            assert [one.grant for grants in fleet.published for one in grants.revoked] == [HELD.grant]
+        await candidate.stop()
+
+    run(story())
+
+
+def test_what_its_client_gave_up_is_not_carried_on_when_its_rcs_answer_late() -> None:
+    async def story() -> None:
+        fleet = FakeFleet("h1")
+        fleet.client("one")
+        first, late = holding(fleet, "robot/a"), holding(fleet, "robot/b", deaf=True)
+        candidate = fleet.candidate("h1")
+        await until(lambda: candidate.rcm)
+        late.deaf = False
+        await fleet.joined(first, late)
+        await until(lambda: not first.holders and not late.holders)
+        await candidate.stop()
+
+    run(story())
+
+
+def test_a_grant_that_was_answered_and_never_published_is_lost_before_any_vote() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm(5)
+        radio = fleet.rc("radio/rf0", accept=None)
+        await fleet.joined(radio)
+        client = fleet.client("one")
+        believed: dict[str, Any] = {"grant": HELD.grant, "rcs": ["radio/rf0"], "place": HELD.place}
+        notice = await client.ask("tally", "radio/rf0:5", **believed)
+        assert (notice.state, notice.outcome, notice.place) == ("queued", "lost", HELD.place)
+        await until(lambda: radio.unanswered)
+        radio.vote(True)
+        await until(lambda: client.notices)
+        granted = client.notices[-1].grant
+        assert granted is not None
+        assert granted > HELD.grant
+        assert (await client.ask("tally", "radio/rf0:5", grant=HELD.grant, rcs=["radio/rf0"])).grant == granted
+
+    run(story())

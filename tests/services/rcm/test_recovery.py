@@ -232,7 +232,7 @@ def test_an_rc_that_read_of_its_hold_in_a_snapshot_passes_on_its_binding() -> No
         bound={"robot/*": "robot/a"},
     )  # fmt: skip
     holding = HoldTable("robot/a", hold_lease=3 * SECOND)
-    holding.apply_snapshot(RcmState(TERM, 5, "h", [view]), NOW, sharable=False)
+    holding.apply_snapshot(RcmState(TERM, 5, "h", [view]), NOW)
     (held,) = recover([rc("robot/a", *holding.holders(NOW))], [], NOW).holds
     assert (held.request.needs, held.bound) == ({"robot/*": {}}, {"robot/*": "robot/a"})
 

@@ -8,7 +8,7 @@ import os
 import socket
 from collections.abc import Callable, Coroutine, Generator, Mapping
 from decimal import Decimal
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Final, Generic, Self, TypeVar
 
 from zscout import messages
 from zscout.behaviors.client.handover import MovableClient
@@ -19,7 +19,7 @@ from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_
 from zscout.mesh import Declaration, Mesh, ZenohMesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Done, Foresight, Notice, Problem, RcmState
-from zscout.types import SECOND, Grant, Term
+from zscout.types import SECOND, Grant, Ns, Term
 
 __all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "RequestRefused"]
 
@@ -29,6 +29,12 @@ CONFIRM_TIMEOUT = 1.0
 """Seconds within which all RCs of a grant must have confirmed it."""
 CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
 """Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
+NOT_CONFIRMED = CONFIRM_AGAIN | {"ended", "free", "not_holder", "wrong_client"}
+"""Refusals after which an ARC is queued again; others concern whoever asked for it."""
+
+
+RENEW_TOKEN: Final[Ns] = SECOND // 2
+"""A client that is dropped again after its token was renewed renews it no sooner."""
 
 
 class Client(MovableClient):
@@ -39,6 +45,9 @@ class Client(MovableClient):
         super().__init__(mesh, fleet, Supervisor(f"client {mesh.me}", self._failed))
         self._leaving: asyncio.Task[None] | None = None
         self._declared: list[Declaration] = []
+        self._token: Declaration | None = None
+        self._shown: Ns = 0
+        """When the present token was declared."""
 
     @classmethod
     def connect(
@@ -65,14 +74,26 @@ class Client(MovableClient):
     def start(self) -> Self:
         """Declares on the mesh what a client has; `connect` does so."""
         keys, mesh = self.mesh.keys, self.mesh
-        self._declared = [
-            mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice),
-            *self._rcm.start(),
-            mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance())),
-        ]
+        self._declared = [mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice), *self._rcm.start()]
+        self._store.ask_again = self._on_dropped
+        self._renew_token()
         self._supervisor.spawn(self._rcm.keep_asking())
         self._supervisor.spawn(self._rcm.watch_lease())
         return self
+
+    def _renew_token(self) -> None:
+        """Shows that this client lives, by a token that nobody can have taken for gone."""
+        mesh = self.mesh
+        token = mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance()))
+        if self._token is not None:
+            self._token.close()
+        self._token, self._shown = token, mesh.now()
+
+    def _on_dropped(self, arc: OpenArc) -> None:
+        # All that was dropped together is asked for with one token.
+        if self.mesh.now() - self._shown > RENEW_TOKEN:
+            self._renew_token()
+        self._supervisor.spawn(self._ask_again(arc))
 
     async def close(self) -> None:
         """Gives back everything and leaves the mesh."""
@@ -97,7 +118,7 @@ class Client(MovableClient):
         try:
             await self._supervisor.close()
         finally:
-            for declared in reversed(self._declared):
+            for declared in (*filter(None, [self._token]), *reversed(self._declared)):
                 declared.close()
             await self.mesh.close()
 
@@ -167,18 +188,23 @@ class Client(MovableClient):
                 return None
             if arc.state == "running" and arc.grant is not None:
                 grant = arc.grant
-                refusal = await self._confirm(arc, grant)
+                refusals = await self._confirm(arc, grant)
                 if arc.grant != grant:
                     continue
-                if refusal is None:
+                if not refusals:
                     return grant
-                log.warning("the grant of %s is given back: %s", arc.name, refusal)
-                await self.end(arc)
-                raise refusal
-            await self.changed(arc)
+                log.warning("the grant of %s is given back: %s", arc.name, refusals[0])
+                if other := [refused for refused in refusals if refused.code not in NOT_CONFIRMED]:
+                    await self.end(arc)
+                    raise other[0]
+                arc.not_confirmed([refused.rc for refused in refusals], str(refusals[0]), self.mesh.now())
+                self._store.notify(arc)
+                await self._rcm.submit(arc)
+            else:
+                await self.changed(arc)
 
-    async def _confirm(self, arc: OpenArc, grant: Grant) -> CommandRefused | None:
-        """Asks all RCs of a grant, side by side, whether they know of it."""
+    async def _confirm(self, arc: OpenArc, grant: Grant) -> list[CommandRefused]:
+        """Asks all RCs of a grant, side by side, whether they know of it. Returns those that do not say so."""
         deadline = self.mesh.now() + round(CONFIRM_TIMEOUT * SECOND)
 
         async def one(rc: str) -> CommandRefused | None:
@@ -197,7 +223,7 @@ class Client(MovableClient):
                 pause *= 2
 
         refusals = await asyncio.gather(*(one(rc) for rc in arc.rcs))
-        return next((refused for refused in refusals if refused is not None), None)
+        return [refused for refused in refusals if refused is not None]
 
     async def end(self, arc: OpenArc) -> None:
         """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed

@@ -38,7 +38,7 @@ class MovableClient:
     def __init__(self, mesh: Mesh, fleet: Fleet, supervisor: Supervisor) -> None:
         self.mesh, self.fleet, self._supervisor = mesh, fleet, supervisor
         self._store = RequestStore(mesh.now)
-        self._rcm = RcmLink(mesh, fleet, self._store)
+        self._rcm = RcmLink(mesh, fleet, self._store, supervisor)
         self.expected_came = asyncio.Event()
         """Set at the first notice of an ARC that is expected: from then on it is this client's."""
         self._unclaimed: dict[str, OpenArc] = {}

@@ -7,16 +7,15 @@ hold lease, holds end here as they do at their RCs.
 from __future__ import annotations
 
 import asyncio
-import random
 from typing import NoReturn
 
 import msgspec
 
 from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStore
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import Role, Token
+from zscout.keyexpr import RANDOM, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
-from zscout.mesh.supervision import StallWatch, done_within
+from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd
 from zscout.types import NO_TERM, SECOND, Ns, Term
 
@@ -26,7 +25,7 @@ ASK_AGAIN = 5.0
 BACKOFF = (0.05, 1.0)
 """Seconds before a query without an answer is repeated: first, and at most."""
 END_TRIES = 3
-TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full"})
+TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full", "old_term"})
 CHECKS_PER_LEASE = 10
 """How often within a hold lease a client checks whether an RCM published."""
 
@@ -41,11 +40,15 @@ class RcmLink:
     """Follows the RCM for one client, answers it when it takes the lead, and sends it what is requested
     and withdrawn."""
 
-    def __init__(self, mesh: Mesh, fleet: Fleet, store: RequestStore) -> None:
-        self.mesh, self.fleet, self.store = mesh, fleet, store
+    def __init__(self, mesh: Mesh, fleet: Fleet, store: RequestStore, supervisor: Supervisor) -> None:
+        self.mesh, self.fleet, self.store, self._supervisor = mesh, fleet, store, supervisor
         self.key = mesh.keys.schedule(mesh.me)
         self.term: Term = NO_TERM
         """The highest term received or promised; what is of an older one is ignored."""
+        self._unanswered = False
+        """Whether the last question had no answer at all."""
+        self._is_ahead = False
+        """Whether the last answer was of a lower term: its RCM is told."""
         self.leader_came = asyncio.Event()
         self._leaders: set[Token] = set()
         self._last_contact: Ns = mesh.now()
@@ -68,20 +71,38 @@ class RcmLink:
         """The host whose node leads, or None where no RCM is seen."""
         return next((token.host for token in sorted(self._leaders)), None)
 
-    def accept(self, term: Term) -> bool:
-        """Whether what is of `term` counts; the highest term is kept."""
-        if term < self.term or absurd(term, self.term):
+    def accept(self, term: Term, *, above: bool = False) -> bool:
+        """Whether what is of `term` counts; the highest term is kept. `above`: the fleet must go above one that an RC
+        obeys already."""
+        if term < self.term or absurd(term, self.term, heard=self._hears and not above):
             return False
         self.term = term
         return True
+
+    @property
+    def _hears(self) -> bool:
+        return self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease
 
     async def leader_within(self, seconds: float) -> bool:
         """Waits so long for a leader to appear since `leader_came` was cleared. False: none did."""
         return await done_within(seconds, self.leader_came.wait())
 
     def _on_requests(self, request: IncomingQuery[RcAsk]) -> None:
+        if request.message.above is None:
+            self._promise(request, above=False)
+        else:
+            self._supervisor.spawn(self._promise_above(request, request.message.above))
+
+    async def _promise_above(self, request: IncomingQuery[RcAsk], host: str) -> None:
+        seen = await self.mesh.living(self.mesh.keys.alive_any(Role.CANDIDATE), timeout=QUERY_TIMEOUT)
+        try:
+            self._promise(request, above=any(token.host == host for token in seen))
+        except Refused as refused:
+            request.refuse(refused.problem)
+
+    def _promise(self, request: IncomingQuery[RcAsk], *, above: bool) -> None:
         promise = request.message.promise
-        if promise is not None and not self.accept(promise):
+        if promise is not None and not self.accept(promise, above=above):
             raise Refused("old_term", f"this client obeys term {self.term.counter}", self.term)
         request.answer(ClientRequests(client=str(self.mesh.me), requests=self.store.open_requests()))
 
@@ -100,7 +121,7 @@ class RcmLink:
             now = self.mesh.now()
             # As at the RCs: an RCM that was replaced, or whose term is absurd, keeps no hold alive.
             terms = [one.term for _, one in self._published.each()]
-            if any(term >= self.term and not absurd(term, self.term) for term in terms):
+            if any(term >= self.term and not absurd(term, self.term, heard=self._hears) for term in terms):
                 # It may have published right after the last check.
                 self._last_contact = now - lease // CHECKS_PER_LEASE
             if now - self._last_contact < lease or self._stall.fresh():
@@ -133,27 +154,34 @@ class RcmLink:
             elif self.leader is None:
                 arc.reason = "no RCM is on the mesh; start zscout-node"
             self.store.notify(arc)
-            if not await self.leader_within(pause * random.uniform(0.8, 1.2)):  # noqa: S311
+            if not await self.leader_within(pause * RANDOM.get().uniform(0.8, 1.2)):
                 pause = min(longest, pause * 2)
 
     async def ask(self, arc: OpenArc) -> Problem | None:
         """Asks once, and applies the answer. Returns why it was refused, if it was."""
-        reply = await self.query(arc.ask(self.mesh.now()))
+        ask = arc.ask(self.mesh.now())
+        reply = await self.query(msgspec.structs.replace(ask, term=self.term) if self._is_ahead else ask)
+        self._unanswered = reply is None
         if reply is None:
             return None
+        self._is_ahead = reply.message is not None and reply.message.term < self.term
         if reply.message is not None and self.accept(reply.message.term):
             self.store.take(arc, reply.message)
         return reply.problem
 
     async def keep_asking(self) -> NoReturn:
         """Asks for all that is open again, and withdraws what was given up, at every change of RCM and every
-        few seconds."""
+        few seconds; sooner where the RCM did not answer."""
+        unanswered = False
         while True:
             self.leader_came.clear()
-            await self.leader_within(ASK_AGAIN * random.uniform(0.8, 1.2))  # noqa: S311
+            pause = BACKOFF[1] if unanswered and self.leader is not None else ASK_AGAIN
+            await self.leader_within(pause * RANDOM.get().uniform(0.8, 1.2))
+            unanswered = False
             for arc in self.store.open:
                 if arc.open and self.store.resumed.is_set():
                     problem = await self.ask(arc)
+                    unanswered |= self._unanswered
                     if problem is not None and problem.code not in TRY_AGAIN and arc.state == "queued":
                         # It will be refused each time, though an earlier RCM took it.
                         self.store.withdrawn[arc.id] = Cancel(id=arc.id)
@@ -162,6 +190,7 @@ class RcmLink:
                         self.store.forget(arc)
             for request_id in list(self.store.withdrawn):
                 if not await self._withdraw(request_id):
+                    unanswered = True
                     break
 
     async def end(self, arc: OpenArc) -> None:

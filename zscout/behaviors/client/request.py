@@ -31,7 +31,7 @@ class CommandRefused(Exception):
 
     def __init__(self, rc: str, problem: Problem) -> None:
         super().__init__(f"{rc}: {problem.message}")
-        self.code = problem.code
+        self.rc, self.code = rc, problem.code
 
 
 class HoldEnd(NamedTuple):
@@ -79,8 +79,12 @@ class OpenArc:
     """When `state` began."""
     waits_since: Ns | None = None
     """When it was last queued: its present wait began then, whichever RCM leads."""
+    unconfirmed: tuple[Grant, list[str]] | None = None
+    """The grant that some of its RCs did not confirm, and which, until the RCM has answered that."""
     ending: HoldEnd | None = None
     """How the last hold ended; `outcome` and `reason` are of the newest notice, whatever it is about."""
+    shown: Term = NO_TERM
+    """In which term its place was shown last, to an RCM that had given a worse one."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
 
@@ -106,7 +110,7 @@ class OpenArc:
             return False
         if (bound := self._binding(notice)) is None:
             return False
-        self.last = (notice.term, notice.step)
+        self.last, self.unconfirmed = (notice.term, notice.step), None
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
         if notice.state != "running":
@@ -118,7 +122,7 @@ class OpenArc:
         self.outcome, self.by = notice.outcome, notice.by
         self.ahead = notice.ahead
         self.start = None if notice.starts_in is None else now + round(notice.starts_in * SECOND)
-        if notice.place is not None:
+        if notice.place is not None and (self.place is None or notice.place < self.place):
             self.place = notice.place
         if notice.state == "running":
             self.grant = notice.grant
@@ -149,11 +153,28 @@ class OpenArc:
         self.state, self.reason, self.outcome, self.since = "asking", reason, "lost", now
         self.why = None
 
+    def not_confirmed(self, rcs: list[str], reason: str, now: Ns) -> None:
+        """These RCs do not confirm its grant: it is not entered, and the RCM is to queue it again."""
+        assert self.grant is not None  # noqa: S101 - what is not confirmed was granted
+        self.unconfirmed = self.grant, rcs
+        self.lose(reason, now)
+
     def finish(self, outcome: str, reason: str, now: Ns) -> None:
         """The request is over by the client's own judgement."""
         self._close(HoldEnd(outcome, reason), now)
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
         self.why = None
+
+    def shows_place(self, notice: Notice) -> bool:
+        """Whether the RCM is to be shown its place, once in a term: it gave a worse one, to a question from before."""
+        if notice.state != "queued" or notice.place is None or notice.place == self.place:
+            return False
+        shown, self.shown = self.shown, notice.term
+        return shown != notice.term
+
+    def reopen(self, now: Ns) -> None:
+        """It ended because this client seemed gone, which lives: it is asked for again, at its place."""
+        self.state, self.since, self.why = "asking", now, None
 
     def take_first(self, notice: Notice, now: Ns) -> bool:
         """Applies the first notice of an expected request. False if it is none: an old one, or not credible."""
@@ -177,13 +198,14 @@ class OpenArc:
         self.why = None
 
     def ask(self, now: Ns) -> Ask:
-        return Ask(**self._as_asked(now), estimate=self.estimate)
+        grant, unconfirmed = self.unconfirmed or (self.grant, [])
+        return Ask(**self._as_asked(now, grant), estimate=self.estimate, unconfirmed=unconfirmed)
 
     def open_request(self, now: Ns) -> OpenRequest:
         """As it is reported to an RCM that takes the lead."""
-        return OpenRequest(**self._as_asked(now), grant=self.grant)
+        return OpenRequest(**self._as_asked(now, self.grant))
 
-    def _as_asked(self, now: Ns) -> dict[str, Any]:
+    def _as_asked(self, now: Ns, grant: Grant | None) -> dict[str, Any]:
         since = now if self.waits_since is None or self.grant is not None else self.waits_since
         return {
             "id": self.id,
@@ -194,6 +216,8 @@ class OpenArc:
             "keep": self.keep,
             "place": self.place,
             "waited": max(0, now - since) / SECOND,
+            "grant": grant,
+            "rcs": self.rcs if grant is not None else [],
         }
 
 
@@ -222,6 +246,8 @@ class RequestStore:
         self.resumed = asyncio.Event()
         """Not set while the client is paused."""
         self.resumed.set()
+        self.ask_again: Callable[[OpenArc], object] = lambda _: None
+        """Called with what the RCM dropped because this client seemed gone, or has at a worse place than it had."""
         self.watchers: list[Callable[[OpenArc], None]] = []
         """Each is called with whatever there is news of."""
 
@@ -274,6 +300,11 @@ class RequestStore:
             self.reclaim(arc)
         elif arc.take(notice, self._now()):
             self.reclaimed.discard(arc.id)
+            if not arc.open and arc.outcome == "client_lost":
+                arc.reopen(self._now())
+                self.ask_again(arc)
+            elif arc.shows_place(notice):
+                self.ask_again(arc)
             self.notify(arc)
             if not arc.open:
                 self.forget(arc)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import traceback
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import closing
-from typing import Final
+from typing import Any, Final
 
 from zscout import messages
 from zscout.behaviors.client.client import Client
@@ -40,10 +40,15 @@ SUPERSEDED: Final = 0.5
 
 
 class ComponentLifecycle:
-    """Runs the component of `job`. `report` sends one to the node, waited for or not."""
+    """Runs the component of `job`. `report` sends one to the node, waited for or not; `connect` is `Client.connect`."""
 
-    def __init__(self, job: ComponentJob, report: Callable[[channel.ComponentReport], asyncio.Future[None]]) -> None:
-        self._job, self._report = job, report
+    def __init__(
+        self,
+        job: ComponentJob,
+        report: Callable[[channel.ComponentReport], asyncio.Future[None]],
+        connect: Callable[..., Coroutine[Any, Any, Client]] = Client.connect,
+    ) -> None:
+        self._job, self._report, self._connect = job, report, connect
         self._story: asyncio.Task[EndReport] | None = None
         self._wanted: EndReport | None = None
         """How it is to end, once something wants it to."""
@@ -53,6 +58,7 @@ class ComponentLifecycle:
         self._holding = asyncio.Lock()
         self._move: OutgoingMove | None = None
         self._running = False
+        self._instance = f"{job.start.incarnation}-{new_instance()}"
         self._restored = asyncio.Event()
         self._activated = asyncio.Event()
         self._left = asyncio.Event()
@@ -116,7 +122,7 @@ class ComponentLifecycle:
 
     async def _run_story(self) -> EndReport:
         job = self._job
-        connecting = asyncio.create_task(Client.connect(job.client, fleet=job.fleet, host=job.host))
+        connecting = asyncio.create_task(self._connect(job.client, fleet=job.fleet, host=job.host))
         # It joins the mesh in a thread: what follows is done meanwhile.
         await asyncio.sleep(0)
         try:
@@ -159,8 +165,7 @@ class ComponentLifecycle:
 
     async def _perform(self, client: Client, component: Component, movable: bool) -> EndReport:
         start, host = self._job.start, self._job.host
-        instance = f"{start.incarnation}-{new_instance()}"
-        token: Declaration = client.mesh.alive(Token(host, Role.COMPONENT, start.component, instance))
+        token: Declaration = client.mesh.alive(Token(host, Role.COMPONENT, start.component, self._instance))
         self._running = True
         try:
             # Not waited for: nothing comes between this and its first step.
@@ -257,7 +262,8 @@ class ComponentLifecycle:
             return
         if self._move is not None and incarnation == self._move.incarnation:
             self._move.successor_runs.set()
-        elif incarnation > self._job.start.incarnation:
+        # Two placers that did not see each other may have given the same number.
+        elif (incarnation, token.instance) > (self._job.start.incarnation, self._instance):
             ends = EndReport("superseded", f"incarnation {incarnation} runs on {token.host}")
             self._away = self._away or ends
             self.end(ends)

@@ -31,6 +31,12 @@ class DefaultGroup(click.Group):
         return super().parse_args(ctx, args if named else [self.default, *args])
 
 
+def seed_option(default: str, help: str, most: int | None = None) -> Callable[[F], F]:  # noqa: A002
+    """`--seed A|A-B`: one, or those from A to B."""
+    seeds = Parsed("text", lambda text, _option: parse_seeds(text if "-" in text else f"{text}-{text}", most, "--seed"))
+    return click.option("--seed", "seeds", metavar="A|A-B", type=seeds, default=default, help=help)
+
+
 def seeds_option(default: str, help: str, most: int | None = None) -> Callable[[F], F]:  # noqa: A002 - click's word
     """`--seeds N|A-B`, no more than `most`."""
     seeds = Parsed("text", lambda text, _option: parse_seeds(text, most))
@@ -65,19 +71,19 @@ def jobs_option(command: F) -> F:
     )(command)
 
 
-def parse_seeds(text: str, most: int | None = None) -> range:
+def parse_seeds(text: str, most: int | None = None, option: str = "--seeds") -> range:
     """`20` is 0 to 19, `5-9` is 5 to 9; no more than `most`. Raises BadInput."""
     found = re.fullmatch(r"(?:(\d{1,7})-)?(\d{1,7})", text)
     if found is None:
-        raise BadInput(f"--seeds {quoted(text)}: write how many, as in 20, or from which to which, as in 5-9")
+        raise BadInput(f"{option} {quoted(text)}: write how many, as in 20, or from which to which, as in 5-9")
     first, last = int(found[1] or 0), int(found[2])
     seeds = range(first, last + 1) if found[1] else range(last)
     if not seeds:
-        raise BadInput(f"--seeds {quoted(text)} is no seed at all; write at least 1, or the smaller one first")
+        raise BadInput(f"{option} {quoted(text)} is no seed at all; write at least 1, or the smaller one first")
     if seeds[-1] > MAX_SEED:
-        raise BadInput(f"--seeds {quoted(text)}: a seed is at most {MAX_SEED}")
+        raise BadInput(f"{option} {quoted(text)}: a seed is at most {MAX_SEED}")
     if most is not None and len(seeds) > most:
-        raise BadInput(f"--seeds: {len(seeds)} are more than {most}; ask for fewer")
+        raise BadInput(f"{option}: {len(seeds)} are more than {most}; ask for fewer")
     return seeds
 
 

@@ -2,7 +2,10 @@
 
 What it does like Zenoh is what `tests/mesh/both_meshes.py` lets tests try on both. Links behave like TCP with a lease:
 what is sent arrives in order; over a link that is cut, or to or from a frozen process, it waits; after
-`lease` seconds of that both sides give the link up, and see each other's tokens die, until it works again."""
+`lease` seconds of that both sides give the link up, and see each other's tokens die, until it works again.
+
+Messages of a kind may be disturbed besides: lost, late, repeated, or answered with an old answer; and a link that comes
+back may do so without some of what was declared (`Disturbance`, `MemoryNetwork.forgetful`)."""
 
 from __future__ import annotations
 
@@ -11,13 +14,17 @@ import itertools
 import random
 import weakref
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextvars import Context
+from dataclasses import dataclass
 from functools import lru_cache
+from heapq import heappop, heappush
 from typing import Any, Final
 
 import zenoh
 
 from zscout.keyexpr import Keys, Sender
+from zscout.lab.faults.virtual_time import PROCESS, VirtualTimeLoop
 from zscout.mesh import Mesh, MeshError
 from zscout.mesh.transport import Collector, OnSample, Quality, Transport, TransportPublisher, TransportQuery, Undeclare
 from zscout.types import SECOND, Ns
@@ -26,6 +33,22 @@ from zscout.types import SECOND, Ns
 @lru_cache(1 << 16)
 def intersects(one: str, other: str) -> bool:
     return one == other or zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other))
+
+
+_NETWORK: Final = Context()
+"""Of the network's own timers: they belong to no process, and its clock is virtual time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """How likely a message is lost, comes twice, or comes up to `by` seconds later, overtaken by others; of an answer:
+    that it is the one before it on the same key."""
+
+    lost: float = 0.0
+    twice: float = 0.0
+    late: float = 0.0
+    by: float = 0.0
+    old: float = 0.0
 
 
 class MemoryMesh(Mesh):
@@ -53,6 +76,10 @@ class MemoryNetwork:
         self.delay, self.lease = delay, lease
         self.random = random.Random(seed)  # noqa: S311 - what failed once must fail again
         self.nodes: list[MemoryTransport] = []
+        self.trace: Callable[[str, str, str, tuple[Any, ...]], None] | None = None
+        """Told of each message that arrives: from which process to which, its kind, and what it is."""
+        self.forgetful = 0.0
+        """How likely each declaration stays unknown to a peer whose link comes back, until it is lost again."""
         self._links: dict[tuple[MemoryTransport, MemoryTransport], MemoryLink] = {}
 
     def open(self, fleet: str, me: Sender) -> MemoryMesh:
@@ -61,6 +88,18 @@ class MemoryNetwork:
         for other in self.nodes:
             self._connect(node, other)
         return MemoryMesh(node, Keys(fleet), me, node.now)
+
+    def cut_where(self, is_cut: Callable[[str, str], bool]) -> None:
+        """Of all links those are cut for which that is true of the names of both processes."""
+        for link in self._links.values():
+            link.cut = link.source is not link.target and is_cut(str(link.source), str(link.target))
+        self._changed()
+
+    def disturb(self, disturbed: Mapping[str, Disturbance]) -> None:
+        """From now on, on all links but those of a process with itself."""
+        for link in self._links.values():
+            link.disturbed = {} if link.source is link.target else disturbed
+            link.answers.clear()
 
     def link(self, source: Mesh, target: Mesh) -> MemoryLink:
         """What carries messages from `source` to `target`: its delays and losses may be set."""
@@ -86,12 +125,18 @@ class MemoryNetwork:
         self._changed()
 
     def freeze(self, mesh: Mesh) -> None:
-        """Nothing reaches or leaves `mesh` until `thaw`: what arrives waits. (Its own tasks run on.)"""
-        _node(mesh).frozen = True
+        """Nothing reaches or leaves `mesh` until `thaw`: what arrives waits. Its process stands still."""
+        node = _node(mesh)
+        node.frozen = True
+        if node.process is not None:
+            node.process.stop()
         self._changed()
 
     def thaw(self, mesh: Mesh) -> None:
-        _node(mesh).frozen = False
+        node = _node(mesh)
+        node.frozen = False
+        if node.process is not None:
+            node.process.go_on()
         self._changed()
 
     def kill(self, mesh: Mesh) -> None:
@@ -101,7 +146,10 @@ class MemoryNetwork:
         _node(mesh).leave()
 
     def remove(self, node: MemoryTransport) -> None:
-        # What is under way is kept by the timers of its links.
+        # What is under way is kept by the timers of its links; over one that is blocked nothing comes any more.
+        for link in self._links.values():
+            if link.source is node and link.blocked and not link.lost:
+                link.call_in(self.lease, link.target.call, link.target.disconnected, node)
         self.nodes.remove(node)
         self._links = {ends: link for ends, link in self._links.items() if node not in ends}
         self.match()
@@ -121,9 +169,11 @@ class MemoryNetwork:
     def _connect(self, one: MemoryTransport, other: MemoryTransport) -> None:
         for source, target in dict.fromkeys([(one, other), (other, one)]):
             link = self.between(source, target)
-            link.lost = False
+            back, link.lost = link.lost, False
+            link.hidden = {one for one in source.declarations() if back and self.random.random() < self.forgetful}
             for token in source.declared:
-                link.send(target.on_token, source, token, True)
+                if token not in link.hidden:
+                    link.send(target.on_token, source, token, True)
         self.match()
 
     def _changed(self) -> None:
@@ -133,7 +183,7 @@ class MemoryNetwork:
                 continue
             if link.blocked:
                 if link.expiry is None and not link.lost:
-                    link.expiry = link.loop.call_later(self.lease, self._expire, link, back)
+                    link.expiry = link.call_in(self.lease, self._expire, link, back)
             else:
                 if link.expiry is not None:
                     link.expiry.cancel()
@@ -152,7 +202,7 @@ class MemoryNetwork:
                 link.send(link.target.disconnected, link.source, last=True)
             else:
                 link.queue.clear()
-                link.target.disconnected(link.source)
+                link.target.call(link.target.disconnected, link.source)
         self.match()
 
 
@@ -167,30 +217,57 @@ class MemoryLink:
         self.cut = False
         self.lost = False
         """Whether it was blocked for longer than the lease: there is no link then."""
+        self.disturbed: Mapping[str, Disturbance] = {}
+        """By kind of message, see `kind_of`."""
+        self.hidden: set[object] = set()
+        """What the source has declared and the target does not know."""
+        self.answers: dict[str, bytes] = {}
+        """The last answer on each key, while answers are disturbed."""
         self.expiry: asyncio.TimerHandle | None = None
-        self.queue: deque[tuple[float, Callable[..., None], tuple[Any, ...]]] = deque()
-        self._random = network.random
+        self.queue: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
+        self._last = 0.0
+        """When what was sent last is due: what comes in order comes no sooner."""
+        self._numbers = itertools.count()
+        self._random, self.trace = network.random, network.trace
         self._timer: asyncio.TimerHandle | None = None
 
     @property
     def blocked(self) -> bool:
         return self.cut or self.source.frozen or self.target.frozen
 
-    def send(self, call: Callable[..., None], *args: Any, last: bool = False) -> None:
+    def call_in(self, seconds: float, call: Callable[..., None], *args: Any) -> asyncio.TimerHandle:
+        return self.loop.call_at(self.loop.now + seconds, call, *args, context=_NETWORK)
+
+    def chance(self, probability: float) -> bool:
+        return probability > 0 and self._random.random() < probability
+
+    def send(self, call: Callable[..., None], *args: Any, last: bool = False, late: float | None = None) -> None:
+        """`late`: so many seconds later than others, which may overtake it."""
         if self.loop.is_closed():  # what is garbage then undeclares itself
             return
         if self.source is self.target:
             call(*args)
         elif last or not (self.lost or self.source.gone):
-            due = self.loop.time() + self.delay + self._random.random() * self.jitter
-            self.queue.append((max(due, self.queue[-1][0] if self.queue else 0.0), call, args))
+            due = self.loop.now + self.delay + (self._random.random() * self.jitter if self.jitter else 0.0)
+            if late is None:
+                due = self._last = max(due, self._last)
+            else:
+                due += late
+            heappush(self.queue, (due, next(self._numbers), call, args))
             self.pump()
 
-    def send_message(self, call: Callable[..., None], *args: Any) -> bool:
-        """Like `send`, of what may get lost: whether it did not."""
-        if self.loss and self._random.random() < self.loss:
+    def send_message(self, kind: str, call: Callable[..., None], *args: Any) -> bool:
+        """Like `send`, of what may be disturbed: whether it did not get lost."""
+        if self.chance(self.loss):
             return False
-        self.send(call, *args)
+        fate = self.disturbed.get(kind)
+        if fate is None:
+            self.send(call, *args)
+            return True
+        if self.chance(fate.lost):
+            return False
+        for _ in range(2 if self.chance(fate.twice) else 1):
+            self.send(call, *args, late=self._random.random() * fate.by if self.chance(fate.late) else None)
         return True
 
     def pump(self) -> None:
@@ -199,19 +276,35 @@ class MemoryLink:
             self._timer.cancel()
             self._timer = None
         while self.queue and not self.blocked:
-            due, call, args = self.queue[0]
-            if due > self.loop.time():
-                self._timer = self.loop.call_at(due, self.pump)
+            due = self.queue[0][0]
+            if due > self.loop.now:
+                self._timer = self.call_in(due - self.loop.now, self.pump)
                 return
-            self.queue.popleft()
+            _, _, call, args = heappop(self.queue)
             if not self.target.gone:
-                call(*args)
+                if self.trace is not None:
+                    self.trace(str(self.source), str(self.target), call.__name__, args)
+                self.target.call(call, *args)
+
+
+@lru_cache(1 << 14)
+def kind_of(key: str) -> str:
+    """The kind of a message on `key`: `grants`, `schedule`, `vote`, `command`, `rc/state` and so on."""
+    parts = key.split("/")[2:]
+    if not parts:
+        return key
+    at = {"rc": 3, "host": 2, "client": 3}.get(parts[0], 1)
+    name = parts[at] if len(parts) > at else parts[-1]
+    return f"{parts[0]}/{name}" if name == "state" else name
 
 
 class MemoryTransport(Transport):
     def __init__(self, network: MemoryNetwork) -> None:
         self.network = network
-        self.loop = asyncio.get_running_loop()
+        loop = asyncio.get_running_loop()
+        if not isinstance(loop, VirtualTimeLoop):
+            raise TypeError("the mesh in memory needs virtual time")
+        self.loop, self.process = loop, PROCESS.get()
         self.frozen = False
         self.gone = False
         self.declared: list[str] = []
@@ -222,6 +315,19 @@ class MemoryTransport(Transport):
         self._gets: dict[_Get, None] = {}
         self._alive: dict[MemoryTransport, list[str]] = {}
         """Tokens that are known here, by the process that declared them."""
+
+    def call(self, f: Callable[..., None], *args: Any) -> None:
+        """Calls `f` as code of this process."""
+        if self.process is None:
+            f(*args)
+        elif not self.process.dead:
+            self.process.run(f, *args)
+
+    def __str__(self) -> str:
+        return "nobody" if self.process is None else self.process.name
+
+    def declarations(self) -> list[object]:
+        return [*self._queryables, *self._subscribers, *self.declared]
 
     def now(self) -> Ns:
         return round(self.loop.time() * SECOND)
@@ -251,12 +357,12 @@ class MemoryTransport(Transport):
             (node, _Query(get, node, key, payload), on_query)
             for node in self._peers()
             for declared, on_query in node._queryables
-            if intersects(declared, key)
+            if intersects(declared, key) and (declared, on_query) not in self._from(node).hidden
         ]
         get.waiting = {query.id: node for node, query, _ in queries}
         get.check()
         for node, query, on_query in queries:
-            if not self._to(node).send_message(on_query, query):
+            if not self._to(node).send_message(kind_of(key), on_query, query):
                 query.lose()
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
@@ -271,16 +377,18 @@ class MemoryTransport(Transport):
     def publish(self, key: str, payload: bytes, attachment: bytes | None, quality: Quality) -> None:
         for node in self._peers():
             link = self._to(node)
-            if not (link.blocked and quality is not Quality.CONTROL) and node.subscribes(key):
-                link.send_message(node.on_put, key, payload, attachment)
+            if not (link.blocked and quality is not Quality.CONTROL) and node.subscribes(key, self):
+                link.send_message(kind_of(key), node.on_put, self, key, payload, attachment)
 
-    def on_put(self, key: str, payload: bytes, attachment: bytes | None) -> None:
-        for declared, on_sample in tuple(self._subscribers):
-            if intersects(declared, key):
-                on_sample(key, payload, attachment)
+    def on_put(self, source: MemoryTransport, key: str, payload: bytes, attachment: bytes | None) -> None:
+        hidden = self._to(source).hidden
+        for one in tuple(self._subscribers):
+            if intersects(one[0], key) and one not in hidden:
+                one[1](key, payload, attachment)
 
-    def subscribes(self, key: str) -> bool:
-        return any(intersects(declared, key) for declared, _ in self._subscribers)
+    def subscribes(self, key: str, source: MemoryTransport) -> bool:
+        hidden = self._to(source).hidden
+        return any(intersects(one[0], key) and one not in hidden for one in self._subscribers)
 
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
         remove = _add(self._subscribers, (key, on_sample))
@@ -298,7 +406,7 @@ class MemoryTransport(Transport):
         return (lambda: kept.popleft() if kept else None), undeclare
 
     def matching(self, key: str) -> bool:
-        return any(node.subscribes(key) for node in self._peers())
+        return any(node.subscribes(key, self) for node in self._peers())
 
     def token(self, key: str) -> Undeclare:
         self.declared.append(key)
@@ -352,7 +460,7 @@ class MemoryTransport(Transport):
 
     def _announce(self, token: str, alive: bool) -> None:
         for node in self._peers():
-            self._to(node).send(node.on_token, self, token, alive)
+            self._to(node).send_message("alive", node.on_token, self, token, alive)
 
     def _peers(self) -> list[MemoryTransport]:
         """The processes linked to this one, itself included."""
@@ -360,6 +468,9 @@ class MemoryTransport(Transport):
 
     def _to(self, node: MemoryTransport) -> MemoryLink:
         return self.network.between(self, node)
+
+    def _from(self, node: MemoryTransport) -> MemoryLink:
+        return self.network.between(node, self)
 
 
 class MemoryPublisher(TransportPublisher):
@@ -381,7 +492,7 @@ class MemoryPublisher(TransportPublisher):
         matching = self._node.matching(self._key)
         if matching != self._matching and self._on_matching is not None:
             self._matching = matching
-            self._on_matching(matching)
+            self._node.call(self._on_matching, matching)
 
     def undeclare(self) -> None:
         if self in self._node.followed:
@@ -395,7 +506,7 @@ class _Get:
         self.node = node
         self.waiting: dict[int, MemoryTransport] = {}
         self._to = to
-        self._timer = node.loop.call_later(timeout, self._expire)
+        self._timer = node.network.between(node, node).call_in(timeout, node.call, self._expire)
         node._gets[self] = None
 
     def reply(self, query: int, key: str, payload: bytes, ok: bool) -> None:
@@ -428,7 +539,7 @@ class _Query(TransportQuery):
     def __init__(self, get: _Get, node: MemoryTransport, key: str, payload: bytes | None) -> None:
         self.id = next(self._ids)
         self._get: _Get | None = get
-        self._back = node.network.between(node, get.node)
+        self._back, self._kind = node.network.between(node, get.node), kind_of(key)
         self._key, self._payload = key, payload
 
     @property
@@ -447,7 +558,11 @@ class _Query(TransportQuery):
 
     def _reply(self, key: str, payload: bytes, ok: bool) -> None:
         if self._get is not None:
-            self._back.send_message(self._get.reply, self.id, key, payload, ok)
+            back = self._back
+            if (fate := back.disturbed.get(self._kind)) is not None:
+                before, back.answers[key] = back.answers.get(key, payload), payload
+                payload = before if back.chance(fate.old) else payload
+            back.send_message(self._kind, self._get.reply, self.id, key, payload, ok)
             self.drop()
 
     def lose(self) -> None:
@@ -456,7 +571,7 @@ class _Query(TransportQuery):
     def drop(self) -> None:
         get, self._get = self._get, None
         if get is not None:
-            self._back.send_message(get.end, self.id)
+            self._back.send(get.end, self.id)
 
     __del__ = drop
     """A handler that forgets a query drops it."""

@@ -1,33 +1,143 @@
-"""An asyncio event loop whose time jumps to the next timer when nothing is left to do.
+"""An asyncio event loop whose time jumps to the next timer when nothing is left to do, and processes on it.
 
 The idea is that of trio's MockClock. For what runs in one process without sockets and subprocesses, such as
-services on a mesh in memory: an hour of theirs passes in milliseconds, always in the same order."""
+services on a mesh in memory: an hour of theirs passes in milliseconds, always in the same order.
+
+A `Process` stands for a process of the operating system: whatever is begun in its context belongs to it, with a clock
+and a source of randomness of its own. It can stand still, and die without running another line."""
 
 from __future__ import annotations
 
 import asyncio
+import heapq
+import random
 import selectors
+import weakref
 from collections.abc import Callable, Coroutine
-from typing import Any, TypeVar
+from contextlib import suppress
+from contextvars import Context, ContextVar, copy_context
+from typing import Any, Final, TypeVar
+
+from zscout.keyexpr import RANDOM
 
 T = TypeVar("T")
 
 START = 1_000.0
 """The time at which a loop starts, in seconds: not zero, which often stands for "never"."""
 
+PROCESS: Final[ContextVar[Process | None]] = ContextVar("PROCESS", default=None)
+"""Whose code runs; None: that of the simulation itself, or there are no processes."""
+
 
 class Deadlock(RuntimeError):
     """No task can go on, and no timer is left that would wake one."""
 
 
+class Process:
+    """One process of a simulation. Its clock runs `rate` times as fast as virtual time, and began at `boot` seconds."""
+
+    def __init__(self, name: str, *, seed: object = 0, rate: float = 1.0, boot: float = 0.0) -> None:
+        self.name, self.rate, self.boot = name, rate, boot
+        self.stopped = False
+        """Whether it stands still: what falls due waits until it goes on."""
+        self.dead = False
+        self.main: asyncio.Task[None] | None = None
+        self._parked: list[asyncio.Handle] = []
+        self._tasks: weakref.WeakValueDictionary[int, asyncio.Task[Any]] = weakref.WeakValueDictionary()
+        self._begun = 0
+        self._context = copy_context()
+        self._context.run(PROCESS.set, self)
+        self._context.run(RANDOM.set, random.Random(f"{seed} {name}"))  # noqa: S311 - what failed once must fail again
+
+    def run(self, f: Callable[..., T], *args: Any) -> T:
+        """Calls `f` as code of this process."""
+        return self._context.copy().run(f, *args)
+
+    def local(self, time: float) -> float:
+        """What this process's clock shows at a virtual time."""
+        return self.boot + (time - START) * self.rate
+
+    def virtual(self, local: float) -> float:
+        return START + (local - self.boot) / self.rate
+
+    def stop(self) -> None:
+        self.stopped = True
+
+    def go_on(self) -> None:
+        """What fell due meanwhile is done now, in its order."""
+        self.stopped = False
+        parked, self._parked = self._parked, []
+        for handle in parked:
+            handle._loop._ready.append(handle)  # type: ignore[attr-defined]
+
+    def kill(self) -> None:
+        """Nothing of it runs any more, not even what would clean up."""
+        self.dead = True
+        self._parked.clear()
+        for _, task in sorted(self._tasks.items()):
+            asyncio._unregister_task(task)
+            task._log_destroy_pending = False  # type: ignore[attr-defined]
+            coro = task.get_coro()
+            if coro is not None:
+                self.run(_close, coro)
+
+    def park(self, handle: asyncio.Handle) -> bool:
+        """Keeps what is due for later, or for never; False: it is to be done."""
+        if self.stopped and not self.dead:
+            self._parked.append(handle)
+        return self.stopped or self.dead
+
+    def began(self, task: asyncio.Task[Any]) -> None:
+        self._begun += 1
+        self._tasks[self._begun] = task
+
+
+def _close(coro: Any) -> None:
+    # What it still did on its way out would touch nothing: its timers and tasks are dead, and so is its place on the
+    # mesh. What it raises is nobody's.
+    with suppress(BaseException):
+        coro.close()
+
+
+class _Handle(asyncio.Handle):
+    __slots__ = ()
+
+    def _run(self) -> None:
+        process = self._context.get(PROCESS)  # type: ignore[attr-defined]
+        if process is None or not process.park(self):
+            super()._run()
+
+
+class _TimerHandle(asyncio.TimerHandle):
+    __slots__ = ()
+
+    def _run(self) -> None:
+        process = self._context.get(PROCESS)  # type: ignore[attr-defined]
+        if process is None or not process.park(self):
+            super()._run()
+
+
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
+    _ready: Any
+    _scheduled: list[asyncio.TimerHandle]
+
     def __init__(self) -> None:
         self._now = START
         self._threads: set[object] = set()
-        super().__init__(_JumpingSelector(self.jump))
+        super().__init__(_JumpingSelector(self))
         self._clock_resolution = 1e-9
+        self.isolated = False
+        """Whether nothing outside can wake it, no thread and no file: it is not looked there."""
+        self.set_task_factory(_begin)
 
     def time(self) -> float:
+        """By the clock of the process whose code asks."""
+        process = PROCESS.get()
+        return self._now if process is None else process.local(self._now)
+
+    @property
+    def now(self) -> float:
+        """Virtual time, in seconds."""
         return self._now
 
     def jump(self, seconds: float | None) -> bool:
@@ -39,7 +149,36 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         self._now += seconds
         return True
 
+    def call_at(  # type: ignore[override]  # like asyncio's own
+        self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        process = PROCESS.get() if context is None else context.get(PROCESS)
+        timer = _TimerHandle(when if process is None else process.virtual(when), callback, args, self, context)
+        heapq.heappush(self._scheduled, timer)
+        timer._scheduled = True  # type: ignore[attr-defined]
+        return timer
+
+    def _call_soon(self, callback: Callable[..., object], args: Any, context: Context | None) -> asyncio.Handle:
+        handle = _Handle(callback, args, self, context)
+        self._ready.append(handle)
+        return handle
+
+    def call_soon_threadsafe(  # type: ignore[override]  # like asyncio's own
+        self, callback: Callable[..., object], *args: Any, context: Context | None = None
+    ) -> asyncio.Handle:
+        if self.isolated:
+            return self._call_soon(callback, args, context)
+        return super().call_soon_threadsafe(callback, *args, context=context)
+
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]  # like asyncio's own
+        if PROCESS.get() is not None:
+            # In a simulation threads take no time, and come in one order.
+            done: asyncio.Future[T] = self.create_future()
+            try:
+                done.set_result(func(*args))
+            except Exception as error:  # noqa: BLE001 - it is raised to who awaits it
+                done.set_exception(error)
+            return done
         future = super().run_in_executor(executor, func, *args)
         self._threads.add(future)
         future.add_done_callback(self._threads.discard)
@@ -50,16 +189,27 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         await super().shutdown_default_executor(*args)
 
 
+def _begin(loop: asyncio.AbstractEventLoop, coro: Any, **how: Any) -> asyncio.Task[Any]:
+    task: asyncio.Task[Any] = asyncio.Task(coro, loop=loop, **how)
+    context = how.get("context")
+    process = PROCESS.get() if context is None else context.get(PROCESS)
+    if process is not None:
+        process.began(task)
+        if process.dead:  # begun by what cleans up after it
+            process.kill()
+    return task
+
+
 class _JumpingSelector(selectors.DefaultSelector):
-    def __init__(self, jump: Callable[[float | None], bool]) -> None:
+    def __init__(self, loop: VirtualTimeLoop) -> None:
         super().__init__()
-        self._jump = jump
+        self._loop = loop
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        ready = super().select(0)
+        ready = [] if self._loop.isolated else super().select(0)
         if ready or timeout == 0:
             return ready
-        return [] if self._jump(timeout) else super().select(timeout)
+        return [] if self._loop.jump(timeout) else super().select(timeout)
 
 
 def run(coro: Coroutine[Any, Any, T]) -> T:

@@ -44,8 +44,11 @@ class ComponentHost:
         rules: ComponentsConfig,
         on_failure: Callable[[Exception], object],
         limits: ControlGroups | None = None,
+        *,
+        kinds: Callable[[], dict[str, str]] = installed_kinds,
+        process: type[ComponentProcess] = ComponentProcess,
     ) -> None:
-        self.mesh, self._rules = mesh, rules
+        self.mesh, self._rules, self._kinds, self._process = mesh, rules, kinds, process
         self._fleet = msgspec.structs.replace(fleet, mesh=beside(fleet.mesh))
         self._limits = limits or ControlGroups()
         self._living: dict[str, ComponentProcess] = {}
@@ -134,7 +137,7 @@ class ComponentHost:
 
     async def _launch(self, start: messages.StartComponent) -> ComponentProcess:
         self._check(start)
-        kinds = await asyncio.to_thread(installed_kinds)
+        kinds = await asyncio.to_thread(self._kinds)
         # Another one may have asked meanwhile.
         if process := self._same(start):
             return process
@@ -153,7 +156,9 @@ class ComponentHost:
         while len(self._known) > messages.MAX_PLACED:
             self._known.popitem(last=False)
         self._ended.pop(name, None)
-        process = ComponentProcess(self.mesh.me.host, self._fleet, self._limits, start, where, self._on_over)
+        process = self._process(
+            self.mesh.me.host, self._fleet, self.mesh.now, self._limits, start, where, self._on_over
+        )
         self._living[name] = process
         process.begin(self.supervisor)
         log.info("starts %s.%d (%s)", name, start.incarnation, start.spec.kind)
@@ -186,7 +191,7 @@ class ComponentHost:
             raise Refused("too_large", f"params are {size} bytes as JSON; at most {messages.MAX_PARAMS_SIZE} are taken")
 
     async def _list(self, component: str | None) -> messages.ComponentList:
-        kinds = await asyncio.to_thread(installed_kinds)
+        kinds = await asyncio.to_thread(self._kinds)
         found = {**self._ended, **self._living}
         views = [found[name].view() for name in sorted(found) if component in (None, name)]
         return messages.ComponentList(self.mesh.me.host, views, self._startable(kinds)[:MAX_KINDS])

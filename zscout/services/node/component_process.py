@@ -22,7 +22,7 @@ from zscout.behaviors.components.channel import EndReport, Order, OrderAnswer
 from zscout.behaviors.components.processes import VARIABLE, kill_family
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import new_instance
-from zscout.mesh import Refused, Supervisor, clock
+from zscout.mesh import Refused, Supervisor
 from zscout.mesh.supervision import done_within
 from zscout.messages import ComponentView, HowEnded, MoveComponent, Moved, Phase, RestoreComponent, StartComponent
 from zscout.services.node.component_output import OutputReader, OutputRing
@@ -38,19 +38,20 @@ SLACK: Final = 5.0
 
 
 class ComponentProcess:
-    """One incarnation of a component. `where` is the kind's `module:class`; `fleet` how a child joins;
-    `on_over` is called once, when it has ended."""
+    """One incarnation of a component. `where` is the kind's `module:class`; `fleet` how a child joins; `now` the clock
+    of its node; `on_over` is called once, when it has ended."""
 
     def __init__(
         self,
         host: str,
         fleet: Fleet,
+        now: Callable[[], Ns],
         limits: ControlGroups,
         start: StartComponent,
         where: str,
         on_over: Callable[[ComponentProcess], None],
     ) -> None:
-        self._host, self._fleet, self._limits = host, fleet, limits
+        self._host, self._fleet, self._now, self._limits = host, fleet, now, limits
         self.start, self._where, self._on_over = start, where, on_over
         self.phase: Phase = "starting"
         self.ended: HowEnded | None = None
@@ -63,7 +64,7 @@ class ComponentProcess:
         self.running = asyncio.Event()
         """It runs, or has ended."""
         self.over = asyncio.Event()
-        self._began: Ns = clock.now()
+        self._began = now()
         self._lasted: Ns | None = None
         self._tag = f"{start.component}.{start.incarnation}-{new_instance()}"
         self._child: subprocess.Popen[bytes] | None = None
@@ -95,7 +96,7 @@ class ComponentProcess:
         supervisor.spawn(self._live())
 
     def view(self) -> ComponentView:
-        lasted = self._lasted if self._lasted is not None else clock.now() - self._began
+        lasted = self._lasted if self._lasted is not None else self._now() - self._began
         return ComponentView(
             component=self.start.component,
             incarnation=self.start.incarnation,
@@ -312,6 +313,9 @@ class ComponentProcess:
         if self.over.is_set():
             return
         self._verdict = self._verdict or verdict
+        self._kill_child()
+
+    def _kill_child(self) -> None:
         if self.pid is not None:
             # Its number is its own until it was waited for.
             with suppress(ProcessLookupError):
@@ -320,7 +324,7 @@ class ComponentProcess:
     async def _finish(self) -> None:
         ends = self._end_report or self._how()
         await asyncio.to_thread(self._group.close)
-        self._lasted = clock.now() - self._began
+        self._lasted = self._now() - self._began
         self.phase, self.ended, self.reason = "ended", ends.how, ends.reason
         words = f"{ends.how}: {ends.reason}" if ends.reason else ends.how
         log.info("%s.%d %s", self.start.component, self.start.incarnation, words)

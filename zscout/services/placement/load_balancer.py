@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import logging
-import random
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
-from zscout.keyexpr import Role, Token, check_name
+from zscout.keyexpr import RANDOM, Role, Token, check_name
 from zscout.mesh import IncomingQuery, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import HostRanking, LoadReport, RankAsk
@@ -31,9 +30,9 @@ class LoadBalancer:
     """Answers which hosts are best, until it is stopped or fails. What it knows of hosts comes from their
     reports alone, so a new leader's balancer knows all that report within a second."""
 
-    def __init__(self, mesh: Mesh, on_failure: Callable[[Exception], object], rng: random.Random | None = None) -> None:
+    def __init__(self, mesh: Mesh, on_failure: Callable[[Exception], object]) -> None:
         self.mesh = mesh
-        self.core = Balancer(rng or random.Random())  # noqa: S311 - lots and noise, not secrets
+        self.core = Balancer(RANDOM.get())
         self._supervisor = Supervisor("the load balancer", on_failure)
         self._lost: set[HostName] = set()
         """Hosts that are gone: reports that they sent before, and that are not read yet, must not bring them

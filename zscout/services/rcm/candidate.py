@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from typing import TypeVar
 
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import BadName, Role, Token, client_of, new_instance
+from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_instance
 from zscout.mesh import Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import ClientRequests, Grants, RcAsk, RcState, absurd
@@ -22,8 +22,8 @@ from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.recovery import recover
-from zscout.types import NO_TERM, SECOND, Ns, Term
+from zscout.services.rcm.recovery import take_over
+from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 R = TypeVar("R")
@@ -43,7 +43,11 @@ class Candidate:
         self.mesh, self.fleet = mesh, fleet
         self.known: Term = NO_TERM
         """The highest term seen anywhere."""
+        self._goes_above = False
+        """Whether an RC or a client obeys a term so far above that others must be told why this one goes there."""
         self.rcm: Rcm | None = None
+        self._leader: str | None = None
+        """The host of the leader that was seen last."""
         self.ledger = PlacementLedger(mesh)
         self._timeout = fleet.timing.rebuild / SECOND
         self._leading = ExitStack()
@@ -107,29 +111,38 @@ class Candidate:
     # What is seen
 
     def _on_grants(self, _key: str, grants: Grants) -> None:
-        self.election.published(grants.term, self.mesh.now())
-        self._see(grants.term)
+        if self._see(grants.term):
+            self.election.published(grants.term, self.mesh.now())
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         if self.rcm is None or token.instance != self.rcm.term.rcm:
             log.info("%s %s", token.host, "leads" if alive else "does not lead any more")
+        if alive:
+            self._leader = token.host
         self.election.leader(token.instance, alive=alive, now=self.mesh.now())
         self._changed.set()
 
     def _on_candidate(self, token: Token, alive: bool) -> None:
-        self.election.candidate(token.host, alive=alive)
+        self.election.candidate(token.host, alive=alive, now=self.mesh.now())
         self._changed.set()
 
-    def _see(self, term: Term) -> None:
-        if absurd(term, self.known):
-            log.warning("ignored term %d: absurdly far above %d", term.counter, self.known.counter)
-            return
+    def _see(self, term: Term, refused_by: RcName | None = None) -> bool:
+        """False: it is absurd. A term for which an RC that is seen refuses a lower one is none."""
+        heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, self.mesh.now())
+        if absurd(term, self.known, heard=heard):
+            if refused_by is None or absurd(term, self.known, heard=False):
+                log.warning("ignored term %d: absurdly far above %d", term.counter, self.known.counter)
+                return False
+            log.warning("%s obeys term %d: the fleet goes above", refused_by, term.counter)
+            self._goes_above = True
         if term > self.known:
             self.known = term
         if self.rcm is not None and term > self.rcm.term:
             log.warning("stepping down: term %d of another RCM is above %d", term.counter, self.rcm.term.counter)
+            self.election.deposed(self.mesh.now(), RANDOM.get().uniform(0.7, 1.3))
             self._stop_leading()
             self._changed.set()
+        return True
 
     # Leading
 
@@ -145,14 +158,16 @@ class Candidate:
             await done_within(None if at is None else (at - now) / SECOND, self._changed.wait())
 
     async def _leader_elsewhere(self) -> bool:
-        """Whether most RCs still see a leader: then it is this candidate that is cut off."""
+        """Whether RCs still see a leader: then it is this candidate that is cut off."""
         replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
         states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
         for state in states:
             self._see(state.term)
-        seeing = sum(bool(state.leader) for state in states)
-        if seeing * 2 > len(states):
-            log.info("%d of %d RCs still see a leader: waiting", seeing, len(states))
+        host = self.mesh.me.host
+        others = [bool(state.leader) for state in states if state.host != host]
+        own = [bool(state.leader) for state in states if state.host == host]
+        if self.election.must_wait(others, own, self.mesh.now(), self._leader):
+            log.info("%d of %d RCs of other hosts still see a leader: waiting", sum(others), len(others))
             return True
         return False
 
@@ -162,20 +177,30 @@ class Candidate:
             if self.election.sees_leader(self.mesh.now()):
                 return False
             term = Term(self.known.counter + 1, new_instance())
-            promise_query = RcAsk(promise=term)
+            promise_query = RcAsk(promise=term, above=self.mesh.me.host if self._goes_above else None)
             rcs, clients = await asyncio.gather(
                 self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=self._timeout),
                 self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=self._timeout),
             )
-            for problem in (*(reply.problem for reply in rcs), *(reply.problem for reply in clients)):
+            problems = [(reply.key, reply.problem) for reply in rcs] + [(reply.key, reply.problem) for reply in clients]
+            for key, problem in problems:
                 if problem is not None and problem.term is not None:
-                    self._see(problem.term)
+                    await self._refused(key, problem.term)
             if self.known > term:
                 continue
             open_requests = self._credible(clients, lambda answer: keys.requests(client_of(answer.client)))
             self._lead(term, self._credible(rcs, lambda state: keys.rc_state(state.rc)), open_requests)
             return True
         return False
+
+    async def _refused(self, key: str, term: Term) -> None:
+        """An RC or a client obeys a higher term. What has no token may be anybody's word."""
+        keys, names = self.mesh.keys, set[str]()
+        if absurd(term, self.known):
+            seen = await self.mesh.living(keys.alive_any(), timeout=self._timeout)
+            names = {keys.rc_state(one.name) for one in seen if one.role == Role.RC}
+            names |= {keys.requests(Sender(one.host, one.name)) for one in seen if one.role == Role.CLIENT}
+        self._see(term, refused_by=key if key in names else None)
 
     def _credible(self, replies: list[Reply[R]], key_of: Callable[[R], str]) -> list[R]:
         """The messages of `replies` that name in themselves whom their key names; others prove nothing."""
@@ -189,8 +214,8 @@ class Candidate:
         return messages
 
     def _lead(self, term: Term, states: list[RcState], open_requests: list[ClientRequests]) -> None:
-        recovered = recover(states, open_requests, self.mesh.now())
-        self.known = term
+        recovered = take_over(states, open_requests, self.mesh.now())
+        self.known, self._goes_above = term, False
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
         rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed)

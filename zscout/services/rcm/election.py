@@ -1,7 +1,8 @@
 """When a candidate may try to lead. Pure: what is seen goes in, with the time; the next step comes out.
 
 There is no vote among candidates. A leader leads until it dies or a higher term is seen; only while no leader is seen
-does rank matter: the better candidate tries first, the next waits its turn."""
+does rank matter: the better candidate tries first, the next waits its turn. Who was deposed waits longer each time, so
+that two that do not see each other do not take turns over RCs that see both."""
 
 from __future__ import annotations
 
@@ -17,6 +18,9 @@ TURN = SECOND // 4
 RETRY = SECOND // 10
 """From one attempt that failed to the next. Well below TURN: where RCs see the old leader's end a little late, the next
 in rank would else try at the same moment."""
+CALM = 10 * SECOND
+"""After so long without being deposed, a candidate waits as after the first time."""
+MAX_DOUBLINGS = 5
 
 
 class Election:
@@ -31,22 +35,35 @@ class Election:
         """When each leader that has a token last published (or its token was seen first)."""
         self._since = now + SETTLE
         self._not_before: Ns = 0
+        self._heard: Ns | None = None
+        """When a leader that counts was seen or heard last."""
+        self._deposed: Ns | None = None
+        self._depositions = 0
+        self._yields_until: Ns = 0
+        self._lost: dict[str, Ns] = {}
+        """Hosts whose candidates were seen to go, and when."""
+        self._alone_since: Ns | None = None
 
-    def candidate(self, host: str, *, alive: bool) -> None:
+    def candidate(self, host: str, *, alive: bool, now: Ns) -> None:
         """A candidate's token came or went."""
+        if alive:
+            self._lost.pop(host, None)
+        else:
+            self._lost[host] = now
         self._candidates[host] += 1 if alive else -1
         self._candidates = +self._candidates
 
     def leader(self, instance: str, *, alive: bool, now: Ns) -> None:
         """A leader's token came or went."""
         if alive:
-            self._leaders[instance] = now
+            self._leaders[instance] = self._heard = now
         elif self._leaders.pop(instance, None) is not None and not self._leaders:
             # Who has seen a leader is on the mesh: there is nothing to settle any more.
             self._since = now
 
     def published(self, term: Term, now: Ns) -> None:
         """A leader published something."""
+        self._heard = now
         if term.rcm in self._leaders:
             self._leaders[term.rcm] = now
 
@@ -57,6 +74,36 @@ class Election:
     def failed(self, now: Ns) -> None:
         """An attempt did not lead to the lead."""
         self._not_before = now + RETRY
+
+    def deposed(self, now: Ns, jitter: float) -> None:
+        """A higher term ended the own one. `jitter` is about 1."""
+        if self._deposed is None or now - self._deposed > CALM:
+            self._depositions = 0
+        self._yields_until = now + round((self.silence << min(self._depositions, MAX_DOUBLINGS)) * jitter)
+        self._deposed, self._depositions = now, self._depositions + 1
+
+    def must_wait(self, others: Sequence[bool], own: Sequence[bool], now: Ns, leader: str | None) -> bool:
+        """Whether to wait, by what RCs of other hosts and of this one say of a leader: whether they see one. `leader`
+        is the host of the last one.
+
+        RCs of this host share its view of the mesh: they count only where no other answers. Where it may be this
+        host that is cut off, that is once more a silence."""
+        if others:
+            self._alone_since = None
+            yields = now < self._yields_until and (self._heard_lately(now) or any(others))
+            return yields or sum(others) * 2 > len(others)
+        cut_off = any(now - at <= self.silence for host, at in self._lost.items() if host not in (leader, self.host))
+        if sum(own) * 2 <= len(own) and not cut_off and self._alone_since is None:
+            return now < self._yields_until and self._heard_lately(now)
+        self._alone_since = now if self._alone_since is None else self._alone_since
+        return now - self._alone_since < self.silence
+
+    def heard_within(self, span: Ns, now: Ns) -> bool:
+        """Whether a leader that counts was seen or heard so lately."""
+        return self._heard is not None and now - self._heard < span
+
+    def _heard_lately(self, now: Ns) -> bool:
+        return self.heard_within(self.silence, now)
 
     def next_try(self, now: Ns) -> Ns | None:
         """When to try to lead: now or earlier means at once, None not while things stay as they are."""

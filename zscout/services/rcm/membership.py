@@ -7,20 +7,35 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, Mesh
-from zscout.mesh.supervision import Supervisor
+from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import RcAsk, RcState
-from zscout.scheduling.model import ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
-from zscout.types import SECOND, ArcId, ClientId, Grant, Ns, RcName, Term
+from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
+from zscout.services.rcm.recovery import gangs_of, recover
+from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
+AWAY: Final = 0.25
+"""A leader that stood still for this part of the mesh lease, or lost several peers within it, was away itself."""
 NEAR_END: Ns = SECOND // 20
 """A hold with less than this left may have ended at its RC already: clocks differ a little."""
+
+
+@dataclass(slots=True)
+class _Pending:
+    """An RC that answered, and does not count yet."""
+
+    state: RcState
+    waited: float = 0.0
+    """For how many seconds, as far as that was measured: for an answer, or for a lease."""
 
 
 class Membership:
@@ -32,25 +47,47 @@ class Membership:
         fleet: Fleet,
         term: Term,
         supervisor: Supervisor,
-        emit: Callable[[Event], None],
+        emit: Callable[..., None],
         on_reported: Callable[[RcName, RcState], None],
-        on_newer: Callable[[Term], None],
+        on_newer: Callable[[Term, RcName | None], object],
     ) -> None:
         self.mesh, self.term = mesh, term
         self._lease = fleet.mesh.lease
+        self._hold_lease = fleet.timing.hold_lease / SECOND
         self._timeout = fleet.timing.rebuild / SECOND
         self._supervisor = supervisor
         self._emit, self._on_reported, self._on_newer = emit, on_reported, on_newer
         self.clients: dict[ClientId, set[str]] = {}
         """Instances alive of each client that has a token."""
         self._unseen: dict[ClientId, asyncio.TimerHandle] = {}
+        self._stall = StallWatch(mesh.now)
+        self._gone: deque[tuple[Ns, str]] = deque()
+        """Which hosts' last tokens went lately, and when."""
+        self._away_until: Ns = 0
+        """Until then what goes is only unseen: this leader was away itself, and takes its own lost links for theirs."""
         self._rc_tokens: dict[RcName, dict[str, Token]] = {}
+        self._rc_seen: dict[RcName, Ns] = {}
+        """When each RC was seen first, of those that have a token."""
         self._joined: dict[RcName, RcState] = {}
         """The RCs that count as there, as they reported themselves last."""
+        self._pending: dict[RcName, _Pending] = {}
+        """RCs that answered with holds of earlier terms: the other RCs of those gangs may answer too."""
+        self.on_settled: Callable[[], None] = lambda: None
+        """Called when RCs are not pending any more."""
+        self.on_named: Callable[[RcName], None] = lambda _: None
+        """Called when the instances of an RC are to hear which one is meant."""
+        self._named: dict[RcName, tuple[str, HostName]] = {}
+        """The instance that is meant of each RC, and its host."""
+        self._departed: dict[RcName, RcState] = {}
+        """RCs that went less than a hold lease ago: they may still let their holders command."""
 
-    def join(self, rcs: dict[RcName, RcState]) -> list[Event]:
-        """The RCs that promised to obey before the term began."""
+    def join(self, rcs: dict[RcName, RcState], pending: Iterable[RcState]) -> list[Event]:
+        """The RCs that promised to obey before the term began; those that are `pending` join later."""
         self._joined.update(rcs)
+        for state in (*rcs.values(), *pending):
+            self._named[state.rc] = state.instance, state.host
+        for state in pending:
+            self._hold_up(state)
         # One that died before its token was watched would never be seen to go.
         self._supervisor.call_later(self._lease, self._drop_unseen)
         return [RcJoined(name, state.sharable) for name, state in rcs.items() if state.health == "ok"]
@@ -58,6 +95,7 @@ class Membership:
     def watch(self) -> list[Declaration]:
         keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
         return [
+            Declaration(self._stall.start().stop),
             mesh.subscribe(keys.rc_state_any, RcState, guard(self._on_rc_state)),
             mesh.watch(keys.alive_any(Role.CLIENT), guard(self._on_client)),
             mesh.watch(keys.alive_any(Role.RC), guard(self._on_rc_token)),
@@ -69,6 +107,12 @@ class Membership:
         """A client with requests must live: one that is not among `clients` yet gets a lease to show itself."""
         if client not in self._unseen:
             self._unseen[client] = self._supervisor.call_later(self._lease, self._client_lost, client)
+
+    def heard(self, client: ClientId) -> None:
+        """A client that says something lives, though its token is not seen."""
+        if timer := self._unseen.pop(client, None):
+            timer.cancel()
+            self.expect(client)
 
     def find(self, client: ClientId, then: Callable[[bool], None]) -> None:
         """Calls `then` with whether a client has a token: at once where it was seen, else once the mesh was
@@ -93,7 +137,27 @@ class Membership:
         instances.discard(token.instance)
         if not instances:
             del self.clients[client]
-            self._client_lost(client)
+            if self._is_away(token):
+                self.expect(client)
+            else:
+                self._client_lost(client)
+
+    def _is_away(self, token: Token) -> bool:
+        """Whether `token` may have gone because this leader was away: it stood still, or lost several hosts at once."""
+        now, span = self.mesh.now(), round(AWAY * self._lease * SECOND)
+        if not self._sees(token.host):
+            self._gone.append((now, token.host))
+        while self._gone and self._gone[0][0] < now - span:
+            self._gone.popleft()
+        stood_still = self._stall.fresh() and self._stall.length > span
+        if stood_still or len({host for _, host in self._gone}) > 1:
+            self._away_until = now + round(self._lease * SECOND)
+        return now < self._away_until
+
+    def _sees(self, host: HostName) -> bool:
+        """Whether any program of a host shows itself."""
+        others = (token.host for tokens in self._rc_tokens.values() for token in tokens.values())
+        return host in others or any(client.startswith(f"{host}/") for client in self.clients)
 
     def _client_lost(self, client: ClientId) -> None:
         self._unseen.pop(client, None)
@@ -101,27 +165,69 @@ class Membership:
 
     # RCs
 
+    def awaits(self, rcs: Iterable[RcName]) -> bool:
+        """Whether it may soon be known what one of `rcs` holds: it is pending, or its token was seen for less than a
+        lease and it has not answered."""
+        since = self.mesh.now() - round(self._lease * SECOND)
+        return any(
+            rc in self._pending or (rc not in self._joined and self._rc_seen.get(rc, since) > since) for rc in rcs
+        )
+
     def _on_rc_token(self, token: Token, alive: bool) -> None:
         tokens = self._rc_tokens.setdefault(token.name, {})
         current = self._joined.get(token.name)
         if alive:
             tokens[token.instance] = token
-            if current is None:
+            self._rc_seen.setdefault(token.name, self.mesh.now())
+            if self._is_wanted(token):
+                if current is not None:
+                    self._succeed(token)
                 self._supervisor.spawn(self._join(token))
-            elif current.instance != token.instance:
+            elif current is not None and current.instance != token.instance:
                 log.warning("%s is offered twice; the one at %s is used", token.name, current.host)
+                self.on_named(token.name)
             return
         tokens.pop(token.instance, None)
+        if token.name in self._pending and self._pending[token.name].state.instance == token.instance:
+            del self._pending[token.name]
         if current is not None and current.instance == token.instance:
-            self._drop(token.name)
+            if self._is_away(token):
+                self._supervisor.call_later(self._lease, self._drop_unseen)
+            else:
+                self._drop(token.name)
         if not tokens:
-            del self._rc_tokens[token.name]
+            del self._rc_tokens[token.name], self._rc_seen[token.name]
+            self._settle()
+
+    def _succeed(self, token: Token) -> None:
+        """A new instance on the same host: the one before is not there any more."""
+        del self._joined[token.name]
+        self._named[token.name] = token.instance, token.host
+        self._emit(RcLost(token.name, "it started anew"))
+        self.on_named(token.name)
 
     def _drop(self, name: RcName) -> None:
-        del self._joined[name]
+        gone = self._departed[name] = self._joined.pop(name)
+        self._supervisor.call_later(self._hold_lease, self._free, gone)
         self._emit(RcLost(name))
         for other in self._rc_tokens.get(name, {}).values():
             self._supervisor.spawn(self._join(other))
+
+    def _free(self, gone: RcState) -> None:
+        """An RC that went lets nobody command any more: another host may offer it."""
+        if self._departed.get(gone.rc) is not gone:
+            return
+        del self._departed[gone.rc]
+        others = sorted(self._rc_tokens.get(gone.rc, {}).values())
+        if others and gone.rc not in self._joined:
+            self._named[gone.rc] = others[0].instance, others[0].host
+            self.on_named(gone.rc)
+        for other in others:
+            self._supervisor.spawn(self._join(other))
+
+    def named(self, rcs: Iterable[RcName]) -> dict[RcName, tuple[str, HostName]]:
+        """The instance that is meant of each of these RCs, and its host."""
+        return {rc: self._named[rc] for rc in rcs if rc in self._named}
 
     def _drop_unseen(self) -> None:
         for name, state in list(self._joined.items()):
@@ -134,26 +240,82 @@ class Membership:
         while self._is_wanted(token):
             for reply in await self.mesh.ask(key, RcAsk(promise=self.term), RcState, timeout=self._timeout):
                 if reply.problem is not None and reply.problem.term is not None:
-                    self._see(reply.problem.term)
+                    self.see(reply.problem.term, refused_by=token.name)
                 state = reply.message
                 if state is not None and state.instance == token.instance and self._is_wanted(token):
-                    self._joined[token.name] = state
-                    if state.health == "ok":
-                        self._emit(RcJoined(token.name, state.sharable))
-                    self._on_reported(token.name, state)
+                    self._answered(state)
                     return
             # No answer can come at once, and again and again: a token may outlive its RC.
             await asyncio.sleep(self._timeout)
 
+    def _answered(self, state: RcState) -> None:
+        """An RC joins at once, if it holds nothing of an earlier term; else with all RCs of its gangs: a hold that all
+        of them have goes on."""
+        if any(holder.grant.term != self.term for holder in state.holders):
+            self._hold_up(state)
+        else:
+            self._admit([state])
+        self._settle()
+
+    def _hold_up(self, state: RcState) -> None:
+        pending = self._pending[state.rc] = _Pending(state)
+        for wait in (self._timeout, self._lease):
+            self._supervisor.call_later(wait, self._wait_over, pending, wait)
+
+    def _wait_over(self, pending: _Pending, wait: float) -> None:
+        pending.waited = wait
+        self._settle()
+
+    def _settle(self) -> None:
+        """Lets in the pending RCs whose gangs have answered. Others wait for a lease; where nothing shows that one of
+        the gang lives, only as long as for an answer."""
+        for rc in list(self._pending):
+            if rc not in self._pending:
+                continue
+            gangs = gangs_of(rc, {one: pending.state for one, pending in self._pending.items()})
+            missing = gangs - self._joined.keys() - self._pending.keys()
+            seen = any(one in self._rc_tokens for one in missing)
+            if not missing or self._pending[rc].waited >= (self._lease if seen else self._timeout):
+                self._admit([self._pending.pop(one).state for one in sorted(gangs & self._pending.keys())])
+
+    def _admit(self, states: list[RcState]) -> None:
+        self._joined.update({state.rc: state for state in states})
+        self._named |= {state.rc: (state.instance, state.host) for state in states}
+        well = {state.rc: state for state in states if state.health == "ok"}
+        held = {(rc, holder.grant) for rc, state in well.items() for holder in state.holders}
+        recovered = recover(well.values(), [], self.mesh.now()).holds
+        adopted = [
+            Adopted(hold)
+            for hold in recovered
+            if all((rc, hold.grant) in held or rc not in self._joined for rc in hold.rcs)
+        ]
+        if well:
+            self._emit(*(RcJoined(state.rc, state.sharable) for state in well.values()), *adopted)
+        for state in states:
+            self._on_reported(state.rc, state)
+            if state.duplicate_of or len(self._rc_tokens.get(state.rc, ())) > 1:
+                self.on_named(state.rc)
+        self.on_settled()
+
     def _is_wanted(self, token: Token) -> bool:
-        """Whether an RC lives and has not joined. Once the term is over, no RC is asked any more."""
-        living = self._rc_tokens.get(token.name, {})
-        return self._supervisor.active and token.instance in living and token.name not in self._joined
+        """Whether an instance of an RC lives and may join: where none has, or as the successor of one on its own host.
+        Once the term is over, no RC is asked any more."""
+        if not self._supervisor.active or token.instance not in self._rc_tokens.get(token.name, {}):
+            return False
+        pending, gone = self._pending.get(token.name), self._departed.get(token.name)
+        present = pending.state if pending is not None else self._joined.get(token.name)
+        if present is not None:
+            return present.host == token.host and present.instance != token.instance
+        return gone is None or gone.host == token.host
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
-        self._see(state.term)
+        self.see(state.term)
         name = self.mesh.keys.rc_of(key)
-        known = self._joined.get(name)
+        if name in self._pending and self._pending[name].state.instance == state.instance:
+            self._pending[name].state = state
+        known, gone = self._joined.get(name), self._departed.get(name)
+        if gone is not None and gone.instance == state.instance and state.leaving:
+            self._free(gone)
         if known is None or known.instance != state.instance:
             return
         self._joined[name] = state
@@ -167,9 +329,9 @@ class Membership:
             self._emit(RcReported(name, rules_changed=True))
         self._on_reported(name, state)
 
-    def _see(self, term: Term) -> None:
+    def see(self, term: Term, refused_by: RcName | None = None) -> None:
         if term > self.term:
-            self._on_newer(term)
+            self._on_newer(term, refused_by)
 
 
 def discrepancies(

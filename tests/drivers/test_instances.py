@@ -1,0 +1,171 @@
+"""Two hosts offer one RC: one of them serves, the other stands by."""
+
+from __future__ import annotations
+
+import asyncio
+from decimal import Decimal
+from typing import Any
+
+from tests.mesh.kit import run, until
+from tests.services.rcm.kit import FakeClient, FakeFleet, grant_of
+from zscout.drivers.generic import ExclusiveDriver
+from zscout.drivers.instances import Standing
+from zscout.drivers.resource_controller import ResourceController
+from zscout.lab.faults.memory import MemoryMesh
+from zscout.mesh.supervision import StallWatch
+from zscout.messages import Command, Done, Holder, OpenRequest
+from zscout.types import SECOND, Grant
+
+RC = "robot/a"
+
+
+class Recorded(ExclusiveDriver):
+    """What its device was told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[str] = []
+
+    async def begin(self, holder: Holder) -> None:
+        self.told.append(f"begin {holder.arc}")
+
+    async def safe(self) -> None:
+        self.told.append("safe")
+
+
+async def offer(fleet: FakeFleet, host: str) -> ResourceController:
+    mesh = fleet.mesh(host)
+    lease = fleet.fleet.timing.hold_lease / SECOND
+    rc = ResourceController(mesh, RC, Recorded(), hold_lease=lease, stall=StallWatch(mesh.now).start())
+    await rc.start()
+    return rc
+
+
+def told(rc: ResourceController) -> list[str]:
+    assert isinstance(rc.driver, Recorded)
+    return rc.driver.told
+
+
+async def confirms(client: FakeClient, grant: Grant) -> list[Any]:
+    """All that answer a confirmation, as a code, or as nothing."""
+    mesh = client.mesh
+    command = Command(grant=grant, do={"name": "confirm"})
+    replies = await mesh.ask(mesh.keys.command(RC, mesh.me), command, Done, timeout=1)
+    return [reply.problem and reply.problem.code for reply in replies]
+
+
+def kill(fleet: FakeFleet, rc: ResourceController) -> None:
+    """It and its mesh end without a word."""
+    assert isinstance(rc.mesh, MemoryMesh)
+    rc.supervisor.cancel()
+    fleet.network.kill(rc.mesh)
+
+
+def test_who_finds_another_instance_stands_by_and_serves_when_its_holds_are_surely_over() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm()
+        first = await offer(fleet, "h2")
+        second = await offer(fleet, "h1")
+        assert [one.instances.standing for one in (first, second)] == [Standing.SERVES, Standing.STANDS_BY]
+        assert second._rc_state([]).duplicate_of == "robot/a at h2"
+        client = fleet.client("one")
+        await until(lambda: rcm.core.status().rcs)
+        answer = await client.ask("tally", RC)
+        assert await confirms(client, grant_of(answer)) == [None]
+        assert (told(first), told(second)) == (["begin tally"], [])
+        # The first may let its holder command for as long as the hold lease.
+        kill(fleet, first)
+        killed = fleet.watcher.now()
+        await until(lambda: told(second))
+        assert fleet.watcher.now() - killed >= fleet.fleet.timing.hold_lease
+        assert (told(second), second.instances.standing) == (["begin tally"], Standing.SERVES)
+        again = grant_of(client.notices[-1])
+        assert again > grant_of(answer)
+        assert await confirms(client, again) == [None]
+
+    run(story())
+
+
+def test_who_leaves_in_order_is_followed_at_once() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        first = await offer(fleet, "h2")
+        second = await offer(fleet, "h1")
+        client = fleet.client("one")
+        await client.ask("tally", RC)
+        await until(lambda: told(first))
+        stopped = fleet.watcher.now()
+        await first.stop()
+        await until(lambda: told(second))
+        assert fleet.watcher.now() - stopped < SECOND // 2
+        assert told(first) == ["begin tally", "safe"]
+
+    run(story())
+
+
+def test_of_two_that_did_not_see_each_other_the_one_that_was_taken_in_first_goes_on() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm()
+        first = await offer(fleet, "h2")
+        client = fleet.client("one")
+        await until(lambda: rcm.core.status().rcs)
+        answer = await client.ask("tally", RC)
+        apart = fleet.mesh("h1")
+        fleet.network.isolate(apart)
+        second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
+        await second.start()
+        assert second.instances.standing is Standing.SERVES
+        fleet.network.heal()
+        await until(lambda: second.instances.standing is Standing.STANDS_BY)
+        assert await confirms(client, grant_of(answer)) == [None]
+        assert (told(first), told(second)) == (["begin tally"], [])
+
+    run(story())
+
+
+def test_after_a_change_of_rcm_the_one_with_the_hold_is_meant() -> None:
+    async def story() -> None:
+        fleet = FakeFleet("h2", "h1")
+        candidates = [fleet.candidate(host) for host in ("h1", "h2")]
+        await until(lambda: candidates[1].rcm)
+        first = await offer(fleet, "h9")
+        client = fleet.client("one")
+        await until(lambda: candidates[1].rcm and candidates[1].rcm.core.status().rcs)
+        answer = await client.ask("tally", RC, seconds=600)
+        client.open = [OpenRequest("tally", "tally", {RC: {}}, 0, Decimal(600), place=answer.place)]
+        second = await offer(fleet, "h0")
+        await asyncio.sleep(0.1)
+        second.instances.take(second.instance)  # as though it had not heard
+        await candidates[1].stop()
+        await until(lambda: second.instances.standing is Standing.STANDS_BY)
+        assert await confirms(client, grant_of(answer)) == [None]
+        assert told(second) == []
+        assert told(first) == ["begin tally"]
+        await candidates[0].stop()
+
+    run(story())
+
+
+def test_a_new_instance_on_the_same_host_follows_at_once_and_the_hold_ends() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm()
+        first = await offer(fleet, "h2")
+        client = fleet.client("one")
+        await until(lambda: rcm.core.status().rcs)
+        before = grant_of(await client.ask("tally", RC))
+        fleet.network.freeze(first.mesh)
+        first.supervisor.cancel()
+        began = fleet.watcher.now()
+        second = await offer(fleet, "h2")
+        assert second.instances.standing is Standing.SERVES
+        await until(lambda: [one for one in client.notices if one.grant is not None and one.grant > before])
+        assert fleet.watcher.now() - began < SECOND // 2
+        assert told(second) == ["begin tally"]
+        await asyncio.sleep(2)
+        assert client.notices[-1].state == "running"
+
+    run(story())

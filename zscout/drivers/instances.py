@@ -1,0 +1,109 @@
+"""Which instance of an RC serves: two nodes may offer devices under one name, and one of them is meant.
+
+An instance that finds another one on the mesh, or that an RCM does not name, stands by: it holds nothing, answers
+nothing and keeps its token. When the one that serves has not been seen for the hold lease, and so has let go of
+everything, this one offers itself, and serves once an RCM names it."""
+
+from __future__ import annotations
+
+import asyncio
+import enum
+import logging
+from collections.abc import Callable
+
+from zscout.keyexpr import Token
+from zscout.mesh import Declaration, Mesh, Supervisor
+from zscout.types import HostName
+
+log = logging.getLogger(__name__)
+
+
+class Standing(enum.Enum):
+    SERVES = "serves"
+    OFFERED = "offered"
+    """It tells its state to an RCM that may take it in."""
+    STANDS_BY = "stands by"
+
+
+class Instances:
+    """Follows the instances of `rc`, of which `instance` is this one. `hold_lease` is in seconds."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        rc: str,
+        instance: str,
+        supervisor: Supervisor,
+        on_change: Callable[[], object],
+        *,
+        hold_lease: float,
+    ) -> None:
+        self._mesh, self._rc, self.instance, self._hold_lease = mesh, rc, instance, hold_lease
+        self._supervisor, self._on_change = supervisor, on_change
+        self.standing = Standing.SERVES
+        self._serves = instance
+        """The instance that serves, as far as this one knows."""
+        self._others: dict[str, Token] = {}
+        """The other ones that have a token."""
+        self._waiting: asyncio.TimerHandle | None = None
+
+    @property
+    def duplicate_of(self) -> str:
+        """For which one it stands by, in words; empty if it serves."""
+        if self.standing is Standing.SERVES:
+            return ""
+        other = self._others.get(self._serves)
+        return f"{self._rc} at {other.host}" if other is not None else f"{self._rc} elsewhere"
+
+    def watch(self) -> Declaration:
+        return self._mesh.watch(self._mesh.keys.alive_rc(self._rc), self._supervisor.guard(self._on_token))
+
+    def begin(self) -> None:
+        """Stands by from the beginning where another host offers the RC. On its own host it is its successor."""
+        elsewhere = [token for token in self._others.values() if token.host != self._mesh.me.host]
+        if elsewhere and self.standing is Standing.SERVES:
+            self.take(min(elsewhere).instance)
+
+    def take(self, named: str, host: HostName | None = None) -> None:
+        """An RCM that is obeyed names this instance, of `host` if that was said."""
+        if named == self.instance:
+            self._become(Standing.SERVES)
+        elif (self._others[named].host if named in self._others else host) != self._mesh.me.host:
+            self._serves = named
+            if named not in self._others:
+                self._wait()
+            self._become(Standing.STANDS_BY)
+
+    def _on_token(self, token: Token, alive: bool) -> None:
+        if token.instance == self.instance:
+            return
+        if alive:
+            self._others[token.instance] = token
+            if token.instance == self._serves:
+                self._cancel()
+        else:
+            self._others.pop(token.instance, None)
+            if token.instance == self._serves:
+                self._wait()
+
+    def _wait(self) -> None:
+        self._cancel()
+        self._waiting = self._supervisor.call_later(self._hold_lease, self._offer)
+
+    def _cancel(self) -> None:
+        if self._waiting is not None:
+            self._waiting.cancel()
+
+    def _offer(self) -> None:
+        if self.standing is Standing.STANDS_BY:
+            self._become(Standing.OFFERED)
+
+    def _become(self, standing: Standing) -> None:
+        if standing is self.standing:
+            return
+        self.standing = standing
+        if standing is Standing.STANDS_BY:
+            log.warning("%s stands by: duplicate of %s", self._rc, self.duplicate_of)
+        else:
+            log.info("%s %s", self._rc, standing.value)
+        self._on_change()

@@ -1,0 +1,177 @@
+"""Components of a simulated fleet: their own code, each in a process of the simulation instead of the system's."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Callable
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from zscout import messages
+from zscout.behaviors.client.client import Client, RequestRefused
+from zscout.behaviors.client.placer_client import PlacerClient
+from zscout.behaviors.components import channel
+from zscout.behaviors.components.component import Component, ComponentContext
+from zscout.behaviors.components.lifecycle import ComponentLifecycle
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import RANDOM, Role, Token, new_instance
+from zscout.lab.faults.memory import MemoryMesh
+from zscout.lab.faults.programs import Work
+from zscout.lab.faults.virtual_time import PROCESS, Process
+from zscout.messages import ComponentSpec, LoadReport, MigrateComponent, PlaceComponent
+from zscout.services.node.component_process import ComponentProcess
+
+KIND: Final = "worker"
+KINDS: Final = {KIND: "zscout.lab.faults.components:Worker"}
+SUPERSEDED_WITHIN: Final = 2.0
+"""Seconds without a fault after which no older incarnation acts beside a newer one."""
+STEP: Final = 0.1
+"""Seconds from one piece of work to the next."""
+
+
+class Processes(Protocol):
+    """The processes of a simulation."""
+
+    def open_process(self, name: str) -> tuple[Process, MemoryMesh]:
+        """Another one, with its place on the mesh."""
+
+    def end_process(self, name: str) -> None:
+        """Nothing of it runs any more."""
+
+
+@dataclass(slots=True)
+class Deeds:
+    """What components have done, which no fault touches. `broken(text)` is told of a promise that was not kept."""
+
+    broken: Callable[[str], None]
+    calm: Callable[[], float]
+    """For how many seconds there was no fault: a host that is cut off knows of no newer incarnation."""
+    done: dict[str, dict[str, int]] = field(default_factory=dict)
+    """By component: how much each of its processes had done, the one that acted last at the end."""
+
+    def act(self, component: str, process: str, done: int, restored: int | None) -> None:
+        """`restored`: what it took over of another one, if it was moved."""
+        others = self.done.setdefault(component, {})
+        if process not in others:
+            if restored is not None and restored not in others.values():
+                self.broken(f"{process} goes on from {restored}, which no other one had done: {others}")
+        elif process != next(reversed(others)) and self.calm() > SUPERSEDED_WITHIN:
+            self.broken(f"{process} acts again after {next(reversed(others))}")
+        others.pop(process, None)
+        others[process] = done
+
+
+DEEDS: Final[ContextVar[Deeds]] = ContextVar("DEEDS")
+
+
+class Worker(Component):
+    """Does one piece of work after the other, and counts them."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        self.done = 0
+        self.restored: int | None = None
+
+    async def run(self, context: ComponentContext) -> None:
+        while True:
+            self.done += 1
+            DEEDS.get().act(context.component, _here(), self.done, self.restored)
+            await asyncio.sleep(STEP)
+            await context.safe_point()
+
+    def checkpoint(self) -> bytes:
+        return str(self.done).encode()
+
+    def restore(self, state: bytes) -> None:
+        self.done = self.restored = int(state)
+
+
+def _here() -> str:
+    process = PROCESS.get()
+    assert process is not None  # noqa: S101 - components run in processes
+    return process.name
+
+
+class SimulatedComponent(ComponentProcess):
+    """Its process is one of the simulation; what it and its node say to each other takes no time."""
+
+    processes: Processes
+
+    @property
+    def _name(self) -> str:
+        return f"{self._host}/{self.start.component}.{self.start.incarnation}"
+
+    async def _run_child(self) -> None:
+        node, loop = PROCESS.get(), asyncio.get_running_loop()
+        assert node is not None  # noqa: S101 - its host runs in one
+        process, mesh = self.processes.open_process(self._name)
+        self._child_over = asyncio.Event()
+        self._orders = asyncio.Queue()
+
+        def report(one: channel.ComponentReport) -> asyncio.Future[None]:
+            node.run(loop.call_soon, self._on_message, one)
+            told = loop.create_future()
+            told.set_result(None)
+            return told
+
+        async def connect(name: str, *, fleet: Fleet, host: str) -> Client:
+            return Client(mesh, fleet).start()
+
+        async def live(life: ComponentLifecycle) -> None:
+            ends = await life.run()
+            report(ends)
+            node.run(loop.call_soon, self._kill_child)
+
+        job = channel.ComponentJob(self.start, self._where, self._host, self._fleet, self._tag)
+        life = process.run(ComponentLifecycle, job, report, connect)
+        process.main = process.run(loop.create_task, live(life))
+        if self.phase == "stopping":
+            self._send(channel.Order(0, messages.StopComponent(self.start.component)))
+        ordering = loop.create_task(self._pass_on(process, life, self._orders))
+        try:
+            await self._child_over.wait()
+        finally:
+            ordering.cancel()
+            self._orders = None
+            self._kill_child()
+
+    async def _pass_on(self, process: Process, life: ComponentLifecycle, orders: asyncio.Queue[bytes]) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            order = msgspec.json.decode(await orders.get(), type=channel.Order)
+            process.run(loop.call_soon, life.order, order)
+
+    def _kill_child(self) -> None:
+        self.processes.end_process(self._name)
+        self._child_over.set()
+
+
+async def report_load(mesh: MemoryMesh) -> None:
+    """Publishes the load of an idle host every second: what the balancer must hear of one to choose it."""
+    host, rng = mesh.me.host, RANDOM.get()
+    token = mesh.alive(Token(host, Role.LOAD, mesh.me.client, new_instance()))
+    publisher = mesh.publisher(mesh.keys.load(host), LoadReport)
+    for number in itertools.count(1):
+        load = rng.uniform(0, 2)
+        publisher.put(LoadReport(host, number, 2, (load, load, load), 50 * load, 8 << 30, 16 << 30))
+        await asyncio.sleep(1.0)
+    token.close()
+
+
+async def operate(mesh: MemoryMesh, work: Work, components: int) -> None:
+    """An operator, who has so many components run, and moves one now and then."""
+    rng, placer = RANDOM.get(), PlacerClient(mesh)
+    names = [f"w{number}" for number in range(components)]
+    spec = ComponentSpec(KIND, restart="always")
+    while not work.over:
+        name = rng.choice(names)
+        operation = PlaceComponent(name, spec, wait=3.0) if rng.random() < 0.5 else MigrateComponent(name, wait=5.0)
+        try:
+            await placer.request_once(operation, lambda _: True)
+            work.counts[f"component {operation.__struct_config__.tag}"] += 1
+        except RequestRefused as refused:
+            work.counts[f"component refused {refused.code}"] += 1
+        await asyncio.sleep(rng.uniform(0.5, work.pause))

@@ -1,0 +1,108 @@
+"""A device as the simulation knows it, which no fault touches: it sees who drives it, and what it is told to do.
+
+The promises about a device are checked here, where they count, and not by what services believe."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any, Final
+
+from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
+from zscout.lab.faults.virtual_time import PROCESS, Process
+from zscout.messages import Holder, exact_amounts
+from zscout.types import NO_TERM, Grant
+
+NO_GRANT: Final = Grant(NO_TERM, 0)
+
+
+@dataclass(slots=True)
+class Device:
+    """One device; `broken(text)` is told of a promise that was not kept."""
+
+    name: str
+    capacity: Mapping[str, Fraction] | None
+    """None: it is exclusive."""
+    broken: Callable[[str], None]
+    log: Callable[[str], None]
+    holders: dict[Grant, tuple[Process, Holder]] = field(default_factory=dict)
+    """Who drives it, and in which process the driver is that let them."""
+    newest: Grant = NO_GRANT
+    """Of all commands that it has carried out."""
+
+    def begin(self, process: Process, holder: Holder) -> None:
+        self.log(f"{self.name} begins for {holder.client} {holder.arc} {number(holder.grant)}")
+        self._forget_dead()
+        if self.capacity is None:
+            others = [one for _, one in self.holders.values() if one.place != holder.place]
+            if others:
+                self.broken(f"two holders of {self.name}: {others[0].client} and {holder.client}")
+        self.holders[holder.grant] = process, holder
+        if self.capacity is not None:
+            for parameter, most in self.capacity.items():
+                total = sum(exact_amounts(one.params).get(parameter, Fraction()) for _, one in self.holders.values())
+                if total > most:
+                    self.broken(f"{self.name} carries {float(total):g} of {parameter}, and can carry {float(most):g}")
+
+    def end(self, holder: Holder) -> None:
+        self.log(f"{self.name} ends for {holder.client} {holder.arc} {number(holder.grant)}")
+        self.holders.pop(holder.grant, None)
+
+    def safe(self, process: Process) -> None:
+        """All that this driver let in have gone."""
+        self.log(f"{self.name} is safe")
+        self.holders = {grant: held for grant, held in self.holders.items() if held[0] is not process}
+
+    def command(self, process: Process, holder: Holder) -> None:
+        self._forget_dead()
+        if self.capacity is None and holder.grant < self.newest:
+            self.broken(f"{self.name} obeyed {number(holder.grant)} after {number(self.newest)}")
+        if holder.grant not in self.holders:
+            self.broken(f"{self.name} obeyed {holder.client}, who does not hold it")
+        self.newest = max(self.newest, holder.grant)
+
+    def _forget_dead(self) -> None:
+        # What a driver let in that was killed drives nothing any more: commands went through it.
+        self.holders = {grant: held for grant, held in self.holders.items() if not held[0].dead}
+
+
+def number(grant: Grant) -> str:
+    return f"{grant.term.counter}.{grant.seq}"
+
+
+class _Watched:
+    """A driver's part that tells its device."""
+
+    device: Device
+
+    async def begin(self, holder: Holder) -> None:
+        self.device.begin(_here(), holder)
+
+    async def end(self, holder: Holder) -> None:
+        self.device.end(holder)
+
+    async def safe(self) -> None:
+        self.device.safe(_here())
+
+    async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
+        self.device.command(_here(), holder)
+        return await super().command(holder, do)  # type: ignore[misc]
+
+
+class WatchedExclusive(_Watched, ExclusiveDriver):
+    def __init__(self, device: Device) -> None:
+        super().__init__()
+        self.device = device
+
+
+class WatchedCapacity(_Watched, CapacityDriver):
+    def __init__(self, device: Device) -> None:
+        super().__init__(device.capacity or {})
+        self.device = device
+
+
+def _here() -> Process:
+    process = PROCESS.get()
+    assert process is not None  # noqa: S101 - drivers run in nodes
+    return process

@@ -1,0 +1,186 @@
+"""The guards of the protocol, each of which can be taken out of a simulated fleet: without it some promise must break.
+
+What is taken out is one decision in one function, so that the rest of the fleet is as it is."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
+
+from msgspec.structs import replace
+
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.rcm_link import RcmLink
+from zscout.behaviors.client.request import OpenArc
+from zscout.drivers.holds import HoldChange, HoldEntry, HoldTable
+from zscout.drivers.instances import Instances
+from zscout.drivers.resource_controller import ResourceController
+from zscout.messages import Problem
+from zscout.services.rcm import candidate, membership, recovery
+from zscout.services.rcm.election import Election
+from zscout.services.rcm.membership import Membership
+from zscout.services.rcm.rcm import Rcm
+from zscout.services.rcm.registry import RequestRegistry
+from zscout.services.rcm.request_handler import RequestHandler
+from zscout.types import NO_TERM, Grant, Ns, Term
+
+ABSENT: Final = object()
+
+
+class Guard(NamedTuple):
+    what: str
+    """What it demands."""
+    without: Mapping[tuple[Any, str], Any]
+    """By class or module and name: what stands there instead. (`all` of a module hides the one of Python.)"""
+
+
+def _nothing(*_: object, **__: object) -> None:
+    return None
+
+
+def _no(*_: object, **__: object) -> bool:
+    return False
+
+
+def _yes(*_: object, **__: object) -> bool:
+    return True
+
+
+def _promise(self: HoldTable, term: Term, _now: Ns, **_: object) -> bool:
+    return term >= self.term
+
+
+def _accept(self: HoldTable, update: Any, _change: HoldChange, now: Ns) -> bool:
+    self.term, self.seq, self.last_contact = update.term, update.seq, now
+    return True
+
+
+_check = HoldTable.check
+_remove = HoldTable._remove
+_expire = HoldTable.expire
+_apply_grants = HoldTable.apply_grants
+_as_asked = OpenArc._as_asked
+_take = OpenArc.take
+
+
+def _check_any(self: HoldTable, grant: Grant, client: str, now: Ns) -> Problem | None:
+    problem = _check(self, grant, client, now)
+    if problem is not None and self.held and grant not in self.held:
+        held = next(iter(self.held.values()))
+        self.held[grant] = HoldEntry(replace(held.holder, grant=grant), held.end)
+        return None
+    return problem
+
+
+def _forget_ended(self: HoldTable, *args: Any, **how: Any) -> None:
+    _remove(self, *args, **how)
+    self._ended.clear()
+
+
+def _expire_by_time(self: HoldTable, now: Ns, *, lease: bool = True) -> HoldChange:
+    return _expire(self, now, lease=False)
+
+
+def _miss_nothing(self: HoldTable, *args: Any, **how: Any) -> HoldChange:
+    change = _apply_grants(self, *args, **how)
+    change.reread = False
+    return change
+
+
+async def _begin_first(self: ResourceController, change: HoldChange) -> None:
+    for holder in change.began:
+        await self._guard(self.driver.begin(holder))
+    for holder in change.removed_not_handed_over:
+        await self._guard(self.driver.end(holder))
+    if change.removed and change.interrupts:
+        await self._guard(self.driver.safe())
+
+
+async def _never(*_: object) -> None:
+    await asyncio.Event().wait()
+
+
+async def _enter_at_once(*_: object) -> list[Any]:
+    return []
+
+
+def _without_place(self: OpenArc, now: Ns, grant: Grant | None) -> dict[str, Any]:
+    return _as_asked(self, now, grant) | {"place": None}
+
+
+def _take_any(self: OpenArc, *args: Any) -> bool:
+    self.last = (NO_TERM, 0)
+    return _take(self, *args)
+
+
+def _accept_any(self: RcmLink, term: Term, **_: object) -> bool:
+    self.term = max(self.term, term)
+    return True
+
+
+def _alone(rc: str, _states: object) -> set[str]:
+    return {rc}
+
+
+GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
+    {
+        "promise": Guard("an RC that answered a new leader obeys no older one", {(HoldTable, "promise"): _promise}),
+        "order": Guard("an RC obeys nothing older than what it heard", {(HoldTable, "_accept"): _accept}),
+        "grant": Guard("a command is obeyed under exactly the grant that is held", {(HoldTable, "check"): _check_any}),
+        "ended": Guard("a grant that ended at an RC does not begin again", {(HoldTable, "_remove"): _forget_ended}),
+        "safe first": Guard(
+            "the device is safe before its next holder begins",
+            {(ResourceController, "_carry_out_change"): _begin_first},
+        ),
+        "gaps": Guard("an RC that missed a publication reads the state", {(HoldTable, "apply_grants"): _miss_nothing}),
+        "reports": Guard("a leader sets right what an RC reports otherwise", {(Rcm, "_compare"): _nothing}),
+        "hold lease": Guard(
+            "without an RCM for the hold lease a hold ends",
+            {(HoldTable, "expire"): _expire_by_time, (RcmLink, "watch_lease"): _never},
+        ),
+        "snapshots": Guard("what a snapshot adds passes the RC's own vote", {(ResourceController, "_carries"): _yes}),
+        "instances": Guard(
+            "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Instances, "take"): _nothing}
+        ),
+        "whole": Guard(
+            "a new leader carries on whole gangs only", {(recovery, "all"): _yes, (membership, "all"): _yes}
+        ),
+        "pending": Guard(
+            "holds wait for the rest of their gang to answer",
+            {(recovery, "gangs_of"): _alone, (membership, "gangs_of"): _alone},
+        ),
+        "majority": Guard("a candidate that RCs contradict waits", {(Election, "must_wait"): _no}),
+        "deposed": Guard("who was deposed waits longer each time", {(Election, "deposed"): _nothing}),
+        "step down": Guard("a leader that sees a higher term steps down", {(candidate.Candidate, "_see"): _yes}),
+        "away": Guard("a leader that was away itself drops nobody for it", {(Membership, "_is_away"): _no}),
+        "reopen": Guard("who was dropped and lives goes on at its place", {(RequestRegistry, "reopens"): _no}),
+        "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
+        "shown": Guard("a worse place is set right", {(OpenArc, "shows_place"): _no}),
+        "notices": Guard("of two notices the newer counts", {(OpenArc, "take"): _take_any}),
+        "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
+        "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
+        "believed": Guard("a client is told of a grant that no RC knows", {(RequestHandler, "_may_hold"): _no}),
+        "confirmed": Guard("a body is entered when all RCs confirm", {(Client, "_confirm"): _enter_at_once}),
+        "withdrawn": Guard("what nobody asks for is given back", {(RcmLink, "_withdraw"): _enter_at_once}),
+    }
+)
+
+
+@contextmanager
+def without(name: str | None) -> Iterator[None]:
+    """Takes a guard out, in this process."""
+    put_back: list[tuple[Any, str, Any]] = []
+    try:
+        for (owner, attribute), instead in GUARDS[name].without.items() if name is not None else ():
+            put_back.append((owner, attribute, vars(owner).get(attribute, ABSENT)))
+            setattr(owner, attribute, instead)
+        yield
+    finally:
+        for owner, attribute, before in put_back:
+            if before is ABSENT:
+                delattr(owner, attribute)
+            else:
+                setattr(owner, attribute, before)

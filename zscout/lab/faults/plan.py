@@ -1,0 +1,81 @@
+"""What goes wrong in a run, and when: drawn from the seed before the run begins, so that a fault can be left out."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from zscout.lab.faults.memory import Disturbance
+
+FaultKind: TypeAlias = Literal["freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "forget", "double"]
+
+KINDS: tuple[FaultKind, ...] = ("freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "double")
+MESSAGES = ("grants", "rc/state", "rcm/state", "schedule", "notice", "requests", "command", "vote", "alive")
+"""Kinds of messages that may be disturbed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """From `at` on, for `lasts` seconds."""
+
+    at: float
+    lasts: float
+    kind: FaultKind
+    whom: tuple[str, ...]
+    """Processes or hosts; of a partition one side of it; of a cut from whom and to whom; an RC and a host."""
+    both: bool = True
+    """Of a cut: in both directions. Of a double: it leaves in order."""
+    message: str = ""
+    how: Disturbance = field(default_factory=Disturbance)
+
+    def __str__(self) -> str:
+        what = {
+            "freeze": "stands still",
+            "stall": "does not come round to anything",
+            "kill": "is killed, and started again",
+            "cut": "cut from one another" if self.both else "the first can't reach the second",
+            "isolate": "is cut off",
+            "part": "are cut off from all others",
+            "disturb": f"disturbed: {self.message} {self.how}",
+            "double": "offers it as well",
+            "forget": "links come back without all declarations",
+        }[self.kind]
+        return f"{self.at:7.3f} for {self.lasts:.3f} s: {' '.join(self.whom)} {what}"
+
+
+def draw(
+    seed: int, processes: Sequence[str], hosts: Sequence[str], rcs: Sequence[str], *, count: int, span: float
+) -> list[Fault]:
+    """`count` faults within `span` seconds, most of them 0.5 to 1.5 s long: about a lease, the worst there is."""
+    rng = random.Random(f"faults {seed}")  # noqa: S311 - what failed once must fail again
+    faults = []
+    for _ in range(count):
+        at = 3.0 + rng.random() * (span - 3.0)
+        lasts = rng.uniform(0.5, 1.5) if rng.random() < 0.7 else rng.uniform(0.05, 6.0)
+        kind = rng.choice(KINDS)
+        whom: tuple[str, ...] = ()
+        match kind:
+            case "freeze" | "stall" | "kill":
+                whom = (rng.choice(processes),)
+            case "cut":
+                whom = tuple(rng.sample(hosts, 2))
+            case "isolate":
+                whom = (rng.choice(hosts),)
+            case "double":
+                whom, lasts = (rng.choice(rcs), rng.choice(hosts)), 5 * lasts
+            case "part":
+                whom = tuple(sorted(rng.sample(hosts, rng.randrange(1, len(hosts)))))
+        how = Disturbance()
+        if kind == "disturb":
+            lasts *= 3
+            how = Disturbance(
+                lost=rng.choice((0, 0, 0.1, 0.5, 1.0)),
+                twice=rng.choice((0, 0.3)),
+                late=rng.choice((0, 0.3)),
+                by=rng.choice((0.05, 0.5, 2.0)),
+                old=rng.choice((0, 0, 0.2)),
+            )
+        faults.append(Fault(at, lasts, kind, whom, rng.random() < 0.7, rng.choice(MESSAGES), how))
+    return sorted(faults, key=lambda fault: fault.at)

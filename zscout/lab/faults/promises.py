@@ -1,0 +1,218 @@
+"""What zscout promises under every fault, as far as it shows in a simulated fleet: the list of docs/promises.md.
+
+Promises about a device are kept by `device.py`, which sees them at every event; here are those about what clients and
+leaders believe. Some hold only once they had time to come right: their clocks start anew with every fault."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from itertools import product
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from zscout.scheduling.model import ArcStatus
+from zscout.scheduling.reason import ReasonCode
+from zscout.types import ArcId, Grant, Ns, Place, Term
+
+if TYPE_CHECKING:
+    from zscout.behaviors.client.client import Client
+    from zscout.behaviors.client.request import OpenArc
+    from zscout.drivers.resource_controller import ResourceController
+    from zscout.services.rcm.rcm import Rcm
+
+HALF_A_GANG: Final = 2.0
+"""Seconds beyond the hold lease for which a client may believe in a hold that not all of its RCs have."""
+COME_RIGHT: Final = 3.0
+"""Seconds without any fault within which a leader that RCs have left has stepped down, and the leader has everybody
+at the place that it knows of."""
+MOST_TERMS: Final = 4
+TERMS_WITHIN: Final = 10.0
+"""Seconds in which no more terms begin: two faults at one time cost one or two each."""
+UNLED: Final = 0.5
+"""Seconds beyond the hold lease after which an RC that hears no RCM is held by nobody."""
+GIVEN_BACK: Final = 3.0
+"""Seconds after which no RC begins any more for an ARC that its client has ended."""
+LEFT_OVER: Final = 7.0
+"""Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
+
+Standing: TypeAlias = tuple[int, Ns, Place]
+
+
+class Promises:
+    """Told what happens; `broken(text)` is told of a promise that was not kept. Times are virtual seconds.
+
+    `strict`: the strategy grants in rank order, whatever was promised."""
+
+    def __init__(
+        self, broken: Callable[[str], None], now: Callable[[], float], hold_lease: float, *, strict: bool
+    ) -> None:
+        self._broken, self._now, self._strict = broken, now, strict
+        self._half_a_gang = hold_lease + HALF_A_GANG
+        self.terms: dict[Term, float] = {}
+        """Of every leader that was seen, and when it was seen first."""
+        self._told: dict[str, tuple[Term, int]] = {}
+        """By ARC: (term, step) of the newest that its client was told."""
+        self._arc_of: dict[str, str] = {}
+        """By grant that was published."""
+        self._over: dict[str, float] = {}
+        """ARCs that their clients have ended, and when."""
+        self._places: dict[tuple[str, str], Place] = {}
+        self._heard: dict[str, tuple[Any, int]] = {}
+        """By instance of an RC: the newest (term, seq)."""
+        self._promised: dict[str, Any] = {}
+        self._held: dict[str, set[str]] = {}
+        self._ended: dict[str, set[str]] = {}
+        self._since: dict[tuple[object, ...], float] = {}
+        """Since when each thing that may not last is so."""
+        self._running: dict[Term, set[Grant]] = {}
+        self._queued: dict[Term, dict[ArcId, Standing]] = {}
+
+    def event(self, what: Mapping[str, Any]) -> None:
+        """A line of `zscout.trace`: at every event, what an RC may not do whatever it hears."""
+        if what["do"] == "publish":
+            for holders in what["rcs"].values():
+                self._arc_of |= {str(grant): arc for grant, arc, *_ in holders}
+            return
+        rc, instance, known = what["rc"], what["instance"], (what["term"], what["seq"])
+        before = self._heard.get(instance, known)
+        if known < before:
+            self._broken(f"{rc} went back from {before} to {known}")
+        self._heard[instance] = max(known, before)
+        promised = self._promised.get(instance, known[0])
+        if known[0] < promised:
+            self._broken(f"{rc} obeys {known[0]}, and has promised {promised}")
+        if what["do"] == "promise":
+            self._promised[instance] = max(what["promised"], promised)
+        for grant in {str(grant) for grant in what["holds"]} - self._held.get(instance, set()):
+            arc = self._arc_of.get(grant, "")
+            if self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
+                self._broken(f"{rc} begins for {arc}, which its client has ended")
+        held, ended = {str(grant) for grant in what["holds"]}, self._ended.setdefault(instance, set())
+        ended |= self._held.get(instance, set()) - held
+        if again := held & ended:
+            self._broken(f"{rc} holds {', '.join(sorted(again))} again")
+        self._held[instance] = held
+        if what["do"] == "command" and str(what["grant"]) not in held:
+            self._broken(f"{rc} obeyed a command under {what['grant']}, which it does not hold")
+
+    def forget_client(self, name: str) -> None:
+        """It died: what it was promised was to that life."""
+        self._places = {key: place for key, place in self._places.items() if key[0] != name}
+
+    def told(self, name: str, arc: OpenArc, term: Term, *, touched: bool) -> None:
+        """A client, which believes no term below `term`, has news of one of its requests. `touched`: a fault may be
+        felt by it or by the RCs that the request names."""
+        full = f"{name}/{arc.id}"
+        known = self._told.get(full, arc.last)
+        if arc.last != known and arc.last < max(known, (term, 0)):
+            self._broken(f"{name} {arc.name} believes {arc.last} after {max(known, (term, 0))}")
+        self._told[full] = max(arc.last, known)
+        if arc.open:
+            self._over.pop(full, None)
+        else:
+            self._over.setdefault(full, self._now())
+        if arc.outcome in ("lost", "client_lost") and not touched:
+            self._broken(f"{name} {arc.name} {arc.outcome}, though no fault touched it: {arc.reason}")
+        if arc.place is not None:
+            before = self._places.setdefault((name, arc.id), arc.place)
+            if arc.place > before:
+                self._broken(f"the place of {name} {arc.name} got worse: {before}, then {arc.place}")
+        if arc.outcome == "client_lost" and not arc.open:
+            self._broken(f"{name} lives, and was dropped")
+
+    def look(
+        self,
+        clients: Mapping[str, Client],
+        rcs: Mapping[str, ResourceController],
+        leaders: Mapping[str, Rcm],
+        silence: Mapping[str, Ns],
+        *,
+        calm: bool,
+    ) -> None:
+        """What must be so at any time, of processes that do not stand still. `silence`: for how long each RC that goes
+        on has heard no RCM, by its own clock. `calm`: there is no fault now."""
+        for rcm in leaders.values():
+            self.terms.setdefault(rcm.term, self._now())
+            if self._strict:
+                self._in_order(rcm)
+        lasting = dict.fromkeys(_half_gangs(clients, rcs), self._half_a_gang)
+        lasting |= dict.fromkeys(_unled(rcs, silence), UNLED)
+        if calm:
+            come_right = (*_left(leaders, rcs), *_worse_places(clients, leaders), *_doubles(rcs))
+            lasting |= dict.fromkeys(come_right, COME_RIGHT)
+        self._since = {key: self._since.get(key, self._now()) for key in lasting}
+        for key, longest in lasting.items():
+            if self._now() - self._since[key] > longest:
+                self._broken(f"for more than {longest:g} s: {' '.join(map(str, key))}")
+
+    def _in_order(self, rcm: Rcm) -> None:
+        """Of two that wait, the better-ranked is granted first, if it needs no more than what the other got."""
+        running, queued = self._running.get(rcm.term, set()), self._queued.get(rcm.term, {})
+        status = rcm.core.status()
+        granted = [arc for arc in status.running if arc.hold and arc.hold.grant not in running and arc.id in queued]
+        waited = [arc for arc in status.queued if queued.get(arc.id) == _rank(arc)]
+        for arc, other in product(granted, waited):
+            if _rank(other) < _rank(arc) and other.needs.keys() <= arc.needs.keys():
+                self._broken(f"{arc.name} was granted before {other.name}, which ranks before it")
+        self._running[rcm.term] = {arc.hold.grant for arc in status.running if arc.hold is not None}
+        sharable = {rc.name for rc in status.rcs if rc.sharable}
+        self._queued[rcm.term] = {
+            arc.id: _rank(arc)
+            for arc in status.queued
+            if not arc.needs.keys() & sharable and (arc.reported is None or arc.reported.code is ReasonCode.HELD)
+        }
+
+    def at_end(self, clients: Mapping[str, Client], leaders: Mapping[str, Rcm]) -> None:
+        """Everything was served, and `LEFT_OVER` is over."""
+        begun = sorted(self.terms.values())
+        for at in begun:
+            if (terms := sum(at <= other < at + TERMS_WITHIN for other in begun)) > MOST_TERMS:
+                self._broken(f"{terms} terms began within {TERMS_WITHIN:g} s")
+        for name, client in clients.items():
+            if left := {*client._store.arcs, *client._store.withdrawn}:
+                self._broken(f"{name} still keeps {', '.join(sorted(left))}")
+        for host, rcm in leaders.items():
+            state, requests = rcm.core.status(), rcm.requests
+            left = {arc.id for arc in (*state.running, *state.queued)} | requests.waiting.keys() | requests.given_up
+            if left:
+                self._broken(f"the leader on {host} still keeps {', '.join(sorted(left))}")
+
+
+def _rank(arc: ArcStatus) -> Standing:
+    return (-arc.request.priority, arc.request.min_runtime, arc.place)
+
+
+def _half_gangs(clients: Mapping[str, Client], rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
+    held = {(rc.name, grant) for rc in rcs.values() for grant in rc.holds.held}
+    for name, client in clients.items():
+        for arc in client._store.open:
+            if arc.grant is not None and not all((rc, arc.grant) in held for rc in arc.rcs):
+                yield name, "believes in", arc.grant, "which not all of its RCs hold"
+
+
+def _unled(rcs: Mapping[str, ResourceController], silence: Mapping[str, Ns]) -> Iterator[tuple[object, ...]]:
+    for key, span in silence.items():
+        if rcs[key].holds.held and span > rcs[key].holds.hold_lease:
+            yield key, "is held, and has heard no RCM for the hold lease"
+
+
+def _doubles(rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
+    held = Counter(rc.name for rc in rcs.values() if rc.holds.held)
+    for name, instances in held.items():
+        if instances > 1:
+            yield name, "is held in several instances"
+
+
+def _left(leaders: Mapping[str, Rcm], rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
+    for host, rcm in leaders.items():
+        if any(rc.holds.term > rcm.term for rc in rcs.values()):
+            yield host, "leads in", rcm.term, "though an RC obeys a higher one"
+
+
+def _worse_places(clients: Mapping[str, Client], leaders: Mapping[str, Rcm]) -> Iterator[tuple[object, ...]]:
+    for name, client in clients.items():
+        for arc in client._store.acknowledged:
+            for rcm in leaders.values():
+                known = rcm.core.arc(f"{name}/{arc.id}")
+                if known is not None and arc.place is not None and known.place > arc.place:
+                    yield name, arc.name, "is at a worse place than it was told, in", rcm.term

@@ -1,0 +1,464 @@
+"""A fleet under faults, in virtual time: the services and clients as they are, each process on a mesh in memory.
+
+One seed is one run, to the byte: the work, the faults, the network's delays, and every process's clock and randomness
+come from it. Afterwards all faults are mended, and what was asked must be served."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import hashlib
+import logging
+import random
+from collections import Counter
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any, Final, TypeVar
+
+import msgspec
+from msgspec.structs import replace
+
+from zscout import trace
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
+from zscout.config.fleet import default_fleet
+from zscout.config.node import ComponentsConfig
+from zscout.drivers.resource_controller import ResourceController
+from zscout.keyexpr import Role, Sender, Token, new_instance
+from zscout.lab.faults import plan
+from zscout.lab.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent, operate, report_load
+from zscout.lab.faults.device import Device, WatchedCapacity, WatchedExclusive
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
+from zscout.lab.faults.plan import Fault
+from zscout.lab.faults.programs import Work
+from zscout.lab.faults.promises import LEFT_OVER, Promises
+from zscout.lab.faults.virtual_time import PROCESS, START, Process, VirtualTimeLoop
+from zscout.mesh.supervision import StallWatch
+from zscout.services.node.component_host import ComponentHost
+from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.rcm import Rcm
+from zscout.types import SECOND
+
+T = TypeVar("T")
+
+DEVICES: Final[Mapping[str, Mapping[str, Fraction] | None]] = {
+    "robot/a": None,
+    "robot/b": None,
+    "robot/c": None,
+    "framegrabber/f": None,
+    "radio/r": {"rate": Fraction(10)},
+}
+DRIFT: Final = 0.001
+"""By which clocks run apart at most."""
+SERVED_WITHIN: Final = 60.0
+"""Seconds after the last fault in which all that was asked must have been served."""
+FELT: Final = 5.0
+"""Seconds for which a fault may be felt when it is over: links come back, and holds that were lost are told of."""
+LOOK_EVERY: Final = 0.05
+OPERATOR: Final = "h0/operator"
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How much happens in a run."""
+
+    hosts: int = 3
+    clients: int = 4
+    components: int = 2
+    faults: int = 6
+    span: float = 30.0
+    """Seconds with faults and new requests."""
+    pause: float = 3.0
+    """Seconds from one request of a program to its next, at most."""
+
+    @classmethod
+    def of(cls, seed: int) -> Size:
+        """Every tenth run is a long one of many."""
+        return cls(hosts=4, clients=20, faults=30, span=300.0, pause=60.0) if seed % 10 == 9 else cls()
+
+
+@dataclass(slots=True)
+class Result:
+    seed: int
+    faults: list[Fault]
+    broken: list[str] = field(default_factory=list)
+    """Promises that were not kept, each with the time."""
+    lines: list[str] = field(default_factory=list)
+    trace: list[str] = field(default_factory=list)
+    """What became of holds, in the order in which it came about (`zscout.trace`)."""
+    digest: str = ""
+    """Of everything that arrived anywhere, in order."""
+    counts: Counter[str] = field(default_factory=Counter)
+    served_after: float = 0.0
+    """Seconds from the end of the last fault until all was served."""
+
+
+def simulate(
+    seed: int, size: Size | None = None, faults: Sequence[Fault] | None = None, *, traced: bool = False
+) -> Result:
+    """One run. `faults` in place of those that the seed draws; `traced`: with the trace of what became of holds."""
+    fleet = Simulation(seed, size or Size.of(seed), faults, traced=traced)
+    logger, handler = logging.getLogger("zscout"), _Lines(fleet)
+    before = logger.level, logger.propagate
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    trace.log.setLevel(logging.DEBUG)
+    logger.propagate = False
+    collecting = gc.isenabled()
+    gc.disable()  # what dies is to die at its place in the run
+    try:
+        with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
+            runner.get_loop().set_exception_handler(fleet.on_exception)
+            return runner.run(fleet.run())
+    finally:
+        logger.removeHandler(handler)
+        logger.level, logger.propagate = before
+        trace.log.setLevel(logging.NOTSET)
+        if collecting:
+            gc.enable()
+
+
+class Simulation:
+    def __init__(self, seed: int, size: Size, faults: Sequence[Fault] | None, *, traced: bool = False) -> None:
+        self.seed, self.size, self._traced = seed, size, traced
+        self.random = random.Random(f"fleet {seed}")  # noqa: S311 - what failed once must fail again
+        self.hosts = [f"h{number}" for number in range(size.hosts)]
+        self.clients = {f"{self.random.choice(self.hosts)}/c{number}": None for number in range(size.clients)}
+        fleet = default_fleet()
+        self.fleet = replace(fleet, strategy=self.random.choice(("priority", "adaptive")))
+        self.where = {rc: f"{self.random.choice(self.hosts)}/{self._program(rc)}" for rc in DEVICES}
+        """In which process each RC is: in its host's node, or in one of its own, without a candidate beside it."""
+        self.running: dict[str, tuple[Process, MemoryMesh]] = {}
+        self.candidates: dict[str, Candidate] = {}
+        self.rcs: dict[str, ResourceController] = {}
+        self.programs: dict[str, Client] = {}
+        self.busy: dict[str, set[str]] = {}
+        """By program: its ARCs that are not over."""
+        self.present: list[Fault] = []
+        """The faults of now."""
+        self.calm_since = START
+        """When the last fault ended."""
+        self.everybody = [
+            *dict.fromkeys((*(f"{host}/node" for host in self.hosts), *self.where.values(), *self.clients))
+        ]
+        drawn = plan.draw(seed, self.everybody, self.hosts, sorted(DEVICES), count=size.faults, span=size.span)
+        self.faults = drawn if faults is None else list(faults)
+        self.cuts: Counter[tuple[str, str]] = Counter()
+        self.result = Result(seed, self.faults)
+        self.idle, self.failed = asyncio.Event(), asyncio.Event()
+
+    def _program(self, rc: str) -> str:
+        return "node" if self.random.random() < 0.6 else f"rc-{rc.replace('/', '-')}"
+
+    async def run(self) -> Result:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualTimeLoop)  # noqa: S101
+        self.loop, loop.isolated = loop, True
+        self.network = MemoryNetwork(lease=self.fleet.mesh.lease, seed=self.seed)
+        self._digest = hashlib.blake2b(digest_size=16)
+        self.network.trace = self._trace
+        self.devices = {rc: self._device(rc) for rc in DEVICES}
+        DEEDS.set(Deeds(self.broken, lambda: 0.0 if self.present else loop.now - self.calm_since))
+        self.component = type("Component", (SimulatedComponent,), {"processes": self})
+        self.work = Work(DEVICES, self.size.pause, self.result.counts, self.log, self.broken)
+        self.promises = Promises(
+            self.broken,
+            lambda: loop.now,
+            self.fleet.timing.hold_lease / SECOND,
+            strict=self.fleet.strategy == "priority",
+        )
+        for name in (*self.everybody, OPERATOR):
+            self.start(name)
+        look = asyncio.create_task(self._look())
+        timers = [loop.call_later(fault.at, self._begin, fault) for fault in self.faults]
+        done = asyncio.create_task(self._served())
+        failed = asyncio.create_task(self.failed.wait())
+        await asyncio.wait({done, failed}, return_when=asyncio.FIRST_COMPLETED)
+        for timer in timers:
+            timer.cancel()
+        for task in (look, done, failed):
+            task.cancel()
+        self.result.digest = self._digest.hexdigest()
+        for process, mesh in self.running.values():
+            process.kill()
+            self.network.kill(mesh)
+        return self.result
+
+    async def _served(self) -> None:
+        """All faults are mended, and then all that was asked for is served."""
+        await asyncio.sleep(self.size.span)
+        self.work.over = True
+        end = max([self.size.span, *(fault.at + fault.lasts for fault in self.faults)])
+        await asyncio.sleep(max(0.0, START + end - self.loop.now))
+        self.log("all faults are mended")
+        mended = self.loop.now
+        try:
+            async with asyncio.timeout(SERVED_WITHIN):
+                await self.idle.wait()
+        except TimeoutError:
+            waiting = ", ".join(f"{name} {arc}" for name, arcs in self.busy.items() for arc in sorted(arcs))
+            self.broken(f"not served within {SERVED_WITHIN:g} s: {waiting}")
+        self.result.served_after = self.loop.now - mended
+        await asyncio.sleep(LEFT_OVER)
+        self.promises.at_end(self._alive(self.programs), self._leaders())
+        self.result.counts["terms"] += len(self.promises.terms)
+
+    # What is seen
+
+    def log(self, text: str) -> None:
+        process = PROCESS.get()
+        who = "" if process is None else process.name
+        self.result.lines.append(f"{self.loop.now - START:8.3f}  {who:8}  {text}")
+
+    def broken(self, text: str) -> None:
+        """A promise was not kept."""
+        process = PROCESS.get()
+        if process is not None and process.dead:
+            return
+        self.log(f"BROKEN: {text}")
+        self.result.broken.append(f"{self.loop.now - START:.3f} {text}")
+        self.failed.set()
+
+    def on_exception(self, _loop: object, context: dict[str, Any]) -> None:
+        self.broken(f"an error that nobody saw: {context.get('exception') or context['message']!r}")
+
+    def _trace(self, source: str, target: str, kind: str, args: tuple[Any, ...]) -> None:
+        self.result.counts["messages"] += 1
+        payload = next((arg for arg in args if isinstance(arg, bytes)), b"")
+        self._digest.update(f"{self.loop.now:.9f} {source} {target} {kind} ".encode() + payload)
+
+    def on_trace(self, line: str) -> None:
+        if self._traced:
+            self.result.trace.append(line)
+        self.promises.event(msgspec.json.decode(line))
+
+    async def _look(self) -> None:
+        while True:
+            await asyncio.sleep(LOOK_EVERY)
+            silence = {
+                key: process.run(rc.mesh.now) - rc.holds.last_contact
+                for key, rc in self.rcs.items()
+                if not (process := self.running[key.split()[0]][0]).stopped
+            }
+            clients = self._alive(self.programs)
+            self.promises.look(clients, self.rcs, self._leaders(), silence, calm=not self.present)
+            if self.work.over and not any(self.busy.values()):
+                self.idle.set()
+
+    def _alive(self, of: dict[str, T]) -> dict[str, T]:
+        """Without those that stand still."""
+        return {name: one for name, one in of.items() if not self.running[name][0].stopped}
+
+    def _leaders(self) -> dict[str, Rcm]:
+        candidates = {f"{host}/node": one for host, one in self.candidates.items()}
+        return {name: one.rcm for name, one in self._alive(candidates).items() if one.rcm is not None}
+
+    # Processes
+
+    def start(self, name: str) -> None:
+        process, mesh = self.open_process(name)
+        process.run(self._start, process, name, mesh)
+
+    def open_process(self, name: str) -> tuple[Process, MemoryMesh]:
+        rng = self.random
+        process = Process(
+            name,
+            seed=(self.seed, rng.random()),
+            rate=1 + rng.uniform(-DRIFT, DRIFT) / 2,
+            boot=rng.uniform(100, 1_000_000),
+        )
+        self.running[name] = process, process.run(self.network.open, self.fleet.name, Sender(*name.split("/")))
+        self._cut()
+        return self.running[name]
+
+    def end_process(self, name: str) -> None:
+        process, mesh = self.running[name]
+        if not process.dead:
+            process.kill()
+            self.network.kill(mesh)
+
+    def _start(self, process: Process, name: str, mesh: MemoryMesh) -> None:
+        host, program = name.split("/")
+        main: Coroutine[Any, Any, None]
+        if program == "node":
+            main = self._node(host, mesh)
+        elif name in self.where.values():
+            main = self._offer_all(mesh, StallWatch(mesh.now).start())
+        elif name == OPERATOR:
+            main = operate(mesh, self.work, self.size.components)
+        else:
+            main = self._client(name, mesh)
+        process.main = asyncio.create_task(self._guard(main))
+
+    async def _guard(self, main: Coroutine[Any, Any, None]) -> None:
+        try:
+            await main
+        except BaseException as error:
+            self.broken(f"it ended with {error!r}")
+            raise
+
+    async def _node(self, host: str, mesh: MemoryMesh) -> None:
+        stall = StallWatch(mesh.now).start()
+        mesh_token = mesh.alive(Token(host, Role.NODE, "node", new_instance()))
+        await self._offer_all(mesh, stall)
+        candidate = self.candidates[host] = Candidate(mesh, self.fleet)
+        candidate.start()
+        component_host = ComponentHost(
+            mesh, self.fleet, ComponentsConfig(), self._on_failure, kinds=lambda: KINDS, process=self.component
+        )
+        await component_host.start()
+        await report_load(mesh)
+        mesh_token.close()
+
+    def _device(self, rc: str) -> Device:
+        return Device(rc, DEVICES[rc], self.broken, self.log)
+
+    async def _offer(self, name: str, device: Device, mesh: MemoryMesh, stall: StallWatch) -> ResourceController:
+        driver = WatchedExclusive(device) if device.capacity is None else WatchedCapacity(device)
+        lease = self.fleet.timing.hold_lease / SECOND
+        rc = ResourceController(mesh, name, driver, hold_lease=lease, stall=stall, on_failure=self._on_failure)
+        await rc.start()
+        self.rcs[f"{mesh.me} {name}"] = rc
+        return rc
+
+    async def _offer_all(self, mesh: MemoryMesh, stall: StallWatch) -> None:
+        """The RCs of this process."""
+        for rc in [rc for rc, at in self.where.items() if at == str(mesh.me)]:
+            await self._offer(rc, self.devices[rc], mesh, stall)
+
+    async def _spare(self, name: str, mesh: MemoryMesh, leaves: asyncio.Event) -> None:
+        """Another device of this name on another host, until it `leaves`."""
+        rc = await self._offer(name, self._device(name), mesh, StallWatch(mesh.now).start())
+        await leaves.wait()
+        await rc.stop()
+        self.rcs.pop(f"{mesh.me} {name}", None)
+
+    def _on_failure(self, error: Exception) -> None:
+        self.broken(f"a service failed: {error!r}")
+
+    async def _client(self, name: str, mesh: MemoryMesh) -> None:
+        client = self.programs[name] = Client(mesh, self.fleet).start()
+        busy = self.busy[name] = set()
+
+        def watch(arc: OpenArc) -> None:
+            self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
+            self.promises.told(name, arc, client.term, touched=self._touched(name, *arc.rcs, *arc.needs))
+
+        client.watch(watch)
+        await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
+
+    # Faults
+
+    def _touched(self, *whom: str) -> bool:
+        """Whether a fault may be felt by these processes and RCs: one of now, or one that was over lately."""
+        names = {*whom, *(self.where[rc] for rc in whom if rc in self.where)}
+        lately = self.loop.now - START - FELT
+        faults = [
+            fault for fault in self.faults if fault.at < self.loop.now - START and fault.at + fault.lasts > lately
+        ]
+        return any(fault.kind not in ("freeze", "stall", "kill") or names & {*fault.whom} for fault in faults)
+
+    def _begin(self, fault: Fault) -> None:
+        self.log(f"FAULT {fault}")
+        self.result.counts["faults"] += 1
+        end: Callable[[], None]
+        match fault.kind:
+            case "freeze" | "stall":
+                (name,) = fault.whom
+                process, mesh = self.running[name]
+                if process.stopped or process.dead:
+                    return
+                if fault.kind == "freeze":
+                    self.network.freeze(mesh)
+                    end = lambda: self.network.thaw(mesh)  # noqa: E731
+                else:
+                    process.stop()
+                    end = process.go_on
+            case "kill":
+                (name,) = fault.whom
+                process, mesh = self.running[name]
+                if process.dead:
+                    return
+                self._kill(name)
+                end = lambda: self.start(name)  # noqa: E731
+            case "cut" | "isolate" | "part":
+                pairs = self._pairs(fault)
+                self.cuts.update(pairs)
+                self._cut()
+                end = lambda: self._mend(pairs)  # noqa: E731
+            case "disturb":
+                self.network.disturb({fault.message: fault.how})
+                end = lambda: self.network.disturb({})  # noqa: E731
+            case "double":
+                rc, host = fault.whom
+                if self.where[rc].startswith(f"{host}/"):
+                    return
+                name, leaves = f"{host}/spare{self.result.counts['faults']}", asyncio.Event()
+                process, mesh = self.open_process(name)
+                process.main = process.run(asyncio.create_task, self._guard(self._spare(rc, mesh, leaves)))
+                end = leaves.set if fault.both else lambda: self._kill_spare(name, rc)
+            case "forget":
+                self.network.forgetful = 0.1
+                end = lambda: setattr(self.network, "forgetful", 0.0)  # noqa: E731
+        self.present.append(fault)
+        self.loop.call_later(fault.lasts, self._end, fault, end)
+
+    def _end(self, fault: Fault, end: Callable[[], None]) -> None:
+        self.log(f"OVER  {fault.kind} {' '.join(fault.whom)}")
+        self.present.remove(fault)
+        self.calm_since = self.loop.now
+        end()
+
+    def _kill(self, name: str) -> None:
+        self.end_process(name)
+        host, program = name.split("/")
+        if program == "node":
+            for other in [other for other in self.running if other.startswith(f"{host}/") and "." in other]:
+                self.end_process(other)
+            self.candidates.pop(host, None)
+        for rc in [key for key in self.rcs if key.startswith(f"{name} ")]:
+            del self.rcs[rc]
+        if name in self.clients:
+            self.programs.pop(name, None)
+            self.busy.pop(name, None)
+            self.promises.forget_client(name)
+
+    def _kill_spare(self, name: str, rc: str) -> None:
+        self.end_process(name)
+        self.rcs.pop(f"{name} {rc}", None)
+
+    def _pairs(self, fault: Fault) -> list[tuple[str, str]]:
+        if fault.kind == "cut":
+            one, other = fault.whom
+            return [(one, other), (other, one)] if fault.both else [(one, other)]
+        side = set(fault.whom)
+        return [(one, other) for one in self.hosts for other in self.hosts if (one in side) != (other in side)]
+
+    def _mend(self, pairs: list[tuple[str, str]]) -> None:
+        self.cuts.subtract(pairs)
+        self._cut()
+
+    def _cut(self) -> None:
+        cuts = +self.cuts
+        self.network.cut_where(lambda one, other: (one.split("/")[0], other.split("/")[0]) in cuts)
+
+
+class _Lines(logging.Handler):
+    """What services log becomes part of the transcript; an error among it is a promise that was not kept."""
+
+    def __init__(self, fleet: Simulation) -> None:
+        super().__init__()
+        self._fleet = fleet
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if record.name == trace.log.name:
+            self._fleet.on_trace(text)
+            return
+        if record.exc_info and record.exc_info[1] is not None:
+            text += f" ({record.exc_info[1]!r})"
+        if record.levelno >= logging.ERROR:
+            self._fleet.broken(text)
+        else:
+            self._fleet.log(text)
