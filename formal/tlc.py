@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import shutil
 import subprocess
@@ -19,6 +20,7 @@ GUARDS: Final = ("fence", "above", "older", "ended", "grant", "whole", "over", "
 INVARIANTS: Final = ("NeverAgain", "Whole", "Final", "Known")
 ACTIONS: Final = ("Fenced", "Forward")
 MEMORY: Final = "-Xmx8g"
+CORES: Final = os.cpu_count() or 1
 
 
 class NoTlc(Exception):
@@ -61,7 +63,7 @@ def jar() -> Path:
     return Path(found.origin).parent / "tla2tools.jar"
 
 
-def check(instance: Instance, *, workers: int | str = "auto") -> Outcome:
+def check(instance: Instance, *, workers: int = CORES) -> Outcome:
     """All states of an instance. Raises NoTlc, and RuntimeError where TLC itself fails."""
     module = (
         "EXTENDS ownership, TLC\n"
@@ -90,7 +92,7 @@ def check(instance: Instance, *, workers: int | str = "auto") -> Outcome:
     return run(module, config, workers=workers)
 
 
-def run(module: str, config: Sequence[str], *, workers: int | str = "auto", options: Sequence[str] = ()) -> Outcome:
+def run(module: str, config: Sequence[str], *, workers: int = CORES, options: Sequence[str] = ()) -> Outcome:
     """TLC on a module `MC` of this text, beside the model."""
     tools = jar()
     with tempfile.TemporaryDirectory(prefix="zscout-model-") as name:

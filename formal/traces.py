@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from formal.tlc import Outcome, run
+from formal.tlc import CORES, Outcome, run
 
 Term: TypeAlias = tuple[int, str]
 Grant: TypeAlias = tuple[Term, int]
@@ -255,7 +255,7 @@ class Behaviour:
         self.actions.append(action)
 
 
-def accept(behaviours: Sequence[Behaviour], *, workers: int | str = "auto") -> tuple[Outcome, str]:
+def accept(behaviours: Sequence[Behaviour], *, workers: int = CORES) -> tuple[Outcome, str]:
     """Whether the model has all of these behaviours: what TLC says, and where one is none: which, and at which action.
 
     Raises NoTlc, RuntimeError."""

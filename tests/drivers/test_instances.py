@@ -9,7 +9,7 @@ from typing import Any
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeClient, FakeFleet, grant_of
 from zscout.drivers.generic import ExclusiveDriver
-from zscout.drivers.instances import Standing
+from zscout.drivers.instances import InstanceState
 from zscout.drivers.resource_controller import ResourceController
 from zscout.lab.faults.memory import MemoryMesh
 from zscout.mesh.supervision import StallWatch
@@ -67,7 +67,7 @@ def test_who_finds_another_instance_stands_by_and_serves_when_its_holds_are_sure
         rcm = fleet.rcm()
         first = await offer(fleet, "h2")
         second = await offer(fleet, "h1")
-        assert [one.instances.standing for one in (first, second)] == [Standing.SERVES, Standing.STANDS_BY]
+        assert [one.instances.state for one in (first, second)] == [InstanceState.SERVES, InstanceState.STANDS_BY]
         assert second._rc_state([]).duplicate_of == "robot/a at h2"
         client = fleet.client("one")
         await until(lambda: rcm.core.status().rcs)
@@ -79,7 +79,7 @@ def test_who_finds_another_instance_stands_by_and_serves_when_its_holds_are_sure
         killed = fleet.watcher.now()
         await until(lambda: told(second))
         assert fleet.watcher.now() - killed >= fleet.fleet.timing.hold_lease
-        assert (told(second), second.instances.standing) == (["begin tally"], Standing.SERVES)
+        assert (told(second), second.instances.state) == (["begin tally"], InstanceState.SERVES)
         again = grant_of(client.notices[-1])
         assert again > grant_of(answer)
         assert await confirms(client, again) == [None]
@@ -117,9 +117,9 @@ def test_of_two_that_did_not_see_each_other_the_one_that_was_taken_in_first_goes
         fleet.network.isolate(apart)
         second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
         await second.start()
-        assert second.instances.standing is Standing.SERVES
+        assert second.instances.state is InstanceState.SERVES
         fleet.network.heal()
-        await until(lambda: second.instances.standing is Standing.STANDS_BY)
+        await until(lambda: second.instances.state is InstanceState.STANDS_BY)
         assert await confirms(client, grant_of(answer)) == [None]
         assert (told(first), told(second)) == (["begin tally"], [])
 
@@ -140,7 +140,7 @@ def test_after_a_change_of_rcm_the_one_with_the_hold_is_meant() -> None:
         await asyncio.sleep(0.1)
         second.instances.take(second.instance)  # as though it had not heard
         await candidates[1].stop()
-        await until(lambda: second.instances.standing is Standing.STANDS_BY)
+        await until(lambda: second.instances.state is InstanceState.STANDS_BY)
         assert await confirms(client, grant_of(answer)) == [None]
         assert told(second) == []
         assert told(first) == ["begin tally"]
@@ -161,7 +161,7 @@ def test_a_new_instance_on_the_same_host_follows_at_once_and_the_hold_ends() -> 
         first.supervisor.cancel()
         began = fleet.watcher.now()
         second = await offer(fleet, "h2")
-        assert second.instances.standing is Standing.SERVES
+        assert second.instances.state is InstanceState.SERVES
         await until(lambda: [one for one in client.notices if one.grant is not None and one.grant > before])
         assert fleet.watcher.now() - began < SECOND // 2
         assert told(second) == ["begin tally"]

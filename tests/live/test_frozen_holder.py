@@ -1,4 +1,5 @@
-"""A client that hangs loses its hold with its lease, and the RC obeys it no more when it wakes."""
+"""A client that hangs loses its hold with its lease; when it wakes, the RC does not obey its old grant, and it waits for
+a new one."""
 
 from __future__ import annotations
 
@@ -54,7 +55,7 @@ def test_a_holder_stopped_is_followed_and_refused_when_it_goes_on(tmp_path: Path
     asyncio.run(story())
 
 
-def test_a_holder_that_wakes_learns_that_its_hold_is_over(tmp_path: Path) -> None:
+def test_a_holder_that_wakes_is_granted_anew_and_its_old_grant_is_never_revived(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path, lease=0.5) as lab:
             lab.node("a", "robot/x")
@@ -62,11 +63,14 @@ def test_a_holder_that_wakes_learns_that_its_hold_is_over(tmp_path: Path) -> Non
             await lab.ready(client, "robot/x")
             frozen = await lab.holder("frozen")
             await frozen.order("ask", arc="frozen", needs={"robot/x": {}}, min_runtime=600)
-            await frozen.event("entered")
+            entered = await frozen.event("entered")
             frozen.signal(signal.SIGSTOP)
             await lab.state(client, lambda state: not state.holds)
             frozen.signal(signal.SIGCONT)
-            told = await frozen.event("ended")
-            assert told["outcome"] == "client_lost"
+            again = await frozen.event("entered")
+            assert again["grant"] > entered["grant"]
+            with pytest.raises(CommandRefused) as refused:
+                await client.command("robot/x", entered["grant"], ECHO)
+            assert refused.value.code == "ended"
 
     asyncio.run(story())

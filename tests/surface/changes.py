@@ -18,7 +18,30 @@ _TABLE1: Final = (
     " apart from every other fleet, for about 25 seconds, and records them. Nothing is left but the recording."
     " Exit code 1: "
 )
+_FAULTS: Final = "the fault simulator, with `zscout study faults`"
+_INSTANCE: Final = (
+    "one device, one instance: the RCM names the one that is meant, and others say of which they are a duplicate"
+)
+_GANG: Final = "the RCs of the grant that a client believes in: a leader that never published it knows what was lost"
+_ABOVE: Final = "terms below 2^52, and a candidate that is asked to go above the term that an RC has promised"
+_STUDIES: Final = (
+    "Examples: zscout study zscout study schedule --family paper --seeds 100 zscout study placement --seeds 20"
+    " zscout study robots --starts 40 "
+)
 _LATE: Final = "on a busy machine cells come late, which is no other order: the demo failed by it"
+
+_INCARNATIONS: Final = (
+    "ActivateComponent.v1 > fields > incarnation",
+    "Checkpoint.v1 > fields > incarnation",
+    "ComponentView.v1 > fields > incarnation",
+    "MoveComponent.v1 > fields > incarnation",
+    "MoveComponent.v1 > fields > to_incarnation",
+    "Moved.v1 > fields > incarnation",
+    "Output.v1 > fields > incarnation",
+    "RestoreComponent.v1 > fields > incarnation",
+    "StartComponent.v1 > fields > incarnation",
+    "StopComponent.v1 > fields > incarnation > anyOf > 0",
+)
 
 ADDED: Final[dict[str, str]] = {
     "messages > zscout.Ask.v1 > fields > estimate": _STARTS_IN,
@@ -44,18 +67,35 @@ ADDED: Final[dict[str, str]] = {
     "python > what Client.request gives > attributes > shown": _PLACE,
     "python > zscout.CommandRefused > attributes > rc": "which RC refused",
     _TABLE1 + "not all came in the order of Table 2; cells that are only late, on a busy machine, are named.": _LATE,
+    "commands > zscout study faults": _FAULTS,
+    "commands > zscout study > commands > faults": _FAULTS,
+    "commands > zscout study > text > "
+    + _STUDIES
+    + "zscout study faults --runs 1000 zscout study schedule --help": _FAULTS,
+    "keys > zscout/FLEET/alive/*/rc/KIND/NAME/*": _INSTANCE,
+    "messages > zscout.Ask.v1 > fields > rcs": _GANG,
+    "messages > zscout.OpenRequest.v1 > fields > rcs": _GANG,
+    "messages > zscout.Grants.v1 > fields > instances": _INSTANCE,
+    "messages > zscout.RcmState.v1 > fields > instances": _INSTANCE,
+    "messages > zscout.RcState.v1 > fields > duplicate_of": _INSTANCE,
+    "messages > zscout.RcState.v1 > fields > leaving": _INSTANCE,
+    "messages > zscout.RcAsk.v1 > fields > above": _ABOVE,
     "python > zscout.Held > methods > now": "the clock by which the hold ends, for bodies that keep a pace",
 }
 
 REMOVED: Final[dict[str, str]] = {
     "python > zscout.Component > methods > run > takes > stage": _CONTEXT,
     _TABLE1 + "a cell differs.": _LATE,
+    "commands > zscout study > text > " + _STUDIES + "zscout study schedule --help": _FAULTS,
 }
 
 CHANGED: Final[dict[str, tuple[object, str]]] = {
     "python > zscout.Client > methods > connect > gives": (
         "Connecting[Self]",
         "it can be awaited, as before, and entered",
-    )
+    ),
+    **{f"messages > zscout.{field} > maximum": (4503599627370495000, _ABOVE) for field in _INCARNATIONS},
+    "messages > zscout.ComponentUse.v1 > fields > incarnation > maximum": (2**52 - 1, _ABOVE),
+    "messages > zscout.ComponentUse.v1 > fields > processes > maximum": (2**52 - 1, _ABOVE),
 }
 """The value now, and the reason."""

@@ -18,7 +18,7 @@ from zscout.types import HostName
 log = logging.getLogger(__name__)
 
 
-class Standing(enum.Enum):
+class InstanceState(enum.Enum):
     SERVES = "serves"
     OFFERED = "offered"
     """It tells its state to an RCM that may take it in."""
@@ -40,7 +40,7 @@ class Instances:
     ) -> None:
         self._mesh, self._rc, self.instance, self._hold_lease = mesh, rc, instance, hold_lease
         self._supervisor, self._on_change = supervisor, on_change
-        self.standing = Standing.SERVES
+        self.state = InstanceState.SERVES
         self._serves = instance
         """The instance that serves, as far as this one knows."""
         self._others: dict[str, Token] = {}
@@ -50,7 +50,7 @@ class Instances:
     @property
     def duplicate_of(self) -> str:
         """For which one it stands by, in words; empty if it serves."""
-        if self.standing is Standing.SERVES:
+        if self.state is InstanceState.SERVES:
             return ""
         other = self._others.get(self._serves)
         return f"{self._rc} at {other.host}" if other is not None else f"{self._rc} elsewhere"
@@ -61,18 +61,18 @@ class Instances:
     def begin(self) -> None:
         """Stands by from the beginning where another host offers the RC. On its own host it is its successor."""
         elsewhere = [token for token in self._others.values() if token.host != self._mesh.me.host]
-        if elsewhere and self.standing is Standing.SERVES:
+        if elsewhere and self.state is InstanceState.SERVES:
             self.take(min(elsewhere).instance)
 
     def take(self, named: str, host: HostName | None = None) -> None:
         """An RCM that is obeyed names this instance, of `host` if that was said."""
         if named == self.instance:
-            self._become(Standing.SERVES)
+            self._become(InstanceState.SERVES)
         elif (self._others[named].host if named in self._others else host) != self._mesh.me.host:
             self._serves = named
             if named not in self._others:
                 self._wait()
-            self._become(Standing.STANDS_BY)
+            self._become(InstanceState.STANDS_BY)
 
     def _on_token(self, token: Token, alive: bool) -> None:
         if token.instance == self.instance:
@@ -95,15 +95,15 @@ class Instances:
             self._waiting.cancel()
 
     def _offer(self) -> None:
-        if self.standing is Standing.STANDS_BY:
-            self._become(Standing.OFFERED)
+        if self.state is InstanceState.STANDS_BY:
+            self._become(InstanceState.OFFERED)
 
-    def _become(self, standing: Standing) -> None:
-        if standing is self.standing:
+    def _become(self, state: InstanceState) -> None:
+        if state is self.state:
             return
-        self.standing = standing
-        if standing is Standing.STANDS_BY:
+        self.state = state
+        if state is InstanceState.STANDS_BY:
             log.warning("%s stands by: duplicate of %s", self._rc, self.duplicate_of)
         else:
-            log.info("%s %s", self._rc, standing.value)
+            log.info("%s %s", self._rc, state.value)
         self._on_change()

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 from zscout import messages, trace
 from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
-from zscout.drivers.instances import Instances, Standing
+from zscout.drivers.instances import Instances, InstanceState
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.supervision import StallWatch
@@ -115,7 +115,7 @@ class ResourceController:
         self.directory = RcDirectory(mesh) if driver.relays else None
         self.stall, self._on_failure = stall, on_failure
         self.supervisor = Supervisor(name, self._failed)
-        self.instances = Instances(mesh, name, self.instance, self.supervisor, self._on_standing, hold_lease=hold_lease)
+        self.instances = Instances(mesh, name, self.instance, self.supervisor, self._on_instance_state, hold_lease=hold_lease)
         self._leaders: set[Token] = set()
         self._is_open = False
         """Whether its driver is."""
@@ -150,17 +150,17 @@ class ResourceController:
     def _serve(self) -> None:
         for declared in self._served:
             declared.close()
-        keys, mesh, standing = self.mesh.keys, self.mesh, self.instances.standing
+        keys, mesh, state = self.mesh.keys, self.mesh, self.instances.state
         self._served = []
-        if standing is not Standing.STANDS_BY:
+        if state is not InstanceState.STANDS_BY:
             self._served.append(mesh.serve(keys.rc_state(self.name), messages.RcAsk, self._on_state_query))
-        if standing is Standing.SERVES:
+        if state is InstanceState.SERVES:
             if self.driver.sharable:
                 self._served.append(mesh.serve(keys.vote(self.name), messages.Proposal, self._on_proposal))
             command = keys.command_any(self.name)
             self._served.append(mesh.serve(command, messages.Command, self._on_command, depth=COMMAND_QUEUE))
 
-    def _on_standing(self) -> None:
+    def _on_instance_state(self) -> None:
         if self._is_open:
             self._serve()
             self.publish()
@@ -258,8 +258,9 @@ class ResourceController:
             health=self.health,
             rules=self.rules,
             leader=heard and bool(self._leaders),
-            capacity=self.driver.capacity(),
-            figures=self.driver.figures(),
+            # The driver is asked nothing any more: it may be the one that failed.
+            capacity={} if leaving else self.driver.capacity(),
+            figures={} if leaving else self.driver.figures(),
             duplicate_of=self.instances.duplicate_of,
             leaving=leaving,
         )

@@ -35,7 +35,7 @@ GIVEN_BACK: Final = 3.0
 LEFT_OVER: Final = 7.0
 """Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
 
-Standing: TypeAlias = tuple[int, Ns, Place]
+Rank: TypeAlias = tuple[int, Ns, Place]
 
 
 class Promises:
@@ -65,7 +65,7 @@ class Promises:
         self._since: dict[tuple[object, ...], float] = {}
         """Since when each thing that may not last is so."""
         self._running: dict[Term, set[Grant]] = {}
-        self._queued: dict[Term, dict[ArcId, Standing]] = {}
+        self._queued: dict[Term, dict[ArcId, Rank]] = {}
 
     def event(self, what: Mapping[str, Any]) -> None:
         """A line of `zscout.trace`: at every event, what an RC may not do whatever it hears."""
@@ -178,7 +178,7 @@ class Promises:
                 self._broken(f"the leader on {host} still keeps {', '.join(sorted(left))}")
 
 
-def _rank(arc: ArcStatus) -> Standing:
+def _rank(arc: ArcStatus) -> Rank:
     return (-arc.request.priority, arc.request.min_runtime, arc.place)
 
 

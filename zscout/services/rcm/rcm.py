@@ -283,7 +283,7 @@ class Rcm:
         asked, now = query.message, self.mesh.now()
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
-        instances = self.membership.named({rc for hold in holds for rc in hold.needs})
+        instances = self.membership.named(sorted({rc for hold in holds for rc in hold.needs}))
         state = messages.RcmState(self.term, self.seq, self.mesh.me.host, holds, instances=instances)
         if not asked.holds_only:
             starts = self.registry.starts() if asked.forecast else {}
