@@ -80,11 +80,12 @@ Promise(r, t) ==
 Ended(t, g) == Leads(t) /\ \E s \in 1 .. Now(t) : \E r \in RCs : history[t][s].table[r] = g /\ Table(t)[r] # g
 
 (* It takes in the RCs of S by these answers, at its beginning or later: a hold of earlier terms goes on if all RCs
-   of its gang say so, it was not ended here, and its client has no other here. All else that they hold ends. *)
-TakeIn(t, S, said) ==
+   of its gang say so, it was not ended here, and its client has no other here. All else that they hold ends, and
+   so do the holds of `lost`: their clients are gone, or do not ask for them. *)
+TakeIn(t, S, said, lost) ==
     LET before == IF Leads(t) THEN Table(t) ELSE Free
         goes_on(g) ==
-            /\ g.term < t
+            /\ g.term < t /\ g \notin lost
             /\ On("whole") => g.rcs \subseteq S /\ \A r \in g.rcs : said[r] = g
             /\ On("over") => ~ Ended(t, g)
             /\ On("known") => \A r \in RCs : before[r] # None => before[r].client # g.client
@@ -99,7 +100,7 @@ Join(t) ==
         /\ S # {} \/ ~ Leads(t)
         /\ \E said \in [S -> UNION {answers[t][r] : r \in S}] :
             /\ \A r \in S : said[r] \in answers[t][r]
-            /\ TakeIn(t, S, said)
+            /\ \E lost \in SUBSET ({said[r] : r \in S} \ {None}) : TakeIn(t, S, said, lost)
     /\ UNCHANGED <<answers, heard, hold, ended, obeyed>>
 
 Step(t, table, named) ==

@@ -89,7 +89,8 @@ def check(instance: Instance, *, workers: int = CORES) -> Outcome:
         # Symmetry is sound for safety alone.
         config += ["SPECIFICATION Spec", f"INVARIANTS {' '.join(INVARIANTS)}", f"PROPERTIES {' '.join(ACTIONS)}"]
         config += ["SYMMETRY Alike"]
-    return run(module, config, workers=workers)
+    # The bounds end every behaviour: that is no deadlock.
+    return run(module, config, workers=workers, options=["-deadlock"])
 
 
 def run(module: str, config: Sequence[str], *, workers: int = CORES, options: Sequence[str] = ()) -> Outcome:

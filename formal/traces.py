@@ -152,7 +152,7 @@ class Behaviour:
         instances: dict[str, str] = event["instances"]
         wanted: dict[str, Grant | None] = {}
         for rc, holders in event["rcs"].items():
-            if rc in self._sharable or rc not in instances:
+            if rc in self._sharable or rc not in instances or not self._promised(term, instances[rc]):
                 continue
             wanted[instances[rc]] = None
             for grant, arc, place, gang in holders[:1]:
@@ -176,6 +176,10 @@ class Behaviour:
             self._add(f"Again({number}, {self._set(wanted)})")
             self._step(reign, {}, wanted)
         reign.published[event["seq"]] = reign.steps
+
+    def _promised(self, term: Term, instance: str) -> bool:
+        """One that was only named, by its token, is not taken in yet."""
+        return instance in self._reigns[term].table or any(one == term for one, _ in self._rcs[instance].answers)
 
     def _take_in(self, term: Term, reign: _Reign, wanted: Mapping[str, Grant | None]) -> None:
         number = self._terms[term]

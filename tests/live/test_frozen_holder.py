@@ -1,4 +1,4 @@
-"""A client that hangs loses its hold with its lease; when it wakes, the RC does not obey its old grant, and it waits for
+"""A client that hangs loses its hold with its lease. When it wakes, the RC does not obey its old grant, and it waits for
 a new one."""
 
 from __future__ import annotations

@@ -115,7 +115,9 @@ class ResourceController:
         self.directory = RcDirectory(mesh) if driver.relays else None
         self.stall, self._on_failure = stall, on_failure
         self.supervisor = Supervisor(name, self._failed)
-        self.instances = Instances(mesh, name, self.instance, self.supervisor, self._on_instance_state, hold_lease=hold_lease)
+        self.instances = Instances(
+            mesh, name, self.instance, self.supervisor, self._on_instance_state, hold_lease=hold_lease
+        )
         self._leaders: set[Token] = set()
         self._is_open = False
         """Whether its driver is."""
