@@ -150,6 +150,8 @@ class Role:
     LOAD = "load"
     RECORDER = "recorder"
     COMPONENT = "component"
+    SESSION = "session"
+    """A session of the process: `instance` is its id in the network below."""
 
 
 class _Key:

@@ -64,6 +64,7 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
             raise MeshError(f"a node named {me.host} is on the mesh already; set another host under [node]")
         stall = StallWatch(mesh.now).start()
         stack.callback(stall.stop)
+        mesh.watch_links()
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
         stack.callback(token.close)
         lease = node.fleet.timing.hold_lease / SECOND

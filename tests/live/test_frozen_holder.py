@@ -1,5 +1,5 @@
-"""A client that hangs loses its hold with its lease. When it wakes, the RC does not obey its old grant, and it waits for
-a new one."""
+"""A client that hangs loses its hold with its lease. When it wakes, the RC does not obey its old grant, and the client
+waits for a new one."""
 
 from __future__ import annotations
 

@@ -245,9 +245,7 @@ class ResourceController:
         query.answer(self._rc_state([]))
 
     def _rc_state(self, ended: list[messages.EndedHold], *, leaving: bool = False) -> messages.RcState:
-        # A leader counts while it publishes: its token outlives a program that hangs. Half a hold lease is longer than
-        # a heartbeat, and leaves a successor time before holds end.
-        heard = self.mesh.now() - self.holds.last_contact < self.holds.hold_lease // 2
+        # A leader counts while it publishes: its token outlives a program that hangs.
         return messages.RcState(
             rc=self.name,
             host=self.mesh.me.host,
@@ -259,7 +257,7 @@ class ResourceController:
             ended=ended,
             health=self.health,
             rules=self.rules,
-            leader=heard and bool(self._leaders),
+            leader=self._hears and bool(self._leaders),
             # The driver is asked nothing any more: it may be the one that failed.
             capacity={} if leaving else self.driver.capacity(),
             figures={} if leaving else self.driver.figures(),
@@ -454,3 +452,24 @@ class ResourceController:
             await asyncio.sleep(FIGURES_PERIOD)
             if self.driver.figures() != published:
                 self.publish()
+            self._look_for_contradictions()
+
+    def _look_for_contradictions(self) -> None:
+        """A leader that is seen and not heard, or heard and never asks: what is declared here, or there, is not known
+        to the other."""
+        signs = {
+            f"{self.name}: an RCM is seen that does not publish": bool(self._leaders) and not self._hears,
+            f"{self.name}: the RCM publishes and has not asked for its promise": self._hears
+            and self.instances.state is not InstanceState.STANDS_BY
+            and self.holds.promised != self.holds.term,
+        }
+        for sign, seen in signs.items():
+            if seen:
+                self.mesh.suspicions.suspect(sign)
+            else:
+                self.mesh.suspicions.clear(sign)
+
+    @property
+    def _hears(self) -> bool:
+        # Half a hold lease is longer than a heartbeat, and leaves a successor time before holds end.
+        return self.mesh.now() - self.holds.last_contact < self.holds.hold_lease // 2

@@ -1,86 +1,180 @@
-"""A transport whose session can be opened anew: all that was declared on the old one is declared on the new one.
+"""A session that can be opened anew, and what tells that it has to be.
 
-Zenoh links can come back without all that was declared on the other side (docs/zenoh.md). A process that finds its own
-view of the mesh in contradiction leaves it, in effect, and joins again; its callers notice nothing but that tokens
-which it had missed appear, and that others go."""
+Zenoh's links can come back without all that was declared on the other side (docs/protocol.md). A process that sees for
+some time that the mesh contradicts itself opens another session, declares everything on it, and closes the first: its
+callers notice nothing but that tokens which it had missed appear."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
-from typing import Final
+import threading
+from collections.abc import Awaitable, Callable, Collection, Sequence
+from typing import Final, TypeAlias
+from weakref import WeakValueDictionary
 
+from zscout.mesh.exchange import MeshError
 from zscout.mesh.transport import Collector, OnSample, Quality, Transport, TransportPublisher, TransportQuery, Undeclare
+from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
 
-SETTLE: Final = 1.0
-"""Seconds after which tokens that a new session has not shown are gone."""
+PATIENCE: Final = 2.0
+"""Seconds for which a contradiction must last."""
+LASTS: Final = 30.0
+"""Seconds after which one that is not said again is forgotten."""
+OVERLAP: Final = 0.5
+"""Seconds for which both sessions live: by then others know what is declared on the new one."""
+LINKED: Final = 2.0
+"""Seconds within which the new session is linked to whom the old one is linked to, or they are gone."""
+LOOK_EVERY: Final = 0.02
+SHORTEST, LONGEST = 10.0, 320.0
+"""Seconds from one renewal to the next, doubled each time; the shortest again after ten times as long without one."""
 
-OnToken = Callable[[str, bool], None]
+OnToken: TypeAlias = Callable[[str, bool], None]
+Opening: TypeAlias = Callable[[], Awaitable[Transport]]
+
+
+class Suspicions:
+    """Contradictions that this process sees, by what they are about. One that lasts calls `renew`."""
+
+    def __init__(self, now: Callable[[], Ns], renew: Callable[[], object]) -> None:
+        self._now, self._renew = now, renew
+        self._since: dict[str, tuple[Ns, Ns]] = {}
+        """When each was suspected first and last."""
+        self._last: Ns | None = None
+        self._pause = SHORTEST
+
+    def suspect(self, what: str) -> None:
+        """What is seen contradicts itself; to be said again while it lasts."""
+        now = self._now()
+        self._since = {one: (first, last) for one, (first, last) in self._since.items() if now - last < LASTS * SECOND}
+        first, _ = self._since.get(what, (now, now))
+        self._since[what] = first, now
+        if now - first < PATIENCE * SECOND:
+            return
+        if self._last is not None:
+            if now - self._last < self._pause * SECOND:
+                return
+            calm = now - self._last > 10 * self._pause * SECOND
+            self._pause = SHORTEST if calm else min(LONGEST, 2 * self._pause)
+        self._last = now
+        self._since.clear()
+        log.warning("%s: this process joins the mesh anew", what)
+        self._renew()
+
+    def clear(self, what: str) -> None:
+        self._since.pop(what, None)
+
+    def keep(self, those: Collection[str], prefix: str) -> None:
+        """Of all that begins with `prefix` only `those` still last."""
+        for what in [what for what in self._since if what.startswith(prefix) and what not in those]:
+            del self._since[what]
 
 
 class RenewableTransport(Transport):
-    """`opening` opens another session. Raises what that raises."""
+    """`openings` open other sessions, one after the other; the last one is that which stays."""
 
-    def __init__(self, transport: Transport, opening: Callable[[], Awaitable[Transport]]) -> None:
-        self._transport, self._opening = transport, opening
-        self._declared: dict[_Declared, None] = {}
-        self._renewing = False
+    def __init__(self, transport: Transport, openings: Sequence[Opening]) -> None:
+        self.current, self._openings = transport, openings
+        self._declared: WeakValueDictionary[int, _Declared] = WeakValueDictionary()
+        """All of which the caller keeps what undeclares it."""
+        self._number = 0
+        self._renewing: asyncio.Task[None] | None = None
         self._closed = False
 
-    async def renew(self) -> None:
-        """Opens a new session, declares on it all that is declared, and closes the old one. Once at a time."""
-        if self._renewing or self._closed:
-            return
-        self._renewing = True
+    def renew(self) -> None:
+        """Once at a time. What fails is logged, and leaves the session that there is."""
+        if self._renewing is None and not self._closed:
+            self._renewing = asyncio.create_task(self._renew())
+
+    async def _renew(self) -> None:
         try:
-            fresh = await self._opening()
-            if self._closed:
-                await fresh.close()
-                return
-            old, self._transport = self._transport, fresh
-            # First the new ones, so that no token of this process goes in between.
-            for one in tuple(self._declared):
-                one.declare(fresh)
-            await old.close()
+            for opening in self._openings:
+                fresh = await opening()
+                try:
+                    await self._linked(fresh)
+                    old, self.current = self.current, fresh
+                except BaseException:
+                    await fresh.close()
+                    raise
+                # First all is declared anew: no token of this process goes in between.
+                for _, one in sorted(self._declared.items()):
+                    one.declare(fresh)
+                try:
+                    await asyncio.sleep(OVERLAP)
+                finally:
+                    await old.close()
+        except MeshError as error:
+            log.warning("%s", error)
         finally:
-            self._renewing = False
+            self._renewing = None
+
+    async def _linked(self, fresh: Transport) -> None:
+        # Zenoh tells of no links, but can be asked at no cost.
+        tries = round(LINKED / LOOK_EVERY)
+        while tries and not set(self.current.peers()) <= {*fresh.peers(), fresh.id()}:
+            tries -= 1
+            await asyncio.sleep(LOOK_EVERY)
 
     def _keep(self, declare: Callable[[Transport], Undeclare]) -> Undeclare:
-        one = _Declared(declare, self._declared)
-        one.declare(self._transport)
+        one = _Declared(declare)
+        self._number += 1
+        self._declared[self._number] = one
+        one.declare(self.current)
         return one.close
 
-    # The transport of now
+    # The session of now
+
+    def id(self) -> str:
+        return self.current.id()
+
+    def peers(self) -> list[str]:
+        return self.current.peers()
 
     def links(self) -> int:
-        return self._transport.links()
+        return self.current.links()
 
     async def close(self) -> None:
         self._closed = True
-        await self._transport.close()
+        if self._renewing is not None:
+            self._renewing.cancel()
+            await asyncio.wait({self._renewing})
+        await self.current.close()
 
     def get(self, key: str, payload: bytes | None, kind: type | None, timeout: float, to: Collector) -> None:
-        self._transport.get(key, payload, kind, timeout, to)
+        self.current.get(key, payload, kind, timeout, to)
 
     def put(self, key: str, payload: bytes, kind: type) -> None:
-        self._transport.put(key, payload, kind)
+        self.current.put(key, payload, kind)
 
     def tokens(self, key: str, timeout: float, to: Collector) -> None:
-        self._transport.tokens(key, timeout, to)
+        self.current.tokens(key, timeout, to)
 
-    # What is declared, on each
+    # What is declared, on each session
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
-        return self._keep(lambda transport: transport.queryable(key, on_query))
+        def declare(transport: Transport) -> Undeclare:
+            def once(query: TransportQuery) -> None:
+                # While there are two sessions a query may come by both.
+                if transport is self.current:
+                    on_query(query)
+                else:
+                    query.drop()
+
+            return transport.queryable(key, once)
+
+        return self._keep(declare)
 
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
         return self._keep(lambda transport: transport.subscriber(key, on_sample))
 
     def token(self, key: str) -> Undeclare:
         return self._keep(lambda transport: transport.token(key))
+
+    def own_token(self, key_of: Callable[[str], str]) -> Undeclare:
+        """A token whose key names the session that it is declared on."""
+        return self._keep(lambda transport: transport.token(key_of(transport.id())))
 
     def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
         taking: list[Callable[[], tuple[str, bytes] | None]] = []
@@ -104,7 +198,7 @@ class RenewableTransport(Transport):
 
     def publisher(self, key: str, kind: type | None, quality: Quality) -> TransportPublisher:
         publisher = _RenewablePublisher(lambda transport: transport.publisher(key, kind, quality))
-        publisher.undeclare = self._keep(publisher.declare)  # type: ignore[method-assign]
+        publisher.close = self._keep(publisher.declare)
         return publisher
 
     def token_subscriber(self, key: str, on_token: OnToken) -> Undeclare:
@@ -112,24 +206,27 @@ class RenewableTransport(Transport):
 
 
 class _Declared:
-    """One declaration, on whichever session there is."""
+    """One declaration, on the session of now."""
 
-    def __init__(self, declare: Callable[[Transport], Undeclare], among: dict[_Declared, None]) -> None:
-        self._declare, self._among = declare, among
+    def __init__(self, declare: Callable[[Transport], Undeclare]) -> None:
+        self._declare = declare
         self._undeclare: Undeclare | None = None
-        among[self] = None
+        self._closed = False
 
     def declare(self, transport: Transport) -> None:
-        self._undeclare = self._declare(transport)
+        if not self._closed:
+            self._undeclare = self._declare(transport)
 
     def close(self) -> None:
-        self._among.pop(self, None)
+        self._closed = True
         undeclare, self._undeclare = self._undeclare, None
         if undeclare is not None:
             undeclare()
 
 
 class _RenewablePublisher(TransportPublisher):
+    close: Undeclare
+
     def __init__(self, declare: Callable[[Transport], TransportPublisher]) -> None:
         self._declare = declare
         self._on_matching: Callable[[bool], None] | None = None
@@ -147,38 +244,44 @@ class _RenewablePublisher(TransportPublisher):
         self._on_matching = on_matching
         return self._publisher.match(on_matching)
 
+    def undeclare(self) -> None:
+        self.close()
+
 
 class _TokenView:
-    """The tokens on a key as their watcher knows them: on a new session only differences are told."""
+    """The tokens on a key as their watcher knows them: of a new session only differences are told."""
 
     def __init__(self, key: str, on_token: OnToken) -> None:
         self._key, self._on_token = key, on_token
         self._session = 0
+        self._lock = threading.Lock()
         self._alive: dict[str, int] = {}
         """By token: the last session that showed it."""
 
     def declare(self, transport: Transport) -> Undeclare:
         self._session += 1
         session = self._session
-        loop = asyncio.get_running_loop()
 
         def on_token(token: str, alive: bool) -> None:
-            if session != self._session:  # of the old one, which is being closed
-                return
-            known = token in self._alive
-            if alive:
-                self._alive[token] = session
-            else:
-                self._alive.pop(token, None)
-            if known != alive:
-                self._on_token(token, alive)
+            with self._lock:
+                if session != self._session:  # of the old one, which is to be closed
+                    return
+                known = token in self._alive
+                if alive:
+                    self._alive[token] = session
+                else:
+                    self._alive.pop(token, None)
+                if known != alive:
+                    self._on_token(token, alive)
 
         undeclare = transport.token_subscriber(self._key, on_token)
         if session > 1:
-            loop.call_later(SETTLE, self._forget, session)
+            asyncio.get_running_loop().call_later(2 * OVERLAP, self._forget, session)
         return undeclare
 
     def _forget(self, session: int) -> None:
-        for token in [token for token, shown in self._alive.items() if shown < session]:
-            del self._alive[token]
-            self._on_token(token, False)
+        """What the new session has not shown by now is gone."""
+        with self._lock:
+            for token in [token for token, shown in self._alive.items() if shown < session]:
+                del self._alive[token]
+                self._on_token(token, False)

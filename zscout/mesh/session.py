@@ -16,7 +16,7 @@ from typing import Any, Self, TypeAlias, TypeVar
 from msgspec import Struct
 
 from zscout import messages
-from zscout.keyexpr import BadName, Keys, Sender, Token
+from zscout.keyexpr import BadName, Keys, Role, Sender, Token
 from zscout.mesh.exchange import (
     QUEUE_DEPTH,
     Backlog,
@@ -28,7 +28,8 @@ from zscout.mesh.exchange import (
     Reply,
 )
 from zscout.mesh.frames import FramePublisher, FrameWatch
-from zscout.mesh.transport import Collector, Quality, Transport, TransportQuery, Undeclare
+from zscout.mesh.renewal import RenewableTransport, Suspicions
+from zscout.mesh.transport import Collector, Quality, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem
 from zscout.types import Ns
 
@@ -40,6 +41,10 @@ BURST = 256
 """Items that are handled in one go at most, those included that arrive meanwhile."""
 RING_DEPTH = 32
 """Publications that `poll_latest` keeps."""
+LINK_PERIOD = 1.0
+"""Seconds between two looks at whether each linked session shows what it has declared."""
+MAX_SESSIONS = 4_096
+"""Sessions that are remembered."""
 FINAL_SLACK = 0.5
 """Seconds after its timeout at which a query is over though the transport has not reported that."""
 
@@ -131,12 +136,15 @@ class Mesh:
 
     Declare once per purpose, never per request: Zenoh keeps memory for every key that was ever declared."""
 
-    def __init__(self, transport: Transport, keys: Keys, me: Sender, now: Callable[[], Ns]) -> None:
+    def __init__(self, transport: RenewableTransport, keys: Keys, me: Sender, now: Callable[[], Ns]) -> None:
         self.keys, self.me, self.now = keys, me, now
         """`now()` is in nanoseconds on this host's monotonic clock. Not comparable between hosts."""
+        self.suspicions = Suspicions(now, transport.renew)
         self._transport = transport
         self._inbox = Inbox(asyncio.get_running_loop())
         self._shared: dict[tuple[Any, ...], _Subscription] = {}
+        self._kept: list[object] = []
+        """What lives as long as this place."""
 
     async def __aenter__(self) -> Self:
         return self
@@ -375,6 +383,32 @@ class Mesh:
 
         await self._all(lambda to: self._transport.tokens(key, timeout, to), on_reply, timeout)
         return sorted(token for token in map(self._token_of, found) if token is not None)
+
+    def watch_links(self) -> None:
+        """Shows this session by a token that names it, until the mesh is left, and suspects links over which the token
+        of the other's session, seen before, has not come back. For programs that stay."""
+        name = functools.partial(Token, self.me.host, Role.SESSION, self.me.client)
+        own = self._transport.own_token(lambda session: self.keys.alive(name(session)))
+        shown: dict[str, bool] = {}
+
+        def on_token(token: Token, alive: bool) -> None:
+            shown.pop(token.instance, None)
+            shown[token.instance] = alive
+            if len(shown) > MAX_SESSIONS:
+                del shown[next(iter(shown))]
+
+        def look() -> None:
+            if self._inbox.closed:
+                return
+            self._inbox.loop.call_later(LINK_PERIOD, look)
+            about = "the token is missing of the linked session "
+            missing = [about + peer for peer in self._transport.peers() if shown.get(peer) is False]
+            self.suspicions.keep(missing, about)
+            for what in missing:
+                self.suspicions.suspect(what)
+
+        self._kept += [own, self.watch(self.keys.alive_any(Role.SESSION), on_token)]
+        look()
 
     def _token_of(self, text: str) -> Token | None:
         try:

@@ -55,6 +55,12 @@ class TransportPublisher(Protocol):
 class Transport(Protocol):
     """A session on the network. What can't be sent is logged, but for queries, which raise MeshError."""
 
+    def id(self) -> str:
+        """Of this session, as the network tells it to others."""
+
+    def peers(self) -> list[str]:
+        """The ids of the sessions that this one is linked to."""
+
     def links(self) -> int: ...
     async def close(self) -> None: ...
 

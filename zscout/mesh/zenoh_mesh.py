@@ -6,18 +6,21 @@ import asyncio
 import functools
 import json
 import logging
+import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, Self, TypeVar
 
 import zenoh
+from msgspec.structs import replace
 from zenoh.handlers import Callback, RingChannel
 
 from zscout import messages
 from zscout.config.fleet import MeshConfig
 from zscout.keyexpr import Keys, Sender
 from zscout.mesh.exchange import MeshError
+from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.session import Mesh
 from zscout.mesh.supervision import clock
 from zscout.mesh.transport import Collector, OnSample, Quality, Transport, TransportPublisher, TransportQuery, Undeclare
@@ -37,6 +40,7 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
     Quality.FRAME: {"congestion_control": DROP, "priority": zenoh.Priority.DATA, "express": True},
 }
 T = TypeVar("T")
+_PORT = re.compile(r":\d+$")
 
 
 def zenoh_config(config: MeshConfig) -> zenoh.Config:
@@ -71,20 +75,27 @@ class ZenohMesh(Mesh):
     @classmethod
     async def open(cls, fleet: str, me: Sender, config: MeshConfig | None = None) -> Self:
         """Joins the mesh of `fleet`. Raises MeshError where an address can't be had."""
-        keys = Keys(fleet)
-        settings = zenoh_config(config or MeshConfig())
-        opening = _in_thread("joins the mesh", lambda: zenoh.open(settings))
-        try:
-            session = await asyncio.wrap_future(opening)
-        except asyncio.CancelledError:
-            # In a thread of its own: this may be the event loop's.
-            opening.add_done_callback(
-                lambda opened: opened.exception() or _in_thread("closes the mesh", opened.result().close)
-            )
-            raise
-        except zenoh.ZError as error:
-            raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
-        return cls(ZenohTransport(session), keys, me, clock.now)
+        config = config or MeshConfig()
+        openings = [functools.partial(_open, config)]
+        if config.listen:
+            # Its addresses are to be had again once the session that listens there is closed.
+            elsewhere = replace(config, listen=tuple(_PORT.sub(":0", one) for one in config.listen))
+            openings.insert(0, functools.partial(_open, elsewhere))
+        return cls(RenewableTransport(await _open(config), openings), Keys(fleet), me, clock.now)
+
+
+async def _open(config: MeshConfig) -> Transport:
+    opening = _in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config)))
+    try:
+        return ZenohTransport(await asyncio.wrap_future(opening))
+    except asyncio.CancelledError:
+        # In a thread of its own: this may be the event loop's.
+        opening.add_done_callback(
+            lambda opened: opened.exception() or _in_thread("closes the mesh", opened.result().close)
+        )
+        raise
+    except zenoh.ZError as error:
+        raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
 
 
 def _in_thread(name: str, call: Callable[[], T]) -> Future[T]:
@@ -108,6 +119,12 @@ class ZenohTransport(Transport):
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
+
+    def id(self) -> str:
+        return str(self._session.info.zid())
+
+    def peers(self) -> list[str]:
+        return [str(peer) for peer in self._session.info.peers_zid()]
 
     def links(self) -> int:
         return len(self._session.info.links())

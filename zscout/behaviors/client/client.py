@@ -75,6 +75,7 @@ class Client(MovableClient):
         """Declares on the mesh what a client has; `connect` does so."""
         keys, mesh = self.mesh.keys, self.mesh
         self._declared = [mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice), *self._rcm.start()]
+        mesh.watch_links()
         self._store.ask_again = self._on_dropped
         self._renew_token()
         self._supervisor.spawn(self._rcm.keep_asking())
@@ -214,9 +215,12 @@ class Client(MovableClient):
                 try:
                     await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
                 except CommandRefused as refused:
+                    if refused.code == "unknown":
+                        self.mesh.suspicions.suspect(f"{rc} was granted and does not answer")
                     if arc.grant != grant or refused.code not in CONFIRM_AGAIN or left <= 0:
                         return refused
                 else:
+                    self.mesh.suspicions.clear(f"{rc} was granted and does not answer")
                     return None
                 # The last time when all is over: a link to the RC may take that long.
                 await asyncio.sleep(max(0.0, min(pause, (deadline - self.mesh.now()) / SECOND)))

@@ -7,7 +7,7 @@ hold lease, holds end here as they do at their RCs.
 from __future__ import annotations
 
 import asyncio
-from typing import NoReturn
+from typing import Final, NoReturn
 
 import msgspec
 
@@ -27,6 +27,7 @@ BACKOFF = (0.05, 1.0)
 END_TRIES = 3
 TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full", "old_term"})
 CHECKS_PER_LEASE = 10
+SILENT_RCM: Final = "an RCM is seen that does not answer"
 """How often within a hold lease a client checks whether an RCM published."""
 
 
@@ -135,7 +136,12 @@ class RcmLink:
 
     async def query(self, operation: Operation) -> Reply[Notice] | None:
         """An RCM's answer to an operation; None: none came, and it was carried out or not."""
-        return await self.mesh.ask_one(self.key, operation, Notice, timeout=QUERY_TIMEOUT)
+        reply = await self.mesh.ask_one(self.key, operation, Notice, timeout=QUERY_TIMEOUT)
+        if reply is None and self.leader is not None:
+            self.mesh.suspicions.suspect(SILENT_RCM)
+        else:
+            self.mesh.suspicions.clear(SILENT_RCM)
+        return reply
 
     async def submit(self, arc: OpenArc) -> None:
         """Asks until the RCM has answered; not while the client is paused. Raises RequestRefused."""

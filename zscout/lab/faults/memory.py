@@ -26,6 +26,7 @@ import zenoh
 from zscout.keyexpr import Keys, Sender
 from zscout.lab.faults.virtual_time import PROCESS, VirtualTimeLoop
 from zscout.mesh import Mesh, MeshError
+from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.transport import Collector, OnSample, Quality, Transport, TransportPublisher, TransportQuery, Undeclare
 from zscout.types import SECOND, Ns
 
@@ -54,7 +55,7 @@ class Disturbance:
 class MemoryMesh(Mesh):
     """One process's place on a MemoryNetwork; `network.open(...)` makes it."""
 
-    _transport: MemoryTransport
+    _transport: RenewableTransport
 
 
 def _memory(mesh: Mesh) -> MemoryMesh:
@@ -64,7 +65,10 @@ def _memory(mesh: Mesh) -> MemoryMesh:
 
 
 def _node(mesh: Mesh) -> MemoryTransport:
-    return _memory(mesh)._transport
+    """Its session of now."""
+    node = _memory(mesh)._transport.current
+    assert isinstance(node, MemoryTransport)  # noqa: S101
+    return node
 
 
 class MemoryNetwork:
@@ -81,22 +85,42 @@ class MemoryNetwork:
         self.forgetful = 0.0
         """How likely each declaration stays unknown to a peer whose link comes back, until it is lost again."""
         self._links: dict[tuple[MemoryTransport, MemoryTransport], MemoryLink] = {}
+        self._ids = itertools.count(1)
+        self._is_cut: Callable[[str, str], bool] = lambda _one, _other: False
+        self._disturbed: Mapping[str, Disturbance] = {}
 
     def open(self, fleet: str, me: Sender) -> MemoryMesh:
-        node = MemoryTransport(self)
+        node = self._session()
+        return MemoryMesh(RenewableTransport(node, [self._another]), Keys(fleet), me, node.now)
+
+    def _session(self) -> MemoryTransport:
+        node = MemoryTransport(self, next(self._ids))
         self.nodes.append(node)
         for other in self.nodes:
             self._connect(node, other)
-        return MemoryMesh(node, Keys(fleet), me, node.now)
+        self._changed()
+        return node
+
+    def _sessions(self, mesh: Mesh) -> list[MemoryTransport]:
+        """Of its process: two, while it joins anew."""
+        now = _node(mesh)
+        mine = [node for node in self.nodes if node.process is now.process]
+        return [now] if now.process is None else mine
+
+    async def _another(self) -> MemoryTransport:
+        return self._session()
 
     def cut_where(self, is_cut: Callable[[str, str], bool]) -> None:
-        """Of all links those are cut for which that is true of the names of both processes."""
+        """Of all links, those of sessions to come included, those are cut for which that is true of the names of both
+        processes."""
+        self._is_cut = is_cut
         for link in self._links.values():
             link.cut = link.source is not link.target and is_cut(str(link.source), str(link.target))
         self._changed()
 
     def disturb(self, disturbed: Mapping[str, Disturbance]) -> None:
-        """From now on, on all links but those of a process with itself."""
+        """From now on, on all links but those of a session with itself."""
+        self._disturbed = disturbed
         for link in self._links.values():
             link.disturbed = {} if link.source is link.target else disturbed
             link.answers.clear()
@@ -120,30 +144,32 @@ class MemoryNetwork:
 
     def heal(self) -> None:
         """All links work again."""
+        self._is_cut = lambda _one, _other: False
         for link in self._links.values():
             link.cut = False
         self._changed()
 
     def freeze(self, mesh: Mesh) -> None:
         """Nothing reaches or leaves `mesh` until `thaw`: what arrives waits. Its process stands still."""
-        node = _node(mesh)
-        node.frozen = True
-        if node.process is not None:
-            node.process.stop()
+        for node in self._sessions(mesh):
+            node.frozen = True
+            if node.process is not None:
+                node.process.stop()
         self._changed()
 
     def thaw(self, mesh: Mesh) -> None:
-        node = _node(mesh)
-        node.frozen = False
-        if node.process is not None:
-            node.process.go_on()
+        for node in self._sessions(mesh):
+            node.frozen = False
+            if node.process is not None:
+                node.process.go_on()
         self._changed()
 
     def kill(self, mesh: Mesh) -> None:
         """As though its process was killed: what it has sent arrives, then its tokens die."""
         self.thaw(mesh)
         _memory(mesh)._inbox.close()
-        _node(mesh).leave()
+        for node in self._sessions(mesh):
+            node.leave()
 
     def remove(self, node: MemoryTransport) -> None:
         # What is under way is kept by the timers of its links; over one that is blocked nothing comes any more.
@@ -158,6 +184,8 @@ class MemoryNetwork:
         link = self._links.get((source, target))
         if link is None:
             link = self._links[source, target] = MemoryLink(self, source, target)
+            if source is not target:
+                link.cut, link.disturbed = self._is_cut(str(source), str(target)), self._disturbed
         return link
 
     def match(self) -> None:
@@ -299,8 +327,8 @@ def kind_of(key: str) -> str:
 
 
 class MemoryTransport(Transport):
-    def __init__(self, network: MemoryNetwork) -> None:
-        self.network = network
+    def __init__(self, network: MemoryNetwork, number: int) -> None:
+        self.network, self.number = network, number
         loop = asyncio.get_running_loop()
         if not isinstance(loop, VirtualTimeLoop):
             raise TypeError("the mesh in memory needs virtual time")
@@ -332,8 +360,14 @@ class MemoryTransport(Transport):
     def now(self) -> Ns:
         return round(self.loop.time() * SECOND)
 
+    def id(self) -> str:
+        return f"{self.number:x}"
+
+    def peers(self) -> list[str]:
+        return [node.id() for node in self._peers() if node is not self]
+
     def links(self) -> int:
-        return sum(1 for node in self._peers() if node is not self)
+        return len(self.peers())
 
     async def close(self) -> None:
         self.leave()

@@ -281,6 +281,8 @@ class Simulation:
     def _start(self, process: Process, name: str, mesh: MemoryMesh) -> None:
         host, program = name.split("/")
         main: Coroutine[Any, Any, None]
+        if name not in self.clients:
+            mesh.watch_links()
         if program == "node":
             main = self._node(host, mesh)
         elif name in self.where.values():

@@ -94,6 +94,7 @@ class Recorder:
             subscribe(keys.placements, messages.Placements, guard(self._on_placements), depth=DEPTH),
             self.mesh.watch(keys.alive_any(), guard(self._on_token)),
         ]
+        self.mesh.watch_links()
         # Apart: of what these miss, the RCM's state has nothing.
         behavior, poses = guard(self._on_behavior), guard(self._on_poses)
         robots = [
