@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 MIN_DELAY = 0.02
 """Seconds until a hold that is over is looked at again."""
 MAX_TTL = 60.0
+LEADERLESS = 5.0
+"""Seconds: longer than an election takes."""
 REREAD_TIMEOUT = 0.5
 """Seconds that one query for `rcm/state` waits for an answer."""
 REREADS = 4
@@ -32,6 +34,8 @@ REREADS = 4
 COMMAND_QUEUE = 64
 EARLY_PER_HOST = 16
 """Commands of one host that may be set aside."""
+LOOK_PERIOD = 1.0
+"""Seconds between two looks at whether leaders that are seen are heard, and ask."""
 FIGURES_PERIOD = 1.0
 """Seconds between two publications of changed figures."""
 
@@ -144,6 +148,7 @@ class ResourceController:
         await self.driver.open(self)
         self.supervisor.spawn(self._worker())
         self.supervisor.spawn(self._publish_figures())
+        self.supervisor.spawn(self._keep_looking())
         self.instances.begin()
         self._is_open = True
         self._serve()
@@ -452,11 +457,15 @@ class ResourceController:
             await asyncio.sleep(FIGURES_PERIOD)
             if self.driver.figures() != published:
                 self.publish()
-            self._look_for_contradictions()
 
-    def _look_for_contradictions(self) -> None:
+    async def _keep_looking(self) -> None:
+        while True:
+            await asyncio.sleep(LOOK_PERIOD)
+            await self._look_for_contradictions()
+
+    async def _look_for_contradictions(self) -> None:
         """A leader that is seen and not heard, or heard and never asks: what is declared here, or there, is not known
-        to the other."""
+        to the other. Where candidates are seen, one leads before long."""
         signs = {
             f"{self.name}: an RCM is seen that does not publish": bool(self._leaders) and not self._hears,
             f"{self.name}: the RCM publishes and has not asked for its promise": self._hears
@@ -468,6 +477,11 @@ class ResourceController:
                 self.mesh.suspicions.suspect(sign)
             else:
                 self.mesh.suspicions.clear(sign)
+        sign = f"{self.name}: candidates are seen, and no RCM"
+        if self._leaders or self._hears:
+            self.mesh.suspicions.clear(sign)
+        elif await self.mesh.living(self.mesh.keys.alive_any(Role.CANDIDATE), timeout=REREAD_TIMEOUT):
+            self.mesh.suspicions.suspect(sign, patience=LEADERLESS)
 
     @property
     def _hears(self) -> bool:

@@ -7,6 +7,7 @@ callers notice nothing but that tokens which it had missed appear."""
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import threading
 from collections.abc import Awaitable, Callable, Collection, Sequence
@@ -21,7 +22,7 @@ log = logging.getLogger(__name__)
 
 PATIENCE: Final = 2.0
 """Seconds for which a contradiction must last."""
-LASTS: Final = 30.0
+LASTS: Final = 60.0
 """Seconds after which one that is not said again is forgotten."""
 OVERLAP: Final = 0.5
 """Seconds for which both sessions live: by then others know what is declared on the new one."""
@@ -45,13 +46,13 @@ class Suspicions:
         self._last: Ns | None = None
         self._pause = SHORTEST
 
-    def suspect(self, what: str) -> None:
-        """What is seen contradicts itself; to be said again while it lasts."""
+    def suspect(self, what: str, *, patience: float = PATIENCE) -> None:
+        """What is seen contradicts itself; to be said again while it lasts. `patience` is in seconds."""
         now = self._now()
         self._since = {one: (first, last) for one, (first, last) in self._since.items() if now - last < LASTS * SECOND}
         first, _ = self._since.get(what, (now, now))
         self._since[what] = first, now
-        if now - first < PATIENCE * SECOND:
+        if now - first < patience * SECOND:
             return
         if self._last is not None:
             if now - self._last < self._pause * SECOND:
@@ -77,9 +78,10 @@ class RenewableTransport(Transport):
 
     def __init__(self, transport: Transport, openings: Sequence[Opening]) -> None:
         self.current, self._openings = transport, openings
-        self._declared: WeakValueDictionary[int, _Declared] = WeakValueDictionary()
-        """All of which the caller keeps what undeclares it."""
-        self._number = 0
+        self._declared: dict[int, _Declared] = {}
+        self._tokens: WeakValueDictionary[int, _Token] = WeakValueDictionary()
+        """These die with what undeclares them."""
+        self._numbers = itertools.count()
         self._renewing: asyncio.Task[None] | None = None
         self._closed = False
 
@@ -99,12 +101,14 @@ class RenewableTransport(Transport):
                     await fresh.close()
                     raise
                 # First all is declared anew: no token of this process goes in between.
-                for _, one in sorted(self._declared.items()):
+                for one in self._all():
                     one.declare(fresh)
                 try:
                     await asyncio.sleep(OVERLAP)
                 finally:
                     await old.close()
+                    for one in self._all():
+                        one.forget_old()
         except MeshError as error:
             log.warning("%s", error)
         finally:
@@ -117,12 +121,27 @@ class RenewableTransport(Transport):
             tries -= 1
             await asyncio.sleep(LOOK_EVERY)
 
+    def _all(self) -> list[_Declared]:
+        return [one for _, one in sorted([*self._declared.items(), *self._tokens.items()])]
+
     def _keep(self, declare: Callable[[Transport], Undeclare]) -> Undeclare:
-        one = _Declared(declare)
-        self._number += 1
-        self._declared[self._number] = one
+        number, one = next(self._numbers), _Other(declare)
+        self._declared[number] = one
+        one.declare(self.current)
+
+        def undeclare() -> None:
+            self._declared.pop(number, None)
+            one.close()
+
+        return undeclare
+
+    def _keep_token(self, key_of: Callable[[str], str]) -> Undeclare:
+        one = self._tokens[next(self._numbers)] = _Token(key_of)
         one.declare(self.current)
         return one.close
+
+    def _owns(self, key: str) -> bool:
+        return any(one.key == key for one in list(self._tokens.values()))
 
     # The session of now
 
@@ -170,11 +189,11 @@ class RenewableTransport(Transport):
         return self._keep(lambda transport: transport.subscriber(key, on_sample))
 
     def token(self, key: str) -> Undeclare:
-        return self._keep(lambda transport: transport.token(key))
+        return self._keep_token(lambda _session: key)
 
     def own_token(self, key_of: Callable[[str], str]) -> Undeclare:
         """A token whose key names the session that it is declared on."""
-        return self._keep(lambda transport: transport.token(key_of(transport.id())))
+        return self._keep_token(key_of)
 
     def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
         taking: list[Callable[[], tuple[str, bytes] | None]] = []
@@ -202,26 +221,57 @@ class RenewableTransport(Transport):
         return publisher
 
     def token_subscriber(self, key: str, on_token: OnToken) -> Undeclare:
-        return self._keep(_TokenView(key, on_token).declare)
+        return self._keep(_TokenView(key, on_token, self._owns).declare)
 
 
 class _Declared:
-    """One declaration, on the session of now."""
+    """One declaration: on the session of now, and on the one before until that is closed."""
 
-    def __init__(self, declare: Callable[[Transport], Undeclare]) -> None:
-        self._declare = declare
-        self._undeclare: Undeclare | None = None
+    def __init__(self) -> None:
+        self._undeclare: list[Undeclare] = []
         self._closed = False
 
     def declare(self, transport: Transport) -> None:
         if not self._closed:
-            self._undeclare = self._declare(transport)
+            self._undeclare.append(self._on(transport))
+
+    def forget_old(self) -> None:
+        del self._undeclare[:-1]
 
     def close(self) -> None:
         self._closed = True
-        undeclare, self._undeclare = self._undeclare, None
-        if undeclare is not None:
-            undeclare()
+        undeclare, self._undeclare = self._undeclare, []
+        for one in undeclare:
+            one()
+
+    def _on(self, transport: Transport) -> Undeclare:
+        raise NotImplementedError
+
+
+class _Other(_Declared):
+    def __init__(self, declare: Callable[[Transport], Undeclare]) -> None:
+        super().__init__()
+        self._declare = declare
+
+    def _on(self, transport: Transport) -> Undeclare:
+        return self._declare(transport)
+
+
+class _Token(_Declared):
+    """`key_of` gives its key on a session of that id."""
+
+    def __init__(self, key_of: Callable[[str], str]) -> None:
+        super().__init__()
+        self._key_of = key_of
+        self.key = ""
+
+    def _on(self, transport: Transport) -> Undeclare:
+        self.key = self._key_of(transport.id())
+        return transport.token(self.key)
+
+    def close(self) -> None:
+        self.key = ""
+        super().close()
 
 
 class _RenewablePublisher(TransportPublisher):
@@ -251,8 +301,8 @@ class _RenewablePublisher(TransportPublisher):
 class _TokenView:
     """The tokens on a key as their watcher knows them: of a new session only differences are told."""
 
-    def __init__(self, key: str, on_token: OnToken) -> None:
-        self._key, self._on_token = key, on_token
+    def __init__(self, key: str, on_token: OnToken, owns: Callable[[str], bool]) -> None:
+        self._key, self._on_token, self._owns = key, on_token, owns
         self._session = 0
         self._lock = threading.Lock()
         self._alive: dict[str, int] = {}
@@ -265,6 +315,9 @@ class _TokenView:
         def on_token(token: str, alive: bool) -> None:
             with self._lock:
                 if session != self._session:  # of the old one, which is to be closed
+                    return
+                # Zenoh tells a session that its own token is gone, where the same one on another session is.
+                if not alive and self._owns(token):
                     return
                 known = token in self._alive
                 if alive:

@@ -78,9 +78,11 @@ class ZenohMesh(Mesh):
         config = config or MeshConfig()
         openings = [functools.partial(_open, config)]
         if config.listen:
-            # Its addresses are to be had again once the session that listens there is closed.
-            elsewhere = replace(config, listen=tuple(_PORT.sub(":0", one) for one in config.listen))
-            openings.insert(0, functools.partial(_open, elsewhere))
+            # Its addresses are to be had again once the session that listens there is closed. Until then one on other
+            # ports hears from that session who else is there.
+            own = tuple(one.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for one in config.listen)  # noqa: S104
+            ports = tuple(_PORT.sub(":0", one) for one in config.listen)
+            openings.insert(0, functools.partial(_open, replace(config, listen=ports, connect=(*config.connect, *own))))
         return cls(RenewableTransport(await _open(config), openings), Keys(fleet), me, clock.now)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from decimal import Decimal
 from types import SimpleNamespace
@@ -19,14 +20,21 @@ from zscout.behaviors.client.request import OpenArc, RequestStore
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import BadName, Keys, Sender
 from zscout.mesh import Mesh
+from zscout.mesh.renewal import Suspicions
 from zscout.messages import Amounts, Notice, OpenRequest, Problem, ReasonInfo
-from zscout.types import SECOND, Grant, Place, Term
+from zscout.types import SECOND, Grant, Ns, Place, Term
 
 OLD, TERM = Term(1, "zz"), Term(2, "aa")
 FIRST, SECOND_GRANT = Grant(TERM, 1), Grant(TERM, 9)
 NOW = 1000 * SECOND
 NOBODY = cast("Client", None)
 """For what asks nobody on the mesh."""
+
+
+def mesh(now: Callable[[], Ns]) -> Mesh:
+    """The parts of a mesh that decisions of a client need."""
+    parts = SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=now, suspicions=Suspicions(now, lambda: None))
+    return cast("Mesh", parts)
 
 
 def arc(*needs: str) -> OpenArc:
@@ -238,9 +246,7 @@ def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_lat
 )
 def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(answers: list[str | None], told: Any) -> None:
     async def story() -> None:
-        client = Client(
-            cast("Mesh", SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)), default_fleet()
-        )
+        client = Client(mesh(lambda: NOW), default_fleet())
         known = arc("robot/a")
         known.take(runs({}), NOW)
         ended: list[OpenArc] = []
@@ -276,9 +282,8 @@ def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(answers: l
 def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> None:
     async def story() -> None:
         loop = asyncio.get_running_loop()
-        mesh = SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: round(loop.time() * SECOND))
-        client, known = Client(cast("Mesh", mesh), default_fleet()), arc()
-        known.take(runs({}), mesh.now())
+        client, known = Client(mesh(lambda: round(loop.time() * SECOND)), default_fleet()), arc()
+        known.take(runs({}), client.mesh.now())
         linked = loop.time() + 0.99
 
         async def command(rc: str, *_: Any, **__: Any) -> None:

@@ -25,6 +25,8 @@ __all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "RequestRef
 
 log = logging.getLogger(__name__)
 
+UNREACHED = 10.0
+"""Seconds for which an RC may be granted that this client neither sees nor reaches."""
 CONFIRM_TIMEOUT = 1.0
 """Seconds within which all RCs of a grant must have confirmed it."""
 CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
@@ -215,19 +217,28 @@ class Client(MovableClient):
                 try:
                     await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
                 except CommandRefused as refused:
-                    if refused.code == "unknown":
-                        self.mesh.suspicions.suspect(f"{rc} was granted and does not answer")
                     if arc.grant != grant or refused.code not in CONFIRM_AGAIN or left <= 0:
                         return refused
                 else:
-                    self.mesh.suspicions.clear(f"{rc} was granted and does not answer")
                     return None
                 # The last time when all is over: a link to the RC may take that long.
                 await asyncio.sleep(max(0.0, min(pause, (deadline - self.mesh.now()) / SECOND)))
                 pause *= 2
 
         refusals = await asyncio.gather(*(one(rc) for rc in arc.rcs))
+        for rc, refused in zip(arc.rcs, refusals, strict=True):
+            await self._look_at_silence(rc, silent=refused is not None and refused.code == "unknown")
         return [refused for refused in refusals if refused is not None]
+
+    async def _look_at_silence(self, rc: str, *, silent: bool) -> None:
+        """An RC that the RCM sees, and so should this client."""
+        sign = f"{rc} was granted and does not answer"
+        if not silent:
+            self.mesh.suspicions.clear(sign)
+        elif await self.mesh.living(self.mesh.keys.alive_rc(rc), timeout=CONFIRM_TIMEOUT):
+            self.mesh.suspicions.suspect(sign)
+        else:  # there may be no link to it: but for so long?
+            self.mesh.suspicions.suspect(sign, patience=UNREACHED)
 
     async def end(self, arc: OpenArc) -> None:
         """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed
@@ -296,9 +307,12 @@ class Client(MovableClient):
             return
         if (arc := self._store.arcs.get(notice.id)) is not None:
             self._store.take(arc, notice)
-        elif not self._take_moving(notice) and notice.state == "running":
-            # A grant that nobody here asked for, or gave up meanwhile, is given back.
-            self._supervisor.spawn(self._rcm.give_back(messages.Release(id=notice.id)))
+        elif not self._take_moving(notice) and notice.id not in self._store.withdrawn:
+            # What nobody here asked for, or what was over here before an RCM that took the lead heard of it.
+            if notice.state == "running":
+                self._supervisor.spawn(self._rcm.give_back(messages.Release(id=notice.id)))
+            elif notice.state == "queued":
+                self._supervisor.spawn(self._rcm.give_back(messages.Cancel(id=notice.id)))
 
 
 C = TypeVar("C", bound=Client)

@@ -28,6 +28,9 @@ END_TRIES = 3
 TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full", "old_term"})
 CHECKS_PER_LEASE = 10
 SILENT_RCM: Final = "an RCM is seen that does not answer"
+NO_RCM: Final = "candidates are seen, and no RCM"
+LEADERLESS: Final = 5.0
+"""Seconds: longer than an election takes."""
 """How often within a hold lease a client checks whether an RCM published."""
 
 
@@ -137,11 +140,22 @@ class RcmLink:
     async def query(self, operation: Operation) -> Reply[Notice] | None:
         """An RCM's answer to an operation; None: none came, and it was carried out or not."""
         reply = await self.mesh.ask_one(self.key, operation, Notice, timeout=QUERY_TIMEOUT)
-        if reply is None and self.leader is not None:
-            self.mesh.suspicions.suspect(SILENT_RCM)
-        else:
-            self.mesh.suspicions.clear(SILENT_RCM)
+        await self._look_at_silence(silent=reply is None)
         return reply
+
+    async def _look_at_silence(self, *, silent: bool) -> None:
+        """An RCM that is seen or heard answers; where candidates are seen one leads before long."""
+        suspicions, heard = (
+            self.mesh.suspicions,
+            self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease // 2,
+        )
+        if not silent:
+            suspicions.clear(SILENT_RCM)
+            suspicions.clear(NO_RCM)
+        elif self.leader is not None or heard:
+            suspicions.suspect(SILENT_RCM)
+        elif await self.mesh.living(self.mesh.keys.alive_any(Role.CANDIDATE), timeout=QUERY_TIMEOUT):
+            suspicions.suspect(NO_RCM, patience=LEADERLESS)
 
     async def submit(self, arc: OpenArc) -> None:
         """Asks until the RCM has answered; not while the client is paused. Raises RequestRefused."""
@@ -170,7 +184,10 @@ class RcmLink:
         self._unanswered = reply is None
         if reply is None:
             return None
-        self._is_ahead = reply.message is not None and reply.message.term < self.term
+        if reply.message is not None:
+            self._is_ahead = reply.message.term < self.term
+        elif reply.problem is not None:
+            self._is_ahead = reply.problem.code == "old_term"
         if reply.message is not None and self.accept(reply.message.term):
             self.store.take(arc, reply.message)
         return reply.problem

@@ -11,7 +11,8 @@ from zscout.lab.faults.memory import Disturbance
 
 FaultKind: TypeAlias = Literal["freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "forget", "double"]
 
-KINDS: tuple[FaultKind, ...] = ("freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "double")
+KINDS: tuple[FaultKind, ...] = ("freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "double", "forget")
+HEALED = 45.0
 MESSAGES = ("grants", "rc/state", "rcm/state", "schedule", "notice", "requests", "command", "vote", "alive")
 """Kinds of messages that may be disturbed."""
 
@@ -30,6 +31,12 @@ class Fault:
     message: str = ""
     how: Disturbance = field(default_factory=Disturbance)
 
+    @property
+    def felt(self) -> float:
+        """Seconds for which it goes on when it is over: until every process that it left in contradiction has joined
+        anew."""
+        return HEALED if self.kind == "forget" else 0.0
+
     def __str__(self) -> str:
         what = {
             "freeze": "stands still",
@@ -40,7 +47,7 @@ class Fault:
             "part": "are cut off from all others",
             "disturb": f"disturbed: {self.message} {self.how}",
             "double": "offers it as well",
-            "forget": "links come back without all declarations",
+            "forget": "is cut off, and its links come back without all that was declared",
         }[self.kind]
         return f"{self.at:7.3f} for {self.lasts:.3f} s: {' '.join(self.whom)} {what}"
 
@@ -63,6 +70,8 @@ def draw(
                 whom = tuple(rng.sample(hosts, 2))
             case "isolate":
                 whom = (rng.choice(hosts),)
+            case "forget":
+                whom, lasts = (rng.choice(hosts),), 1 + lasts
             case "double":
                 whom, lasts = (rng.choice(rcs), rng.choice(hosts)), 5 * lasts
             case "part":

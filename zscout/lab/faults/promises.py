@@ -54,6 +54,8 @@ class Promises:
         """By ARC: (term, step) of the newest that its client was told."""
         self._arc_of: dict[str, str] = {}
         """By grant that was published."""
+        self.in_contradiction = False
+        """Whether links have come back without all declarations: what a client ends may not reach who leads."""
         self._over: dict[str, float] = {}
         """ARCs that their clients have ended, and when."""
         self._places: dict[tuple[str, str], Place] = {}
@@ -85,7 +87,7 @@ class Promises:
             self._promised[instance] = max(what["promised"], promised)
         for grant in {str(grant) for grant in what["holds"]} - self._held.get(instance, set()):
             arc = self._arc_of.get(grant, "")
-            if self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
+            if not self.in_contradiction and self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
                 self._broken(f"{rc} begins for {arc}, which its client has ended")
         held, ended = {str(grant) for grant in what["holds"]}, self._ended.setdefault(instance, set())
         ended |= self._held.get(instance, set()) - held
@@ -111,6 +113,8 @@ class Promises:
             self._over.pop(full, None)
         else:
             self._over.setdefault(full, self._now())
+        if arc.outcome == "lost" and arc.reason.startswith("the RCM refuses it"):
+            self._broken(f"{name} {arc.name} was taken, and then refused: {arc.reason}")
         if arc.outcome in ("lost", "client_lost") and not touched:
             self._broken(f"{name} {arc.name} {arc.outcome}, though no fault touched it: {arc.reason}")
         if arc.place is not None:

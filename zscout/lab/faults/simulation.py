@@ -55,6 +55,8 @@ SERVED_WITHIN: Final = 60.0
 """Seconds after the last fault in which all that was asked must have been served."""
 FELT: Final = 5.0
 """Seconds for which a fault may be felt when it is over: links come back, and holds that were lost are told of."""
+FORGOTTEN: Final = 0.3
+"""Of what was declared, where links come back without all of it."""
 LOOK_EVERY: Final = 0.05
 OPERATOR: Final = "h0/operator"
 
@@ -357,7 +359,9 @@ class Simulation:
         names = {*whom, *(self.where[rc] for rc in whom if rc in self.where)}
         lately = self.loop.now - START - FELT
         faults = [
-            fault for fault in self.faults if fault.at < self.loop.now - START and fault.at + fault.lasts > lately
+            fault
+            for fault in self.faults
+            if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
         return any(fault.kind not in ("freeze", "stall", "kill") or names & {*fault.whom} for fault in faults)
 
@@ -401,16 +405,23 @@ class Simulation:
                 process.main = process.run(asyncio.create_task, self._guard(self._spare(rc, mesh, leaves)))
                 end = leaves.set if fault.both else lambda: self._kill_spare(name, rc)
             case "forget":
-                self.network.forgetful = 0.1
-                end = lambda: setattr(self.network, "forgetful", 0.0)  # noqa: E731
+                pairs = self._pairs(fault)
+                self.cuts.update(pairs)
+                self._cut()
+                end = lambda: self._come_back(pairs)  # noqa: E731
         self.present.append(fault)
+        self.promises.in_contradiction |= fault.kind == "forget"
         self.loop.call_later(fault.lasts, self._end, fault, end)
 
     def _end(self, fault: Fault, end: Callable[[], None]) -> None:
         self.log(f"OVER  {fault.kind} {' '.join(fault.whom)}")
-        self.present.remove(fault)
-        self.calm_since = self.loop.now
         end()
+        self.loop.call_later(fault.felt, self._forget_fault, fault)
+
+    def _forget_fault(self, fault: Fault) -> None:
+        self.present.remove(fault)
+        self.promises.in_contradiction = any(fault.kind == "forget" for fault in self.present)
+        self.calm_since = self.loop.now
 
     def _kill(self, name: str) -> None:
         self.end_process(name)
@@ -440,6 +451,11 @@ class Simulation:
     def _mend(self, pairs: list[tuple[str, str]]) -> None:
         self.cuts.subtract(pairs)
         self._cut()
+
+    def _come_back(self, pairs: list[tuple[str, str]]) -> None:
+        self.network.forgetful = FORGOTTEN
+        self._mend(pairs)
+        self.network.forgetful = 0.0
 
     def _cut(self) -> None:
         cuts = +self.cuts

@@ -26,8 +26,11 @@ from zscout.services.rcm.recovery import take_over
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
+
 R = TypeVar("R")
 
+WAITS = 4.0
+"""Seconds for which a candidate waits for a leader that only others see: longer than RCs believe in one that went."""
 MAX_ATTEMPTS = 3
 """Terms tried in one go when RCs turn out to have promised higher ones."""
 BACKOFF, MAX_BACKOFF = 1.0, 30.0
@@ -168,6 +171,10 @@ class Candidate:
         own = [bool(state.leader) for state in states if state.host == host]
         if self.election.must_wait(others, own, self.mesh.now(), self._leader):
             log.info("%d of %d RCs of other hosts still see a leader: waiting", sum(others), len(others))
+            if sum(others) * 2 > len(others):
+                self.mesh.suspicions.suspect(
+                    "RCs of other hosts see an RCM, and this candidate does not", patience=WAITS
+                )
             return True
         return False
 

@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
+from msgspec import Struct
+
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import Role, Token
+from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import StallWatch, Supervisor
-from zscout.messages import RcAsk, RcState
+from zscout.messages import ClientRequests, RcAsk, RcState
 from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.services.rcm.recovery import gangs_of, recover
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
@@ -25,6 +27,10 @@ log = logging.getLogger(__name__)
 
 AWAY: Final = 0.25
 """A leader that stood still for this part of the mesh lease, or lost several peers within it, was away itself."""
+SEEK_EVERY: Final = 1.0
+"""Seconds."""
+SEEK_TIMES: Final = 20
+MAX_SOUGHT: Final = 256
 NEAR_END: Ns = SECOND // 20
 """A hold with less than this left may have ended at its RC already: clocks differ a little."""
 
@@ -78,6 +84,8 @@ class Membership:
         """Called when the instances of an RC are to hear which one is meant."""
         self._named: dict[RcName, tuple[str, HostName]] = {}
         """The instance that is meant of each RC, and its host."""
+        self._sought: dict[str, int] = {}
+        """By key: how often those whose tokens went without them are still asked."""
         self._departed: dict[RcName, RcState] = {}
         """RCs that went less than a hold lease ago: they may still let their holders command."""
 
@@ -161,7 +169,29 @@ class Membership:
 
     def _client_lost(self, client: ClientId) -> None:
         self._unseen.pop(client, None)
+        self._seek(self.mesh.keys.requests(client_of(client)), ClientRequests, lambda: client in self.clients)
         self._emit(ClientLost(client))
+
+    # Contradictions
+
+    def _seek(self, key: str, kind: type[Struct], is_seen: Callable[[], bool]) -> None:
+        """Asks for a while whoever went: one that answers without a token is there, and the mesh contradicts itself."""
+        fresh = key not in self._sought
+        if not fresh or len(self._sought) < MAX_SOUGHT:
+            self._sought[key] = SEEK_TIMES
+            if fresh:
+                self._supervisor.spawn(self._keep_seeking(key, kind, is_seen))
+
+    async def _keep_seeking(self, key: str, kind: type[Struct], is_seen: Callable[[], bool]) -> None:
+        sign = f"{key} answers, and its token is missing"
+        while self._sought[key] and not is_seen():
+            self._sought[key] -= 1
+            await asyncio.sleep(SEEK_EVERY)
+            reply = await self.mesh.ask_one(key, RcAsk(), kind, timeout=self._timeout)
+            if reply is not None and not is_seen():
+                self.mesh.suspicions.suspect(sign)
+        self.mesh.suspicions.clear(sign)
+        del self._sought[key]
 
     # RCs
 
@@ -209,6 +239,7 @@ class Membership:
     def _drop(self, name: RcName) -> None:
         gone = self._departed[name] = self._joined.pop(name)
         self._supervisor.call_later(self._hold_lease, self._free, gone)
+        self._seek(self.mesh.keys.rc_state(name), RcState, lambda: name in self._rc_tokens)
         self._emit(RcLost(name))
         for other in self._rc_tokens.get(name, {}).values():
             self._supervisor.spawn(self._join(other))

@@ -271,6 +271,11 @@ class Rcm:
         self, rc: RcName, proposal: int, overdue: asyncio.TimerHandle, reply: Reply[messages.Ballot] | None
     ) -> None:
         overdue.cancel()
+        sign = f"{rc} is seen and does not vote"
+        if reply is None:
+            self.mesh.suspicions.suspect(sign)
+        else:
+            self.mesh.suspicions.clear(sign)
         ballot = reply.message if reply is not None else None
         if ballot is not None and ballot.proposal == proposal:
             self._receive(Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON]))

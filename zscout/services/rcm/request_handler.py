@@ -25,6 +25,7 @@ from zscout.messages import (
     Notice,
     Operation,
     Release,
+    absurd,
     duration,
     exact_amounts,
 )
@@ -328,8 +329,10 @@ class RequestHandler:
 
 def check_place(place: Place, core: Core) -> None:
     """Raises Refused for a place that no RCM can have given."""
-    if place.term > core.term:
+    if absurd(place.term, core.term):
         raise Refused("bad_request", "place is of a term that has not been; leave it out")
+    if place.term > core.term:
+        raise Refused("old_term", "place is of a higher term than this RCM's", core.term)
     if place.arrival < 1 or not core.could_have_issued(place):
         raise Refused("bad_request", "place was never given; leave it out")
 

@@ -1,0 +1,107 @@
+"""A session that is opened anew, which nobody else notices; and what tells that it has to be."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+
+import pytest
+
+from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Play, Pong, World, token
+from tests.mesh.kit import run, until
+from zscout.keyexpr import Role, Sender
+from zscout.lab.faults.memory import MemoryNetwork
+from zscout.mesh.renewal import LASTS, LONGEST, PATIENCE, SHORTEST, Suspicions
+from zscout.types import SECOND
+
+
+def test_what_is_declared_goes_on_and_nobody_notices(play: Play) -> None:
+    async def story(world: World) -> None:
+        a, b = await world.open("a", "b")
+        seen: dict[str, list[tuple[str, bool]]] = {"a": [], "b": []}
+        heard: dict[str, set[int]] = {"a": set(), "b": set()}
+        handled: list[int] = []
+        for mesh, name in ((a, "a"), (b, "b")):
+            told, news = seen[name].append, heard[name].add
+            mesh.watch(mesh.keys.alive_any(Role.CLIENT), lambda one, alive, told=told: told((one.host, alive)))  # type: ignore[misc]
+            mesh.subscribe(f"{NEWS}/*", Ping, lambda _, ping, news=news: news(ping.number))  # type: ignore[misc]
+        tokens = [a.alive(token("a")), b.alive(token("b"))]
+
+        def serve(query: object) -> None:
+            handled.append(query.message.number)  # type: ignore[attr-defined]
+            query.answer(Pong(query.message.number))  # type: ignore[attr-defined]
+
+        a.serve(ASK, Ping, serve)
+        publishers = a.publisher(f"{NEWS}/a", Ping), b.publisher(f"{NEWS}/b", Ping)
+        await world.declared()
+        before = a._transport.id()
+        a._transport.renew()
+        asked = answered = 0
+        while a._transport._renewing is not None:
+            asked += 1
+            reply = await b.ask_one(ASK, Ping(asked), Pong, timeout=LONG)
+            answered += reply is not None
+            await asyncio.sleep(0.01)
+        assert a._transport.id() != before
+        # Each at most once. What was sent to the old session alone, as it was left, has no answer: it is asked again.
+        assert len(handled) == len(set(handled)) == answered > 0
+        await until(lambda: b._transport.peers() == [a._transport.id()])
+        await world.declared()
+        for publisher in publishers:
+            publisher.put(Ping(1_000))
+        await until(lambda: all(1_000 in news for news in heard.values()))
+        assert (await b.ask_one(ASK, Ping(0), Pong, timeout=LONG)) is not None
+        assert {name: sorted(told) for name, told in seen.items()} == {key: [("a", True), ("b", True)] for key in "ab"}
+        for one in tokens:
+            one.close()
+        await until(lambda: all(len(told) == 4 for told in seen.values()))
+
+    play(story)
+
+
+def test_a_link_that_comes_back_without_its_token_is_noticed_and_left(caplog: pytest.LogCaptureFixture) -> None:
+    async def story() -> None:
+        network = MemoryNetwork()
+        a, b = (network.open("test", Sender(name, "test")) for name in "ab")
+        for mesh in (a, b):
+            mesh.watch_links()
+        held = b.alive(token("b"))
+        seen: list[bool] = []
+        a.watch(a.keys.alive_any(Role.CLIENT), lambda _, alive: seen.append(alive))
+        await until(lambda: seen == [True])
+        network.isolate(a)
+        await until(lambda: seen == [True, False])
+        network.forgetful = 1.0
+        network.heal()
+        network.forgetful = 0.0
+        await until(lambda: seen == [True, False, True])
+        await until(lambda: a.links() == b.links() == 1)
+        held.close()
+        await until(lambda: len(seen) == 4)
+        for mesh in (a, b):
+            await mesh.close()
+
+    with caplog.at_level(logging.WARNING):
+        run(story())
+    assert [record.message.partition(":")[2] for record in caplog.records] == [" this process joins the mesh anew"] * 2
+
+
+def test_a_contradiction_must_last_and_one_that_stays_is_acted_on_ever_more_seldom() -> None:
+    renewed: list[float] = []
+    seconds = 0.0
+    suspicions = Suspicions(lambda: round(seconds * SECOND), lambda: renewed.append(seconds))
+    suspicions.suspect("x")
+    seconds += PATIENCE / 2
+    suspicions.clear("x")
+    seconds += PATIENCE
+    suspicions.suspect("x")
+    seconds += LASTS
+    suspicions.suspect("x")
+    assert renewed == []
+    while seconds < 2_000:
+        seconds += 0.5
+        suspicions.suspect("x")
+    pauses = [after - before for before, after in itertools.pairwise(renewed)]
+    assert pauses[:3] == [SHORTEST, 2 * SHORTEST, 4 * SHORTEST]
+    assert max(pauses) == pauses[-1] == LONGEST
