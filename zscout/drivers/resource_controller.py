@@ -18,7 +18,7 @@ from zscout.drivers.instances import Instances, InstanceState
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.supervision import StallWatch
-from zscout.types import SECOND, Ns
+from zscout.types import NO_TERM, SECOND, Ns
 
 log = logging.getLogger(__name__)
 
@@ -218,6 +218,9 @@ class ResourceController:
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
+        if not alive and self.holds.promised.rcm == token.instance:
+            # A leader from which this RC was cut off asks it again.
+            self.holds.promised = NO_TERM
 
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
         before = self.holds.term, self.holds.seq

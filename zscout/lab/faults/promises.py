@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from zscout.scheduling.model import ArcStatus
 from zscout.scheduling.reason import ReasonCode
-from zscout.types import ArcId, Grant, Ns, Place, Term
+from zscout.types import ArcId, Grant, Ns, Place, RcName, Term
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
@@ -31,7 +31,7 @@ TERMS_WITHIN: Final = 10.0
 UNLED: Final = 0.5
 """Seconds beyond the hold lease after which an RC that hears no RCM is held by nobody."""
 GIVEN_BACK: Final = 3.0
-"""Seconds after which no RC begins any more for an ARC that its client has ended."""
+"""Seconds after which no RC is granted any more to an ARC that its client has ended."""
 LEFT_OVER: Final = 7.0
 """Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
 
@@ -53,7 +53,7 @@ class Promises:
         self._told: dict[str, tuple[Term, int]] = {}
         """By ARC: (term, step) of the newest that its client was told."""
         self._arc_of: dict[str, str] = {}
-        """By grant that was published."""
+        """By grant that was published: the ARC that it was for."""
         self.in_contradiction = False
         """Whether links have come back without all declarations: what a client ends may not reach who leads."""
         self._over: dict[str, float] = {}
@@ -72,8 +72,10 @@ class Promises:
     def event(self, what: Mapping[str, Any]) -> None:
         """A line of `zscout.trace`: at every event, what an RC may not do whatever it hears."""
         if what["do"] == "publish":
-            for holders in what["rcs"].values():
-                self._arc_of |= {str(grant): arc for grant, arc, *_ in holders}
+            for rc, holders in what["rcs"].items():
+                for grant, arc, *_ in holders:
+                    if str(grant) not in self._arc_of:
+                        self._granted(rc, str(grant), arc)
             return
         rc, instance, known = what["rc"], what["instance"], (what["term"], what["seq"])
         before = self._heard.get(instance, known)
@@ -85,10 +87,6 @@ class Promises:
             self._broken(f"{rc} obeys {known[0]}, and has promised {promised}")
         if what["do"] == "promise":
             self._promised[instance] = max(what["promised"], promised)
-        for grant in {str(grant) for grant in what["holds"]} - self._held.get(instance, set()):
-            arc = self._arc_of.get(grant, "")
-            if not self.in_contradiction and self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
-                self._broken(f"{rc} begins for {arc}, which its client has ended")
         held, ended = {str(grant) for grant in what["holds"]}, self._ended.setdefault(instance, set())
         ended |= self._held.get(instance, set()) - held
         if again := held & ended:
@@ -96,6 +94,11 @@ class Promises:
         self._held[instance] = held
         if what["do"] == "command" and str(what["grant"]) not in held:
             self._broken(f"{rc} obeyed a command under {what['grant']}, which it does not hold")
+
+    def _granted(self, rc: RcName, grant: str, arc: str) -> None:
+        self._arc_of[grant] = arc
+        if not self.in_contradiction and self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
+            self._broken(f"{rc} is granted to {arc}, which its client has ended")
 
     def forget_client(self, name: str) -> None:
         """It died: what it was promised was to that life."""

@@ -72,6 +72,8 @@ class Membership:
         self._away_until: Ns = 0
         """Until then what goes is only unseen: this leader was away itself, and takes its own lost links for theirs."""
         self._rc_tokens: dict[RcName, dict[str, Token]] = {}
+        self._blinked: set[str] = set()
+        """Instances of RCs that count as there, and whose tokens went as this leader was away."""
         self._rc_seen: dict[RcName, Ns] = {}
         """When each RC was seen first, of those that have a token."""
         self._joined: dict[RcName, RcState] = {}
@@ -213,7 +215,11 @@ class Membership:
                 if current is not None:
                     self._succeed(token)
                 self._supervisor.spawn(self._join(token))
-            elif current is not None and current.instance != token.instance:
+            elif current is not None and current.instance == token.instance:
+                if token.instance in self._blinked:
+                    self._blinked.discard(token.instance)
+                    self._supervisor.spawn(self._greet(token.name))
+            elif current is not None:
                 log.warning("%s is offered twice; the one at %s is used", token.name, current.host)
                 self.on_named(token.name)
             return
@@ -222,12 +228,20 @@ class Membership:
             del self._pending[token.name]
         if current is not None and current.instance == token.instance:
             if self._is_away(token):
+                self._blinked.add(token.instance)
                 self._supervisor.call_later(self._lease, self._drop_unseen)
             else:
                 self._drop(token.name)
         if not tokens:
             del self._rc_tokens[token.name], self._rc_seen[token.name]
             self._settle()
+
+    async def _greet(self, name: RcName) -> None:
+        """Asks an RC whose token has come back, so that it knows to be seen."""
+        key = self.mesh.keys.rc_state(name)
+        for reply in await self.mesh.ask(key, RcAsk(promise=self.term), RcState, timeout=self._timeout):
+            if reply.message is not None:
+                self._on_rc_state(key, reply.message)
 
     def _succeed(self, token: Token) -> None:
         """A new instance on the same host: the one before is not there any more."""
@@ -238,6 +252,7 @@ class Membership:
 
     def _drop(self, name: RcName) -> None:
         gone = self._departed[name] = self._joined.pop(name)
+        self._blinked.discard(gone.instance)
         self._supervisor.call_later(self._hold_lease, self._free, gone)
         self._seek(self.mesh.keys.rc_state(name), RcState, lambda: name in self._rc_tokens)
         self._emit(RcLost(name))
