@@ -167,6 +167,11 @@ class HoldTable:
     def _heard(self, now: Ns) -> bool:
         return now - self.last_contact < self.hold_lease
 
+    def catch_up(self, term: Term) -> None:
+        """Others have promised `term`."""
+        if term > self.term:
+            self.term, self.seq = term, 0
+
     def promise(self, term: Term, now: Ns, *, above: bool = False) -> bool:
         """Obeys no lower term again. False: a higher one is known, or the jump is absurd, unless the fleet must go
         `above` one that an RC obeys already."""

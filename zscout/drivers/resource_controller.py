@@ -18,7 +18,8 @@ from zscout.drivers.instances import Instances, InstanceState
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.supervision import StallWatch
-from zscout.types import NO_TERM, SECOND, Ns
+from zscout.mesh.terms import promised_elsewhere
+from zscout.types import NO_TERM, SECOND, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -129,6 +130,7 @@ class ResourceController:
         """What it answers, by its standing among the instances of this RC."""
         self._declared: list[Declaration] = []
         self._warm_at: Ns = 0
+        self._catching_up: asyncio.Task[None] | None = None
         self._reading: asyncio.Task[None] | None = None
         self._missed = False
         """Something was missed that has not been read since."""
@@ -223,6 +225,7 @@ class ResourceController:
             self.holds.promised = NO_TERM
 
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
+        self._judge(grants.term)
         before = self.holds.term, self.holds.seq
         change = self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable)
         if change or before != (self.holds.term, self.holds.seq):
@@ -244,8 +247,17 @@ class ResourceController:
         except Refused as refused:
             query.refuse(refused.problem)
 
+    def _judge(self, term: Term) -> None:
+        if messages.of_the_last(term, self.holds.term) and (self._catching_up is None or self._catching_up.done()):
+            self._catching_up = self.supervisor.spawn(self._catch_up())
+
+    async def _catch_up(self) -> None:
+        self.holds.catch_up(await promised_elsewhere(self.mesh, timeout=REREAD_TIMEOUT))
+
     def _promise(self, query: IncomingQuery[messages.RcAsk], *, above: bool) -> None:
         promise = query.message.promise
+        if promise is not None:
+            self._judge(promise)
         if promise is not None and not self.holds.promise(promise, self.mesh.now(), above=above):
             raise Refused("old_term", f"{self.name} obeys term {self.holds.term.counter}", self.holds.term)
         if promise is not None:

@@ -26,6 +26,8 @@ MAX_COUNTER = 2**52 - 1
 """A term whose counter is above this is rejected."""
 MAX_JUMP = 1_000_000
 """A term whose counter is this far above all that were received is an error, not an election."""
+LAST_TERMS = MAX_COUNTER - 2**20
+"""Above this counter terms come one by one: nobody can use up at once those that are left."""
 MAX_ERROR = 400
 """Characters in the text of an error: it may quote what was sent."""
 MAX_DIGITS = 25
@@ -74,9 +76,15 @@ class Malformed(ValueError):
 
 def absurd(term: Term, known: Term, *, heard: bool = True) -> bool:
     """Whether `term` is too far above `known`, the newest received, to be accepted. Where no RCM that is believed is
-    `heard`, as before the first one (`NO_TERM`), any up to MAX_COUNTER is accepted: a fleet may be old."""
-    bound = min(MAX_COUNTER, known.counter + MAX_JUMP) if heard and known != NO_TERM else MAX_COUNTER
-    return term.counter > bound
+    `heard`, as before the first one (`NO_TERM`), any up to LAST_TERMS is accepted: a fleet may be old. Of those above
+    it only the next is, and who does not know it asks others (`zscout.mesh.terms`)."""
+    bound = known.counter + MAX_JUMP if heard and known != NO_TERM else MAX_COUNTER
+    return term.counter > min(bound, max(LAST_TERMS, known.counter + 1), MAX_COUNTER)
+
+
+def of_the_last(term: Term, known: Term) -> bool:
+    """Whether `term` is absurd only because `known` is too old to judge it."""
+    return max(LAST_TERMS, known.counter + 1) < term.counter <= MAX_COUNTER
 
 
 def encode(message: msgspec.Struct) -> bytes:

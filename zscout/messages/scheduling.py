@@ -8,7 +8,7 @@ from typing import Annotated, TypeAlias
 import msgspec
 
 from zscout.messages.base import NAMES_ONCE, Amounts, Elapsed, Message, Seconds, State
-from zscout.types import Grant, Place, Term
+from zscout.types import NO_TERM, Grant, Place, Term
 
 MAX_OTHERS = 255
 """ARCs that one hand-over takes along, beside the one that it names first."""
@@ -275,3 +275,5 @@ class OpenRequest(_Wanted, frozen=True):
 class ClientRequests(Message, frozen=True):
     client: str
     requests: list[OpenRequest]
+    term: Term = NO_TERM
+    """The highest that it has promised."""

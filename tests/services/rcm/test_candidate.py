@@ -17,7 +17,7 @@ from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role
 from zscout.mesh.supervision import StallWatch
-from zscout.messages import Notice, OpenRequest, Release
+from zscout.messages import LAST_TERMS, Grants, Notice, OpenRequest, RcAsk, RcState, Release
 from zscout.services.rcm.candidate import BACKOFF, MAX_BACKOFF, Candidate
 from zscout.types import SECOND, Term
 
@@ -229,6 +229,36 @@ def test_the_fleet_goes_above_the_term_that_an_rc_obeys_however_high(has_token: 
         joined = {one.name for one in candidate.rcm.core.status().rcs if one.present}
         wanted = (far.counter + 1, {"robot/a", "robot/b"}) if has_token else (1, {"robot/a"})
         assert (candidate.rcm.term.counter, joined) == wanted
+        assert robot.holds.term == candidate.rcm.term
+        await candidate.stop()
+
+    run(story())
+
+
+def test_the_last_terms_come_one_by_one_and_who_does_not_know_them_asks() -> None:
+    """Nobody uses up at once those that are left; a fleet that has come so far goes on."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1")
+        far = Term(LAST_TERMS + 500, "old")
+        fleet.rc("robot/b", term=far)
+        mesh = fleet.mesh("h2")
+        lease = fleet.fleet.timing.hold_lease / SECOND
+        robot = ResourceController(
+            mesh, "robot/a", ExclusiveDriver(), hold_lease=lease, stall=StallWatch(mesh.now).start()
+        )
+        await robot.start()
+        candidate = fleet.candidate("h1")
+        await until(lambda: candidate.rcm and len(candidate.rcm.core.status().rcs) == 2)
+        assert candidate.rcm is not None
+        assert candidate.rcm.term.counter == far.counter + 1
+        assert robot.holds.term == candidate.rcm.term
+        forged = Term(far.counter + 3, "forged")
+        stranger = fleet.mesh("h3")
+        asked = await stranger.ask(stranger.keys.rc_state("robot/a"), RcAsk(promise=forged), RcState, timeout=1)
+        assert [reply.problem is not None and reply.problem.code for reply in asked] == ["old_term"]
+        stranger.publisher(stranger.keys.grants, Grants).put(Grants(term=forged, seq=1, prev=0, every=0.5))
+        await asyncio.sleep(5)
         assert robot.holds.term == candidate.rcm.term
         await candidate.stop()
 

@@ -16,7 +16,8 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
-from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd
+from zscout.mesh.terms import promised_elsewhere
+from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd, of_the_last
 from zscout.types import NO_TERM, SECOND, Ns, Term
 
 QUERY_TIMEOUT = 1.0
@@ -57,6 +58,7 @@ class RcmLink:
         self._leaders: set[Token] = set()
         self._last_contact: Ns = mesh.now()
         self._stall = StallWatch(mesh.now)
+        self._catching_up: asyncio.Task[None] | None = None
 
     def start(self) -> list[Declaration]:
         keys, mesh = self.mesh.keys, self.mesh
@@ -79,9 +81,14 @@ class RcmLink:
         """Whether what is of `term` counts; the highest term is kept. `above`: the fleet must go above one that an RC
         obeys already."""
         if term < self.term or absurd(term, self.term, heard=self._hears and not above):
+            if of_the_last(term, self.term) and (self._catching_up is None or self._catching_up.done()):
+                self._catching_up = self._supervisor.spawn(self._catch_up())
             return False
         self.term = term
         return True
+
+    async def _catch_up(self) -> None:
+        self.term = max(self.term, await promised_elsewhere(self.mesh, timeout=QUERY_TIMEOUT))
 
     @property
     def _hears(self) -> bool:
@@ -108,7 +115,7 @@ class RcmLink:
         promise = request.message.promise
         if promise is not None and not self.accept(promise, above=above):
             raise Refused("old_term", f"this client obeys term {self.term.counter}", self.term)
-        request.answer(ClientRequests(client=str(self.mesh.me), requests=self.store.open_requests()))
+        request.answer(ClientRequests(client=str(self.mesh.me), requests=self.store.open_requests(), term=self.term))
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         if alive:

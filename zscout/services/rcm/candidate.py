@@ -16,7 +16,8 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_instance
 from zscout.mesh import Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import ClientRequests, Grants, RcAsk, RcState, absurd
+from zscout.mesh.terms import promised_elsewhere
+from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd, of_the_last
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
@@ -60,6 +61,7 @@ class Candidate:
         self._changed = asyncio.Event()
         self._failures = 0
         self._again: asyncio.TimerHandle | None = None
+        self._catching_up: asyncio.Task[None] | None = None
 
     async def stop(self) -> None:
         if self._again is not None:
@@ -132,6 +134,10 @@ class Candidate:
     def _see(self, term: Term, refused_by: RcName | None = None) -> bool:
         """False: it is absurd. A term for which an RC that is seen refuses a lower one is none."""
         heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, self.mesh.now())
+        if of_the_last(term, self.known):
+            if self._catching_up is None or self._catching_up.done():
+                self._catching_up = self._supervisor.spawn(self._catch_up())
+            return False
         if absurd(term, self.known, heard=heard):
             if refused_by is None or absurd(term, self.known, heard=False):
                 log.warning("ignored term %d: absurdly far above %d", term.counter, self.known.counter)
@@ -146,6 +152,11 @@ class Candidate:
             self._stop_leading()
             self._changed.set()
         return True
+
+    async def _catch_up(self) -> None:
+        term = await promised_elsewhere(self.mesh, timeout=self._timeout)
+        if term > self.known:
+            self.known = term
 
     # Leading
 
@@ -182,6 +193,9 @@ class Candidate:
         keys = self.mesh.keys
         for _ in range(MAX_ATTEMPTS):
             if self.election.sees_leader(self.mesh.now()):
+                return False
+            if self.known.counter == MAX_COUNTER:
+                log.error("no term is left: end all nodes and clients of the fleet, and start them again")
                 return False
             term = Term(self.known.counter + 1, new_instance())
             promise_query = RcAsk(promise=term, above=self.mesh.me.host if self._goes_above else None)
