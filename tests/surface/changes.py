@@ -24,6 +24,7 @@ _INSTANCE: Final = (
 )
 _GANG: Final = "the RCs of the grant that a client believes in: a leader that never published it knows what was lost"
 _ABOVE: Final = "terms below 2^52, and a candidate that is asked to go above the term that an RC has promised"
+_SESSION: Final = "sessions show themselves, so that a link that came back without them is noticed"
 _STUDIES: Final = (
     "Examples: zscout study zscout study schedule --family paper --seeds 100 zscout study placement --seeds 20"
     " zscout study robots --starts 40 "
@@ -73,6 +74,9 @@ ADDED: Final[dict[str, str]] = {
     + _STUDIES
     + "zscout study faults --runs 1000 zscout study schedule --help": _FAULTS,
     "keys > zscout/FLEET/alive/*/rc/KIND/NAME/*": _INSTANCE,
+    "keys > zscout/FLEET/alive/*/session/**": _SESSION,
+    "keys > zscout/FLEET/alive/HOST/session/NAME/INSTANCE": _SESSION,
+    "messages > zscout.ClientRequests.v1 > fields > term": _ABOVE,
     "messages > zscout.Ask.v1 > fields > rcs": _GANG,
     "messages > zscout.OpenRequest.v1 > fields > rcs": _GANG,
     "messages > zscout.Grants.v1 > fields > instances": _INSTANCE,
