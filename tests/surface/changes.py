@@ -44,6 +44,21 @@ _INCARNATIONS: Final = (
     "StopComponent.v1 > fields > incarnation > anyOf > 0",
 )
 
+_TOKENS: Final = (
+    "anvil/candidate/node",
+    "anvil/load/node",
+    "anvil/node/node",
+    "anvil/rc/radio/rf#",
+    "anvil/rc/robot/a",
+    "anvil/rcm/node",
+    "anvil/session/node",
+    "bellows/load/node",
+    "bellows/node/node",
+    "bellows/session/node",
+    "desk/client/request-#",
+    "desk/session/request-#",
+)
+
 ADDED: Final[dict[str, str]] = {
     "messages > zscout.Ask.v1 > fields > estimate": _STARTS_IN,
     "messages > zscout.Notice.v1 > fields > starts_in": _STARTS_IN,
@@ -94,6 +109,8 @@ REMOVED: Final[dict[str, str]] = {
 }
 
 CHANGED: Final[dict[str, tuple[object, str]]] = {
+    "live > keys > .alive[].role": (["candidate", "client", "load", "node", "rc", "rcm", "session"], _SESSION),
+    "live > keys > .alive[].token": ([f"zscout/surface-#/alive/{token}/#" for token in _TOKENS], _SESSION),
     "python > zscout.Client > methods > connect > gives": (
         "Connecting[Self]",
         "it can be awaited, as before, and entered",

@@ -220,7 +220,7 @@ def _whole(keys: str) -> bool:
 
 def masked(text: str) -> str:
     """Without numbers and random names; spans of time and sizes in one unit each."""
-    text = re.sub(r"\b[0-9a-f]{12}\b|[0-9]+([.,][0-9]+)*", "#", text)
+    text = re.sub(r"\b[0-9a-f]{12,32}\b|[0-9]+([.,][0-9]+)*", "#", text)
     text = re.sub(r"# (d|h|min)\b( # (h|min|s)\b)?", "# s", text)
     return text.replace("GiB", "MiB").replace("# GB", "# MB")
 

@@ -46,6 +46,8 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
                 ("anvil", "rc", "robot/a"),
                 ("anvil", "rc", "radio/rf0"),
                 ("test", "client", "program"),
+                ("anvil", "session", "node"),
+                ("test", "session", "program"),
             }
             rcm = alive["anvil", "rcm", "node"]
             assert rcm["token"] == f"{base}/alive/anvil/rcm/node/{state.term.rcm}"
