@@ -108,7 +108,8 @@ def test_nothing_runs_on_when_it_is_stopped(tmp_path: Path, number: signal.Signa
         return
     assert demo.returncode == 128 + number
     assert error == "the recording until then: mine/demo.rrd\n"
-    assert lanes(tmp_path / "mine" / "demo.rrd", "/rc/**")["/rc/robot/scout33"][1][1] == ["arc0"]
+    # A recorder that came late has seen it free more than once.
+    assert ["arc0"] in [held for _, held in lanes(tmp_path / "mine" / "demo.rrd", "/rc/**")["/rc/robot/scout33"]]
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
