@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,7 @@ from zscout.config.node import Node, load_node
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import MemoryNetwork
+from zscout.mesh import MeshError
 from zscout.node import NodeFailed, run_services
 from zscout.services.node.component_host import ComponentHost
 
@@ -114,3 +117,31 @@ def test_a_node_that_can_not_go_on_exits_with_1(monkeypatch: pytest.MonkeyPatch)
     done = CliRunner().invoke(node_module.main, [])
     assert done.exit_code == 1
     assert "zscout-node: a service failed: KeyError('x'); see the log" in done.stderr
+
+
+def test_an_rc_that_another_process_of_its_host_offers_is_refused_and_free_when_that_has_ended(node: Node) -> None:
+    program = (
+        "import sys\n"
+        "from zscout.drivers.lock import only_here\n"
+        f"with only_here({node.fleet.name!r}, 'anvil', 'robot/a'):\n"
+        "    print('here', flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    other = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert other.stdout is not None
+    other.stdout.readline()
+
+    async def begin() -> None:
+        mesh = MemoryNetwork().open("f", Sender("anvil", "node"))
+        stop = asyncio.Event()
+        asyncio.get_running_loop().call_later(5, stop.set)
+        try:
+            await run_services(node, mesh, stop)
+        finally:
+            await mesh.close()
+
+    with pytest.raises(MeshError, match="robot/a: another process offers it for host anvil already"):
+        run(begin())
+    other.kill()
+    other.communicate()
+    run(begin())

@@ -20,6 +20,7 @@ from zscout import __version__
 from zscout.config.devices import RobotRc
 from zscout.config.node import Node, default_node, load_node
 from zscout.config.strict import BadInput
+from zscout.drivers.lock import only_here
 from zscout.drivers.registry import driver_for
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
@@ -70,6 +71,7 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
         lease = node.fleet.timing.hold_lease / SECOND
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
+            stack.enter_context(only_here(node.fleet.name, me.host, spec.name))
             rc = ResourceController(mesh, spec.name, driver_for(spec), hold_lease=lease, stall=stall, on_failure=fail)
             await rc.start()
             stack.push_async_callback(rc.stop)

@@ -18,6 +18,7 @@ from zscout.behaviors.client.request import OpenArc
 from zscout.drivers.holds import HoldChange, HoldEntry, HoldTable
 from zscout.drivers.instances import Instances
 from zscout.drivers.resource_controller import ResourceController
+from zscout.mesh.renewal import Suspicions
 from zscout.messages import Problem
 from zscout.services.rcm import candidate, membership, recovery
 from zscout.services.rcm.election import Election
@@ -164,6 +165,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
         "believed": Guard("a client is told of a grant that no RC knows", {(RequestHandler, "_may_hold"): _no}),
         "confirmed": Guard("a body is entered when all RCs confirm", {(Client, "_confirm"): _enter_at_once}),
+        "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),
         "withdrawn": Guard("what nobody asks for is given back", {(RcmLink, "_withdraw"): _enter_at_once}),
     }
 )
