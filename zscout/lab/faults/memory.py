@@ -74,10 +74,11 @@ def _node(mesh: Mesh) -> MemoryTransport:
 class MemoryNetwork:
     """The processes of a fleet, and the links between them.
 
-    All times are seconds. `delay` is that of every link, and `lease` how long a process waits for a silent peer."""
+    All times are seconds. `delay` is that of every link, and `lease` how long a process waits for a silent peer, less
+    up to `impatience` of it."""
 
-    def __init__(self, *, delay: float = 0.0002, lease: float = 1.0, seed: int = 0) -> None:
-        self.delay, self.lease = delay, lease
+    def __init__(self, *, delay: float = 0.0002, lease: float = 1.0, impatience: float = 0.0, seed: int = 0) -> None:
+        self.delay, self.lease, self.impatience = delay, lease, impatience
         self.random = random.Random(seed)  # noqa: S311 - what failed once must fail again
         self.nodes: list[MemoryTransport] = []
         self.trace: Callable[[str, str, str, tuple[Any, ...]], None] | None = None
@@ -211,7 +212,8 @@ class MemoryNetwork:
                 continue
             if link.blocked:
                 if link.expiry is None and not link.lost:
-                    link.expiry = link.call_in(self.lease, self._expire, link, back)
+                    patience = self.lease * (1 - self.impatience * self.random.random())
+                    link.expiry = link.call_in(patience, self._expire, link, back)
             else:
                 if link.expiry is not None:
                     link.expiry.cancel()

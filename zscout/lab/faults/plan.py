@@ -9,9 +9,22 @@ from typing import Literal, TypeAlias
 
 from zscout.lab.faults.memory import Disturbance
 
-FaultKind: TypeAlias = Literal["freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "forget", "double"]
+FaultKind: TypeAlias = Literal[
+    "freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "forget", "double", "fail"
+]
 
-KINDS: tuple[FaultKind, ...] = ("freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "double", "forget")
+KINDS: tuple[FaultKind, ...] = (
+    "freeze",
+    "stall",
+    "kill",
+    "cut",
+    "isolate",
+    "part",
+    "disturb",
+    "double",
+    "forget",
+    "fail",
+)
 HEALED = 45.0
 MESSAGES = ("grants", "rc/state", "rcm/state", "schedule", "notice", "requests", "command", "vote", "alive")
 """Kinds of messages that may be disturbed."""
@@ -25,7 +38,7 @@ class Fault:
     lasts: float
     kind: FaultKind
     whom: tuple[str, ...]
-    """Processes or hosts; of a partition one side of it; of a cut from whom and to whom; an RC and a host."""
+    """Processes or hosts; of a partition one side of it; of a cut from whom and to whom; an RC, and a host."""
     both: bool = True
     """Of a cut: in both directions. Of a double: it leaves in order."""
     message: str = ""
@@ -47,6 +60,7 @@ class Fault:
             "part": "are cut off from all others",
             "disturb": f"disturbed: {self.message} {self.how}",
             "double": "offers it as well",
+            "fail": "fails, and works again",
             "forget": "is cut off, and its links come back without all that was declared",
         }[self.kind]
         return f"{self.at:7.3f} for {self.lasts:.3f} s: {' '.join(self.whom)} {what}"
@@ -72,6 +86,8 @@ def draw(
                 whom = (rng.choice(hosts),)
             case "forget":
                 whom, lasts = (rng.choice(hosts),), 1 + lasts
+            case "fail":
+                whom = (rng.choice(rcs),)
             case "double":
                 whom, lasts = (rng.choice(rcs), rng.choice(hosts)), 5 * lasts
             case "part":

@@ -55,6 +55,8 @@ SERVED_WITHIN: Final = 60.0
 """Seconds after the last fault in which all that was asked must have been served."""
 FELT: Final = 5.0
 """Seconds for which a fault may be felt when it is over: links come back, and holds that were lost are told of."""
+IMPATIENCE: Final = 0.25
+"""Part of the lease before whose end a link may be given up already, as Zenoh does."""
 FORGOTTEN: Final = 0.3
 """Of what was declared, where links come back without all of it."""
 LOOK_EVERY: Final = 0.05
@@ -66,6 +68,7 @@ class Size:
     """How much happens in a run."""
 
     hosts: int = 3
+    """With a candidate each. Half of the runs have one more, without."""
     clients: int = 4
     components: int = 2
     faults: int = 6
@@ -125,7 +128,8 @@ class Simulation:
     def __init__(self, seed: int, size: Size, faults: Sequence[Fault] | None, *, traced: bool = False) -> None:
         self.seed, self.size, self._traced = seed, size, traced
         self.random = random.Random(f"fleet {seed}")  # noqa: S311 - what failed once must fail again
-        self.hosts = [f"h{number}" for number in range(size.hosts)]
+        self.hosts = [f"h{number}" for number in range(size.hosts + (self.random.random() < 0.5))]
+        self.candidates_at = self.hosts[: size.hosts]
         self.clients = {f"{self.random.choice(self.hosts)}/c{number}": None for number in range(size.clients)}
         fleet = default_fleet()
         self.fleet = replace(fleet, strategy=self.random.choice(("priority", "adaptive")))
@@ -157,7 +161,7 @@ class Simulation:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualTimeLoop)  # noqa: S101
         self.loop, loop.isolated = loop, True
-        self.network = MemoryNetwork(lease=self.fleet.mesh.lease, seed=self.seed)
+        self.network = MemoryNetwork(lease=self.fleet.mesh.lease, impatience=IMPATIENCE, seed=self.seed)
         self._digest = hashlib.blake2b(digest_size=16)
         self.network.trace = self._trace
         self.devices = {rc: self._device(rc) for rc in DEVICES}
@@ -306,8 +310,9 @@ class Simulation:
         stall = StallWatch(mesh.now).start()
         mesh_token = mesh.alive(Token(host, Role.NODE, "node", new_instance()))
         await self._offer_all(mesh, stall)
-        candidate = self.candidates[host] = Candidate(mesh, self.fleet)
-        candidate.start()
+        if host in self.candidates_at:
+            candidate = self.candidates[host] = Candidate(mesh, self.fleet)
+            candidate.start()
         component_host = ComponentHost(
             mesh, self.fleet, ComponentsConfig(), self._on_failure, kinds=lambda: KINDS, process=self.component
         )
@@ -368,7 +373,7 @@ class Simulation:
     def _begin(self, fault: Fault) -> None:
         self.log(f"FAULT {fault}")
         self.result.counts["faults"] += 1
-        end: Callable[[], None]
+        end: Callable[[], object]
         match fault.kind:
             case "freeze" | "stall":
                 (name,) = fault.whom
@@ -404,6 +409,12 @@ class Simulation:
                 process, mesh = self.open_process(name)
                 process.main = process.run(asyncio.create_task, self._guard(self._spare(rc, mesh, leaves)))
                 end = leaves.set if fault.both else lambda: self._kill_spare(name, rc)
+            case "fail":
+                (name,) = fault.whom
+                failing = [(key, rc) for key, rc in self.rcs.items() if rc.name == name]
+                for key, rc in failing:
+                    self._at(key, rc.fail, "its device failed")
+                end = lambda: [self._at(key, rc.recover) for key, rc in failing]  # noqa: E731
             case "forget":
                 pairs = self._pairs(fault)
                 self.cuts.update(pairs)
@@ -413,7 +424,13 @@ class Simulation:
         self.promises.in_contradiction |= fault.kind == "forget"
         self.loop.call_later(fault.lasts, self._end, fault, end)
 
-    def _end(self, fault: Fault, end: Callable[[], None]) -> None:
+    def _at(self, key: str, call: Callable[..., None], *args: Any) -> None:
+        """Has an RC's process do something when it goes on, if it lives."""
+        process, _ = self.running[key.split()[0]]
+        if key in self.rcs and not process.dead:
+            process.run(self.loop.call_soon, call, *args)
+
+    def _end(self, fault: Fault, end: Callable[[], object]) -> None:
         self.log(f"OVER  {fault.kind} {' '.join(fault.whom)}")
         end()
         self.loop.call_later(fault.felt, self._forget_fault, fault)
