@@ -1,0 +1,129 @@
+"""Faults: what is done to which hosts, for how long. Drawn from a seed."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from tests.chaos.work import CLIENTS, HOSTS, NODES, RC_HOSTS
+
+SECOND: Final = 1_000_000_000
+LEASE: Final = 1.0
+Way = tuple[str, str]
+
+
+@dataclass(slots=True)
+class Fault:
+    """Times in ns, 0 where it did not come to that."""
+
+    kind: str
+    how: str
+    """kill, freeze, cut or cable."""
+    lasts: float
+    hosts: tuple[str, ...] = ()
+    """That are killed, frozen or unplugged."""
+    ways: frozenset[Way] = frozenset()
+    at: int = 0
+    mended: int = 0
+    alone: bool = True
+    """Everything was served before it, and no other fault came beside it until all was again."""
+    term: int = 0
+    """The leader's counter before it."""
+    granted: int = 0
+    """The first grant to somebody who asked after it began."""
+    linked: int = 0
+    """The last link or token stood again."""
+    served: int = 0
+
+    @property
+    def touched(self) -> tuple[str, ...]:
+        """Whom it strikes itself: of a host that is cut from all others, these are not."""
+        if not self.ways:
+            return self.hosts
+        return self.hosts or tuple(sorted({host for way in self.ways for host in way}))
+
+    def over(self, after: int) -> int:
+        """When it can't be felt any more: all was served, or so much later."""
+        if not self.mended:
+            return 1 << 62
+        return self.served if self.served and after else self.mended + after
+
+
+def isolated(host: str) -> frozenset[Way]:
+    return frozenset(pair for other in HOSTS if other != host for pair in ((host, other), (other, host)))
+
+
+def groups(rng: random.Random) -> frozenset[Way]:
+    """Two or three parts of the fleet that do not hear one another."""
+    parts = {host: rng.randrange(rng.choice((2, 2, 3))) for host in HOSTS}
+    return frozenset((a, b) for a in HOSTS for b in HOSTS if parts[a] != parts[b])
+
+
+def _lasts(rng: random.Random) -> float:
+    """Mostly about a lease."""
+    low, high = rng.choice(((0.5, 1.5), (0.5, 1.5), (0.5, 1.5), (1.5, 3.0), (3.0, 6.0)))
+    return LEASE * rng.uniform(low, high)
+
+
+def _leader(how: str, low: float, high: float) -> Callable[[random.Random, str], Fault]:
+    def make(rng: random.Random, leader: str) -> Fault:
+        ways = isolated(leader) if how == "cut" else frozenset()
+        return Fault("", how, rng.uniform(low, high), (leader,), ways)
+
+    return make
+
+
+def _any(how: str, *hosts: str) -> Callable[[random.Random, str], Fault]:
+    def make(rng: random.Random, _leader: str) -> Fault:
+        host = rng.choice(hosts)
+        return Fault("", how, _lasts(rng), (host,), isolated(host) if how == "cut" else frozenset())
+
+    return make
+
+
+def _away(rng: random.Random, leader: str) -> Fault:
+    return _leader(rng.choice(("freeze", "cut")), 0.6, 1.0)(rng, leader)
+
+
+def _ways(draw: Callable[[random.Random], frozenset[Way]]) -> Callable[[random.Random, str], Fault]:
+    return lambda rng, _leader: Fault("", "cut", _lasts(rng), (), draw(rng))
+
+
+def _pair(rng: random.Random) -> frozenset[Way]:
+    a, b = rng.choice(NODES + RC_HOSTS), rng.choice(HOSTS)
+    return _pair(rng) if a == b else frozenset(((a, b), (b, a)))
+
+
+def _one_way(rng: random.Random) -> frozenset[Way]:
+    return frozenset((rng.choice(sorted(_pair(rng))),))
+
+
+def _blackout(rng: random.Random, _leader: str) -> Fault:
+    return Fault("", "kill", rng.uniform(0.0, 3.0), NODES)
+
+
+KINDS: Final[dict[str, tuple[int, Callable[[random.Random, str], Fault]]]] = {
+    "leader killed": (4, _leader("kill", 1.0, 2.0)),
+    "leader frozen": (3, _leader("freeze", 1.3, 3.0)),
+    "leader cut": (3, _leader("cut", 1.3, 3.0)),
+    "leader away": (6, _away),
+    "killed": (3, _any("kill", *HOSTS)),
+    "frozen": (4, _any("freeze", *HOSTS)),
+    "cut": (4, _any("cut", *HOSTS)),
+    "unplugged": (2, _any("cable", *HOSTS)),
+    "partition": (4, _ways(groups)),
+    "pair": (5, _ways(_pair)),
+    "one way": (3, _ways(_one_way)),
+    "blackout": (1, _blackout),
+    "client killed": (1, _any("kill", *CLIENTS)),
+}
+"""Of each kind its share, and how one is made from a random source and the host that leads."""
+
+
+def draw(rng: random.Random, kinds: list[str], leader: str) -> Fault:
+    kind = rng.choices(kinds, [KINDS[one][0] for one in kinds])[0]
+    fault = KINDS[kind][1](rng, leader)
+    fault.kind = kind
+    return fault

@@ -1,0 +1,703 @@
+"""A client and resource controllers written from `docs/protocol.md` alone, with plain `zenoh` and `json`: nothing of
+the project. Section names in quotes are that page's.
+
+    python -m tests.chaos.foreign client|rcs FLEET HOST SEED"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import random
+import secrets
+import signal
+import sys
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+# "Joining": with few receiving threads one host that is cut off stalls every link.
+os.environ["ZENOH_RUNTIME"] = (
+    "(rx:(worker_threads:16),net:(worker_threads:4),acc:(worker_threads:4),tx:(worker_threads:4),app:(worker_threads:2))"
+)
+
+import zenoh
+
+from tests.chaos.work import CAPACITY, CLIENT, JOBS, PULSE, Json, draw, now, rcs_of, say
+
+SECOND = 1_000_000_000
+HOLD_LEASE = 3 * SECOND
+LEASE_MS = 1000
+STALL = SECOND // 4
+QUERY_TIMEOUT = 1.0
+TRY_AGAIN = ("busy", "not_leading", "internal", "queue_full")
+AGAIN = ("not_yet", "stale", "busy", "unknown")
+NOT_MINE = ("ended", "free", "not_holder", "wrong_client")
+MAX_COUNTER, MAX_JUMP = 2**52, 1_000_000
+REMEMBERED = 256
+
+Term = tuple[int, str]
+Grant = tuple[Term, int]
+NO_TERM: Term = (0, "")
+
+
+def term_of(value: Any) -> Term:
+    return (int(value[0]), str(value[1]))
+
+
+def grant_of(value: Any) -> Grant:
+    return (term_of(value[0]), int(value[1]))
+
+
+class Refused(Exception):
+    def __init__(self, code: str, message: str, term: Term | None = None) -> None:
+        super().__init__(message)
+        self.problem = {"code": code, "message": message} | ({"term": term} if term is not None else {})
+
+
+class Peer:
+    """What clients and RCs have in common: a session, whom they obey, and standstills of their own."""
+
+    def __init__(self, session: zenoh.Session, fleet: str, host: str, seed: str) -> None:
+        self.session, self.host, self.base = session, host, f"zscout/{fleet}"
+        self.rng = random.Random(seed)  # noqa: S311
+        self.lock = threading.RLock()
+        self.heard = now()
+        self.leaders: set[str] = set()
+        self._ticked = now()
+        self._stall = (0, 0)
+        """Its end and its length."""
+        self.declared: list[Any] = []
+
+    def watch(self, on_leader: Callable[[], None]) -> None:
+        def on_token(sample: zenoh.Sample) -> None:
+            key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            say("token", token=key.partition("/alive/")[2], alive=alive)
+            if "/rcm/" in key:
+                with self.lock:
+                    (self.leaders.add if alive else self.leaders.discard)(key)
+                if alive:
+                    on_leader()
+
+        watched = self.session.liveliness().declare_subscriber(f"{self.base}/alive/**", on_token, history=True)
+        self.declared.append(watched)
+
+    def show(self, role: str, name: str, instance: str) -> Any:
+        return self.session.liveliness().declare_token(f"{self.base}/alive/{self.host}/{role}/{name}/{instance}")
+
+    def tick(self) -> None:
+        """Called often: a step that was too long was a standstill."""
+        with self.lock:
+            at = now()
+            if at - self._ticked > STALL:
+                self._stall = (at, at - self._ticked)
+            self._ticked = at
+
+    def stalled(self, arrived: int | None = None) -> int:
+        """How long a standstill lasted that has just ended, or had when something arrived."""
+        with self.lock:
+            at = now()
+            if at - self._ticked > STALL:
+                return at - self._ticked
+            end, length = self._stall
+            return length if (at if arrived is None else arrived) - end < STALL else 0
+
+    def believes(self, term: Term, known: Term, *, always: bool = False) -> bool:
+        """ "Order": an absurd term is ignored while an RCM is heard."""
+        near = always or now() - self.heard > HOLD_LEASE or term[0] <= known[0] + MAX_JUMP
+        return term[0] < MAX_COUNTER and near
+
+    def get(self, key: str, schema: str, message: Json, timeout: float = QUERY_TIMEOUT) -> list[tuple[bool, Json]]:
+        """All answers, as (whether it is none of a problem, payload). None at all means unknown."""
+        replies = self.session.get(
+            f"{self.base}/{key}",
+            payload=json.dumps(message),
+            encoding=encoding(schema),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=True,
+        )
+        found = []
+        for reply in replies:
+            if reply.ok is not None:
+                found.append((True, json.loads(reply.ok.payload.to_bytes())))
+            elif reply.err is not None and reply.err.payload.to_bytes() != b"Timeout":
+                found.append((False, json.loads(reply.err.payload.to_bytes())))
+        return found
+
+    def serve(self, key: str, answer: Callable[[zenoh.Query], Json], schema: str) -> None:
+        def on_query(query: zenoh.Query) -> None:
+            respond(query, f"{self.base}/{key}", answer, schema)
+
+        self.declared.append(self.session.declare_queryable(f"{self.base}/{key}", on_query))
+
+
+def encoding(schema: str) -> zenoh.Encoding:
+    return zenoh.Encoding.APPLICATION_JSON.with_schema(f"zscout.{schema}.v1")
+
+
+def payload_of(query: zenoh.Query) -> Json:
+    found: Json = json.loads(query.payload.to_bytes()) if query.payload is not None else {}
+    return found
+
+
+def respond(query: zenoh.Query, key: str, answer: Callable[[zenoh.Query], Json], schema: str) -> None:
+    with query:
+        try:
+            query.reply(key, json.dumps(answer(query)), encoding=encoding(schema))
+        except Refused as refused:
+            query.reply_err(json.dumps(refused.problem), encoding=encoding("Problem"))
+
+
+# "A resource controller"
+
+
+@dataclass
+class Held:
+    holder: Json
+    end: int
+
+
+class Rc:
+    """One device of no substance. Its worker carries out commands one at a time."""
+
+    def __init__(self, peer: Peer, name: str) -> None:
+        self.peer, self.name, self.capacity = peer, name, CAPACITY.get(name)
+        self.instance = secrets.token_hex(6)
+        self.term, self.seq = NO_TERM, 0
+        self.held: dict[Grant, Held] = {}
+        self.ended: OrderedDict[Grant, str] = OrderedDict()
+        self.commands: queue.Queue[tuple[int, zenoh.Query]] = queue.Queue(64)
+        self.publisher = peer.session.declare_publisher(
+            f"{peer.base}/rc/{name}/state",
+            encoding=encoding("RcState"),
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=True,
+        )
+
+    def begin(self) -> None:
+        """ "Beginning", but for the subscriptions, which the process has once."""
+        self.read()
+        self.peer.serve(f"rc/{self.name}/state", self.on_state, "RcState")
+        key = f"{self.peer.base}/rc/{self.name}/command/*/*"
+        self.peer.declared.append(self.peer.session.declare_queryable(key, self.on_command))
+        if self.capacity is not None:
+            self.peer.serve(f"rc/{self.name}/vote", self.on_vote, "Ballot")
+        threading.Thread(target=self.work, daemon=True).start()
+        self.peer.declared.append(self.peer.show("rc", self.name, self.instance))
+
+    def trace(self, do: str, **what: Any) -> None:
+        known = {"rc": self.name, "instance": self.instance, "sharable": self.capacity is not None}
+        say(do, **known, term=self.term, seq=self.seq, holds=sorted(self.held), **what)
+
+    def state(self, ended: list[Json] | None = None) -> Json:
+        at = now()
+        holders = [held.holder | {"remaining": (held.end - at) / SECOND} for held in self.held.values()]
+        return {
+            "rc": self.name,
+            "host": self.peer.host,
+            "instance": self.instance,
+            "sharable": self.capacity is not None,
+            "term": self.term,
+            "seq": self.seq,
+            "holders": holders,
+            "ended": ended or [],
+            "leader": bool(self.peer.leaders) and at - self.peer.heard < HOLD_LEASE // 2,
+        }
+
+    def publish(self, ended: list[Json] | None = None) -> None:
+        self.publisher.put(json.dumps(self.state(ended)))
+
+    # "What an RCM says"
+
+    def _accepts(self, said: Json) -> bool:
+        term, seq = term_of(said["term"]), int(said["seq"])
+        if (term, seq) < (self.term, self.seq) or not self.peer.believes(term, self.term):
+            if term < self.term:
+                self.publish()
+            return False
+        self.term, self.seq = term, seq
+        return True
+
+    def on_grants(self, said: Json) -> bool:
+        """Whether something was missed, and `rcm/state` is to be read."""
+        before, known = (self.term, self.seq), set(self.held)
+        if not self._accepts(said):
+            return False
+        missed = before[0] != self.term or int(said["prev"]) > before[1]
+        announce = False
+        if self.name in said.get("rcs", {}):
+            wanted = {grant_of(holder["grant"]): holder for holder in said["rcs"][self.name]}
+            if said.get("instances", {}).get(self.name, self.instance) != self.instance:
+                wanted = {}
+            elif self.capacity is None and len(wanted) > 1:
+                wanted, announce = {max(wanted): wanted[max(wanted)]}, True
+            for grant in known - wanted.keys():
+                self._end(grant, "the RCM says so")
+            for grant, holder in wanted.items():
+                announce |= grant in self.ended
+                self._begin(grant, holder)
+        if before != (self.term, self.seq) or known != self.held.keys():
+            self.trace("hear")
+        if announce:
+            self.publish()
+        return missed
+
+    def _begin(self, grant: Grant, holder: Json) -> None:
+        if grant not in self.held and grant not in self.ended:
+            self.held[grant] = Held(holder, now() + round(holder["remaining"] * SECOND))
+
+    def _end(self, grant: Grant, why: str) -> None:
+        del self.held[grant]
+        self.ended[grant] = why
+        if len(self.ended) > REMEMBERED:
+            self.ended.popitem(last=False)
+
+    def read(self) -> None:
+        answers = [said for good, said in self.peer.get("rcm/state", "StateAsk", {"holds_only": True}, 0.5) if good]
+        with self.peer.lock:
+            believed = [said for said in answers if self.peer.believes(term_of(said["term"]), self.term)]
+            said = max(believed, key=lambda one: (term_of(one["term"]), one["seq"]), default=None)
+            if said is None or not self._accepts(said):
+                return
+            self.peer.heard = now()
+            views = {grant_of(view["grant"]): view for view in said.get("holds", []) if self.name in view["needs"]}
+            named = said.get("instances", {}).get(self.name, [self.instance])[0]
+            for grant, view in views.items() if named == self.instance else ():
+                holder = {name: value for name, value in view.items() if name not in ("needs", "held")}
+                holder |= {"rcs": sorted(view["needs"]), "params": view["needs"][self.name]}
+                others = [held.holder for one, held in self.held.items() if one != grant]
+                if not others or (self.capacity is not None and not self._veto([*others, holder])):
+                    self._begin(grant, holder)
+            self.trace("read")
+            if self.held.keys() - views.keys():
+                self.publish()
+
+    # "Holds end"
+
+    def expire(self) -> None:
+        at, stalled = now(), self.peer.stalled()
+        silent = not stalled and at - self.peer.heard >= HOLD_LEASE
+        over = {grant for grant, held in self.held.items() if at >= held.end and not held.holder.get("keep", False)}
+        gone = [grant for grant in self.held if silent or grant in over]
+        if not gone:
+            return
+        told = [
+            {"id": self.held[grant].holder["id"], "grant": grant, "why": "lease" if silent else "time"}
+            for grant in gone
+        ]
+        for grant in gone:
+            self._end(grant, "lease" if silent else "its time is over")
+        self.trace("end")
+        self.publish(told)
+
+    # "Commands", "Votes", "State"
+
+    def on_command(self, query: zenoh.Query) -> None:
+        try:
+            self.commands.put_nowait((now(), query))
+        except queue.Full:
+            with query:
+                query.reply_err(json.dumps(Refused("busy", "64 commands wait").problem), encoding=encoding("Problem"))
+
+    def work(self) -> None:
+        while True:
+            arrived, query = self.commands.get()
+            command = payload_of(query)
+            if command.get("grant") is not None and grant_of(command["grant"]) > (self.term, self.seq):
+                self.read()
+            respond(query, str(query.key_expr), lambda query: self.obey(query, command, arrived), "Done")  # noqa: B023
+
+    def obey(self, query: zenoh.Query, command: Json, arrived: int) -> Json:
+        with self.peer.lock:
+            if now() - arrived + self.peer.stalled(arrived) > command.get("ttl", 1.0) * SECOND:
+                raise Refused("stale", "it waited longer than its ttl")
+            if command.get("grant") is None:
+                raise Refused("no_grant", "only under a grant")
+            grant, sender = grant_of(command["grant"]), "/".join(str(query.key_expr).split("/")[-2:])
+            held = self.held.get(grant)
+            if held is None:
+                codes = (
+                    ("ended", grant in self.ended),
+                    ("not_yet", grant > (self.term, self.seq)),
+                    ("free", not self.held),
+                )
+                raise Refused(
+                    next((code for code, so in codes if so), "not_holder"), f"not held under {grant}", self.term
+                )
+            if held.holder["client"] != sender:
+                raise Refused("wrong_client", f"held by {held.holder['client']}", self.term)
+            if now() >= held.end and not held.holder.get("keep", False):
+                raise Refused("ended", "its time is over", self.term)
+            self.trace("command", grant=grant)
+            if command["do"]["name"] == "confirm":
+                return {}
+            if command["do"]["name"] == "echo":
+                return {"result": command["do"].get("value")}
+            raise Refused("unknown_command", "confirm or echo")
+
+    def _veto(self, holders: list[Json]) -> str:
+        amounts = [holder.get("params", {}) for holder in holders]
+        if unknown := {name for amount in amounts for name in amount} - {"rate"}:
+            raise Refused("bad_request", f"no such parameter: {sorted(unknown)}")
+        total = sum(float(amount.get("rate", 0)) for amount in amounts)
+        return f"rate {total:g} is more than {self.capacity}" if total > (self.capacity or 0) else ""
+
+    def on_vote(self, query: zenoh.Query) -> Json:
+        said = payload_of(query)
+        reason = self._veto(said["holders"])
+        return {"proposal": said["proposal"], "accept": not reason, "reason": reason}
+
+    def on_state(self, query: zenoh.Query) -> Json:
+        with self.peer.lock:
+            promise = payload_of(query).get("promise")
+            if promise is not None:
+                term = term_of(promise)
+                if term < self.term or not self.peer.believes(term, self.term):
+                    raise Refused("old_term", "a higher term is obeyed", self.term)
+                if term != self.term:
+                    self.term, self.seq = term, 0
+                self.trace("promise", promised=term)
+            return self.state()
+
+
+def run_rcs(peer: Peer, over: threading.Event) -> None:
+    rcs = [Rc(peer, name) for name in rcs_of(peer.host)]
+    missed: queue.SimpleQueue[Rc] = queue.SimpleQueue()
+
+    def on_grants(sample: zenoh.Sample) -> None:
+        said = json.loads(sample.payload.to_bytes())
+        with peer.lock:
+            if any(term_of(said["term"]) >= rc.term and peer.believes(term_of(said["term"]), rc.term) for rc in rcs):
+                peer.heard = now()
+            for rc in rcs:
+                if rc.on_grants(said):
+                    missed.put(rc)
+
+    def read() -> None:
+        while True:
+            missed.get().read()
+
+    peer.declared.append(peer.session.declare_subscriber(f"{peer.base}/rcm/grants", on_grants))
+    peer.watch(lambda: None)
+    for rc in rcs:
+        rc.begin()
+    threading.Thread(target=read, daemon=True).start()
+    say("up")
+    while not over.wait(0.02):
+        with peer.lock:
+            for rc in rcs:
+                rc.expire()
+        peer.tick()
+
+
+# "A client"
+
+
+@dataclass
+class Request:
+    """One that is not over, and the newest word about it."""
+
+    asked: Json
+    state: str = "asking"
+    place: Any = None
+    grant: Any = None
+    rcs: list[str] = field(default_factory=list)
+    unconfirmed: Json = field(default_factory=dict)
+    last: tuple[Term, int] = (NO_TERM, 0)
+    end: int = 0
+    due: int = 0
+    pause: int = SECOND // 20
+
+
+class Client(Peer):
+    """Three threads, one for each job, each with one request at a time."""
+
+    def __init__(self, session: zenoh.Session, fleet: str, host: str, seed: str) -> None:
+        super().__init__(session, fleet, host, seed)
+        self.me = f"{host}/{CLIENT}"
+        self.term = NO_TERM
+        self.requests: dict[str, Request] = {}
+        self.news = threading.Condition(self.lock)
+        self.unknown: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.token: Any = None
+        self.shown = 0
+
+    def begin(self) -> None:
+        grants, notice = f"{self.base}/rcm/grants", f"{self.base}/client/{self.me}/notice"
+        self.declared.append(self.session.declare_subscriber(notice, self.on_notice))
+        self.declared.append(self.session.declare_subscriber(grants, self.on_grants))
+        self.watch(self.ask_all)
+        self.serve(f"client/{self.me}/requests", self.on_requests, "ClientRequests")
+        self.renew()
+
+    def renew(self) -> None:
+        """A new token before the old one goes, at most twice a second."""
+        with self.lock:
+            if now() - self.shown > SECOND // 2:
+                before, self.token = self.token, self.show("client", CLIENT, secrets.token_hex(6))
+                self.shown = now()
+                if before is not None:
+                    before.undeclare()
+
+    # What is heard
+
+    def on_notice(self, sample: zenoh.Sample) -> None:
+        self.take(json.loads(sample.payload.to_bytes()))
+
+    def take(self, notice: Json) -> None:
+        """ "Order", "Asking": the newest word counts, however it came."""
+        with self.news:
+            term = term_of(notice["term"])
+            if term < self.term or not self.believes(term, self.term):
+                return
+            self.term = term
+            request = self.requests.get(notice["id"])
+            if request is None:
+                if notice["state"] == "running":
+                    self.unknown.put(notice["id"])
+                return
+            order = (term, int(notice["step"]))
+            if order <= request.last:
+                return
+            request.last, before = order, request.grant
+            place = notice.get("place")
+            if place is not None and request.place is not None and grant_of(place) > grant_of(request.place):
+                request.due = now()
+            elif place is not None:
+                request.place = place
+            request.state = notice["state"]
+            request.grant = notice.get("grant") if request.state == "running" else None
+            request.rcs = notice.get("rcs", []) if request.state == "running" else request.rcs
+            request.end = now() + round(notice.get("remaining", 0) * SECOND)
+            request.unconfirmed = {}
+            known = ("place", "grant", "rcs", "outcome", "reason", "term", "step", "ahead")
+            say(request.state, id=notice["id"], before=before, **{name: notice.get(name) for name in known})
+            if request.state == "ended" and notice.get("outcome") == "client_lost":
+                request.state, request.due = "asking", now()
+            self.news.notify_all()
+
+    def on_grants(self, sample: zenoh.Sample) -> None:
+        term = term_of(json.loads(sample.payload.to_bytes())["term"])
+        with self.lock:
+            if term >= self.term and self.believes(term, self.term):
+                self.heard = now()
+
+    def ask_all(self) -> None:
+        with self.news:
+            for request in self.requests.values():
+                request.due, request.pause = now(), SECOND // 20
+            self.news.notify_all()
+
+    def on_requests(self, query: zenoh.Query) -> Json:
+        """ "When an RCM takes the lead"."""
+        with self.lock:
+            promise = payload_of(query).get("promise")
+            if promise is not None:
+                if term_of(promise) < self.term or not self.believes(term_of(promise), self.term):
+                    raise Refused("old_term", "a higher term is known", self.term)
+                self.term = term_of(promise)
+            return {"client": self.me, "requests": [self.told(request) for request in self.requests.values()]}
+
+    def told(self, request: Request) -> Json:
+        told = request.asked | ({"place": request.place} if request.place is not None else {})
+        return told | ({"grant": request.grant, "rcs": request.rcs} if request.grant is not None else {})
+
+    # What is asked
+
+    def schedule(self, schema: str, message: Json) -> list[tuple[bool, Json]]:
+        replies = self.get(f"rcm/schedule/{self.me}", schema, message)
+        for good, answer in replies:
+            if good:
+                self.take(answer)
+        return replies
+
+    def ask(self, request: Request) -> None:
+        with self.lock:
+            message = self.told(request) | request.unconfirmed | {"op": "request", "term": self.term}
+            if self.term == NO_TERM:
+                del message["term"]
+            request.due = now() + round(SECOND * 5 * self.rng.uniform(0.8, 1.2))
+            dropped = request.last if request.state == "asking" else None
+        replies = self.schedule("Ask", message)
+        with self.lock:
+            if dropped is not None and request.state == "asking" and dropped != request.last:
+                self.renew()
+            good = any(good and term_of(answer["term"]) >= self.term for good, answer in replies)
+            if good:
+                request.pause = SECOND // 20
+            for bad in [answer for good, answer in replies if not good]:
+                if bad["code"] not in (*TRY_AGAIN, "old_term"):
+                    say("refused", id=request.asked["id"], **bad)
+            if not good:
+                request.due = min(request.due, now() + request.pause)
+                request.pause = min(SECOND, 2 * request.pause)
+
+    def command(self, rc: str, grant: Any, action: Json, timeout: float = QUERY_TIMEOUT) -> str:
+        """The code of a refusal, `unknown` without an answer, or nothing."""
+        sent = now()
+        replies = self.get(f"rc/{rc}/command/{self.me}", "Command", {"grant": grant, "do": action}, timeout)
+        code = "" if replies and replies[0][0] else str(replies[0][1]["code"]) if replies else "unknown"
+        say("commanded", rc=rc, grant=grant, sent=sent, code=code)
+        return code
+
+    def confirm(self, request: Request, grant: Any) -> bool:
+        """ "Entering"."""
+        refused: list[str] = []
+        until = now() + SECOND
+
+        def one(rc: str) -> None:
+            pause = 0.05
+            while True:
+                code = self.command(rc, grant, {"name": "confirm"}, max(0.05, (until - now()) / SECOND))
+                if code not in AGAIN or now() >= until or request.grant != grant:
+                    break
+                threading.Event().wait(min(pause, max(0.0, (until - now()) / SECOND)))
+                pause *= 2
+            if code:
+                refused.append(rc)
+
+        threads = [threading.Thread(target=one, args=(rc,)) for rc in request.rcs]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        with self.lock:
+            if request.grant != grant or request.state != "running":
+                return False
+            if refused:
+                request.unconfirmed = {"grant": grant, "rcs": request.rcs, "unconfirmed": refused}
+                self.lose(request, "not confirmed")
+                return False
+            say("entered", id=request.asked["id"], grant=grant)
+            return True
+
+    def lose(self, request: Request, why: str) -> None:
+        """By this client's own judgement; it asks again."""
+        say("lost", id=request.asked["id"], grant=request.grant, reason=why)
+        request.state, request.grant, request.due = "asking", None, now()
+
+    def use(self, request: Request, grant: Any, lasts: float) -> bool:
+        """Whether the request is over with the hold: made use of, or its time is over."""
+        until = now() + round(lasts * SECOND)
+        while True:
+            with self.news:
+                if request.grant != grant:
+                    return False
+                if now() >= until:
+                    return True
+                if now() >= request.end and not request.asked.get("keep", False):
+                    return True
+            code = self.command(self.rng.choice(request.rcs), grant, {"name": "echo", "value": 1})
+            with self.news:
+                if code in NOT_MINE:
+                    self.news.wait_for(lambda: request.grant != grant, 1.0)
+                    if request.grant == grant and now() < request.end:
+                        self.lose(request, f"an RC says {code}")
+                    return bool(request.grant == grant)
+                self.news.wait_for(lambda: request.grant != grant, 0.05)
+
+    def serve_request(self, asked: Json, lasts: float, over: threading.Event) -> None:
+        """One request from its first asking to its end."""
+        request = Request(asked, due=now())
+        with self.lock:
+            self.requests[asked["id"]] = request
+        say("asked", id=asked["id"], **{name: value for name, value in asked.items() if name != "id"})
+        while not over.is_set():
+            with self.news:
+                ready = lambda: request.state in ("running", "ended") or now() >= request.due  # noqa: E731
+                self.news.wait_for(ready, min(0.5, max(0.0, (request.due - now()) / SECOND)))
+                state, grant, due = request.state, request.grant, now() >= request.due
+            if state == "ended":
+                break
+            if due:
+                self.ask(request)
+            elif state == "running" and self.confirm(request, grant) and self.use(request, grant, lasts):
+                break
+        with self.lock:
+            del self.requests[asked["id"]]
+            ended = request.state == "ended"
+            say("gave_up", id=asked["id"], grant=request.grant, ended=ended)
+        if not ended:
+            self.release(asked["id"], over)
+
+    def release(self, request_id: str, over: threading.Event) -> None:
+        """ "Ending": asked again until somebody answers."""
+        pause = 0.05
+        while not any(good for good, _ in self.schedule("Release", {"op": "release", "id": request_id})):
+            if over.wait(pause):
+                return
+            pause = min(0.5, 2 * pause)
+        say("given_up", id=request_id)
+
+    def job(self, name: str, quiet: threading.Event, over: threading.Event) -> None:
+        rng = random.Random(f"{self.host} {name} {self.rng.random()}")  # noqa: S311
+        while not quiet.wait(PULSE[name] * rng.uniform(0.5, 1.5)):
+            self.serve_request(*draw(rng, name, self.host), over)
+        say("quiet", job=name)
+
+    def give_back(self, over: threading.Event) -> None:
+        while True:
+            self.release(self.unknown.get(), over)
+
+    def watch_lease(self) -> None:
+        with self.news:
+            if self.stalled() or now() - self.heard < HOLD_LEASE:
+                return
+            for request in self.requests.values():
+                if request.grant is not None:
+                    self.lose(request, "no RCM was heard for the hold lease")
+            self.news.notify_all()
+
+
+def run_client(client: Client, quiet: threading.Event, over: threading.Event) -> None:
+    client.begin()
+    threads = [threading.Thread(target=client.job, args=(job, quiet, over), daemon=True) for job in JOBS]
+    threads.append(threading.Thread(target=client.give_back, args=(over,), daemon=True))
+    for thread in threads:
+        thread.start()
+    say("up")
+    while not over.wait(0.05):
+        client.watch_lease()
+        client.tick()
+
+
+def main() -> None:
+    what, fleet, host, seed = sys.argv[1:]
+    quiet, over = threading.Event(), threading.Event()
+    signal.signal(signal.SIGUSR1, lambda *_: quiet.set())
+    signal.signal(signal.SIGTERM, lambda *_: over.set())
+    config = zenoh.Config()
+    block = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+    for key, value in {
+        "mode": "peer",
+        "scouting/multicast/interface": "eth0",
+        "scouting/delay": 200,
+        "transport/link/tx/lease": LEASE_MS,
+        block: LEASE_MS * 1000,
+        "transport/link/tx/queue/size/interactive_high": 8,
+        "transport/shared_memory/enabled": False,
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as session:
+        peer = (Client if what == "client" else Peer)(session, fleet, host, seed)
+        say("imported", modules=sorted(name for name in sys.modules if name.split(".")[0] == "zscout"))
+        if isinstance(peer, Client):
+            run_client(peer, quiet, over)
+        else:
+            run_rcs(peer, over)
+        with contextlib.suppress(zenoh.ZError):
+            for declared in peer.declared:
+                declared.undeclare()
+
+
+if __name__ == "__main__":
+    main()

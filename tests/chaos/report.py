@@ -1,0 +1,75 @@
+"""What a run is to be remembered by."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Sequence
+from typing import Any, Final, TypeAlias
+
+from tests.chaos.checker import Violation
+from tests.chaos.faults import KINDS, SECOND, Fault
+
+Figures: TypeAlias = dict[str, Any]
+MEASURES: Final = {
+    "next_grant": "from a fault to the next grant that was asked for after it",
+    "healed": "from its end until everybody is served",
+    "zenoh": "of that, until the last link and token stand again",
+    "ours": "the rest of that",
+}
+
+
+def spread(values: Sequence[float]) -> Figures:
+    ordered = sorted(values)
+    if not ordered:
+        return {"n": 0}
+    p99 = ordered[min(len(ordered) - 1, round(0.99 * (len(ordered) - 1) + 0.499))]
+    return {
+        "n": len(ordered),
+        "median": round(statistics.median(ordered), 3),
+        "p99": round(p99, 3),
+        "worst": round(ordered[-1], 3),
+    }
+
+
+def figures(faults: Sequence[Fault]) -> dict[str, Figures]:
+    """By kind of fault, of those that came alone."""
+    found = {}
+    for kind in KINDS:
+        alone = [fault for fault in faults if fault.kind == kind and fault.alone]
+        healed = [fault for fault in alone if fault.served]
+        if not alone:
+            continue
+        found[kind] = {
+            "next_grant": spread([(fault.granted - fault.at) / SECOND for fault in alone if fault.granted]),
+            "healed": spread([(fault.served - fault.mended) / SECOND for fault in healed]),
+            "zenoh": spread([(fault.linked - fault.mended) / SECOND for fault in healed]),
+            "ours": spread([(fault.served - fault.linked) / SECOND for fault in healed]),
+        }
+    return found
+
+
+def around(violation: Violation, faults: Sequence[Fault], start: int) -> str:
+    """The violation, with the last faults before it."""
+    last = [fault for fault in faults if fault.at <= violation.at][-2:]
+    told = "; ".join(
+        f"{fault.kind} of {', '.join(fault.hosts or fault.touched)} from {(fault.at - start) / SECOND:.2f} s"
+        f" for {(fault.mended - fault.at) / SECOND:.2f} s"
+        for fault in last
+    )
+    return (
+        f"{(violation.at - start) / SECOND:9.3f} s  [{violation.promise}] {violation.text}  (after: {told or 'none'})"
+    )
+
+
+def table(found: dict[str, Figures]) -> str:
+    lines = [f"{'s, median/p99/worst':15} {'n':>4}  " + "".join(f"{name:>20}" for name in MEASURES)]
+    for kind, rows in found.items():
+        number = max(row["n"] for row in rows.values())
+        cells = (f"{r['median']:.2f}/{r['p99']:.2f}/{r['worst']:.2f}" if r["n"] else "-" for r in rows.values())
+        lines.append(f"{kind:20} {number:>3}  " + "".join(f"{cell:>20}" for cell in cells))
+    return "\n".join([*lines, *(f"  {name}: {meaning}" for name, meaning in MEASURES.items())])
+
+
+def dump(found: Figures) -> str:
+    return json.dumps(found)
