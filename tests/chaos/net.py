@@ -10,6 +10,7 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -172,10 +173,10 @@ class Links:
         return found
 
     def _connections(self, pid: int) -> Iterable[tuple[int, int, str]]:
-        try:
-            lines = Path(f"/proc/{pid}/net/tcp").read_text().splitlines()[1:]
-        except OSError:
-            return
+        lines = []
+        for table in ("tcp", "tcp6"):  # who listens on both has its links in the second
+            with suppress(OSError):
+                lines += Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]
         for line in lines:
             words = line.split()
             peer = self._names.get(_address(words[2]))
@@ -184,7 +185,7 @@ class Links:
 
 
 def _address(text: str) -> str:
-    number = bytes.fromhex(text.split(":")[0])
+    number = bytes.fromhex(text.split(":")[0][-8:])
     return ".".join(str(byte) for byte in reversed(number))
 
 

@@ -324,6 +324,11 @@ class Core:
             self._forget(known)
             held = replace(held, place=min(known.place, held.place))
         arc = self._take_up(held)
+        if known is not None and self._state.queued.get(arc.id) is arc:
+            # As its client asked: of an RC that is absent the others of its gang know no parameters.
+            self._state.dequeue(arc)
+            self._forget(arc)
+            self._state.enqueue(self._new_arc(known.request, held.place), self._state.now)
         if arc.hold is not None and (arc.request.keep or not arc.past_min_runtime(self._state.now)):
             self._effects.append(self._granted(arc, arc.hold))
         self._expire()
