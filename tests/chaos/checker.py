@@ -48,6 +48,8 @@ class _Open:
     place: Grant | None = None
     worse_since: int | None = None
     granted: bool = False
+    held: int = 0
+    """When its last hold began."""
     outcome: str | None = None
     believed: tuple[Grant, int, list[str]] | None = None
     """The hold that its client believes in, since when, and the RCs of it."""
@@ -69,6 +71,7 @@ class Checker:
         self._needs: dict[str, dict[str, Json]] = {}
         self._open: dict[tuple[str, str], _Open] = {}
         self._given_up: dict[str, int] = {}
+        self._too_much: set[tuple[str, frozenset[Grant]]] = set()
         self._terms: dict[Term, int] = {}
         self._recent: deque[int] = deque()
         self.counts: defaultdict[str, int] = defaultdict(int)
@@ -80,7 +83,8 @@ class Checker:
         """Whether a fault may have been felt at one of these hosts, from `since` before `at` on."""
         named = set(hosts)
         return any(
-            fault.at <= at and at - since <= fault.over(AFTER) and named & set(fault.touched) for fault in self.faults
+            fault.began <= at and at - since <= fault.over(AFTER) and named & set(fault.touched)
+            for fault in self.faults
         )
 
     def take(self, host: str, event: Json) -> None:
@@ -118,7 +122,8 @@ class Checker:
         if event["sharable"] and rc in CAPACITY:
             known = [self._needs.get(self._owner.get(grant, ""), {}).get(rc, {}) for grant in holds]
             total = sum(float(amounts.get("rate", 0)) for amounts in known)
-            if total > CAPACITY[rc]:
+            if total > CAPACITY[rc] and (rc, holds) not in self._too_much:
+                self._too_much.add((rc, holds))
                 self.broken(at, "4 capacity", f"{rc} carries {total:g} of {CAPACITY[rc]}: {sorted(holds)}")
 
     def _command(self, event: Json, holds: frozenset[Grant]) -> None:
@@ -181,6 +186,7 @@ class Checker:
         if request.believed is None or request.believed[0] != grant:
             self._disbelieve(host, event["at"], request)
             request.believed = grant, event["at"], event["rcs"]
+            request.held = event["at"]
         request.granted, request.worse_since = True, None
 
     def on_queued(self, host: str, event: Json) -> None:
@@ -231,7 +237,13 @@ class Checker:
             return
         self._given_up[f"{host}/{CLIENT}/{event['id']}"] = event["at"]
         self._disbelieve(host, event["at"], request)
-        if event["ended"] and not (request.outcome == "completed" and request.granted):
+        # One that may be kept, and had its time, ends with an RC. Who was cut off may have missed all of a hold.
+        had = request.granted or self.touched([host], event["at"])
+        kept = (
+            request.outcome == "lost"
+            and event["at"] - (request.held or event["at"]) >= request.asked["min_runtime"] * SECOND
+        )
+        if event["ended"] and not (had and (request.outcome == "completed" or kept)):
             text = f"{host} {event['id']} ended as {request.outcome}, granted: {request.granted}"
             self.broken(event["at"], "9 nothing is thrown away", text)
 

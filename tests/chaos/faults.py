@@ -25,7 +25,9 @@ class Fault:
     hosts: tuple[str, ...] = ()
     """That are killed, frozen or unplugged."""
     ways: frozenset[Way] = frozenset()
+    began: int = 0
     at: int = 0
+    """It was done: it began a little before."""
     mended: int = 0
     alone: bool = True
     """Everything was served before it, and no other fault came beside it until all was again."""

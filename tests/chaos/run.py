@@ -215,7 +215,7 @@ class Fleet:
     # Faults
 
     def begin(self, fault: Fault) -> None:
-        fault.term = self.watch.term[0]
+        fault.term, fault.began = self.watch.term[0], now()
         self._cuts.update(fault.ways)
         self.net.cut(+self._cuts)
         for host in fault.hosts:
