@@ -173,6 +173,8 @@ class Rc:
         self.term, self.seq = NO_TERM, 0
         self.held: dict[Grant, Held] = {}
         self.ended: OrderedDict[Grant, str] = OrderedDict()
+        self.awaited: set[Grant] = set()
+        """What a snapshot named while something else was held."""
         self.commands: queue.Queue[tuple[int, zenoh.Query]] = queue.Queue(64)
         self.publisher = peer.session.declare_publisher(
             f"{peer.base}/rc/{name}/state",
@@ -239,6 +241,7 @@ class Rc:
                 wanted = {}
             elif self.capacity is None and len(wanted) > 1:
                 wanted, announce = {max(wanted): wanted[max(wanted)]}, True
+            self.awaited.clear()
             for grant in known - wanted.keys():
                 self._end(grant, "the RCM says so")
             for grant, holder in wanted.items():
@@ -276,6 +279,8 @@ class Rc:
                 others = [held.holder for one, held in self.held.items() if one != grant]
                 if not others or (self.capacity is not None and not self._veto([*others, holder])):
                     self._begin(grant, holder)
+                elif grant not in self.held:
+                    self.awaited.add(grant)
             self.trace("read")
             if self.held.keys() - views.keys():
                 self.publish()
@@ -311,9 +316,12 @@ class Rc:
         while True:
             arrived, query = self.commands.get()
             command = payload_of(query)
-            if command.get("grant") is not None and grant_of(command["grant"]) > (self.term, self.seq):
+            if command.get("grant") is not None and self.early(grant_of(command["grant"])):
                 self.read()
             respond(query, str(query.key_expr), lambda query: self.obey(query, command, arrived), "Done")  # noqa: B023
+
+    def early(self, grant: Grant) -> bool:
+        return grant > (self.term, self.seq) or grant in self.awaited
 
     def obey(self, query: zenoh.Query, command: Json, arrived: int) -> Json:
         with self.peer.lock:
@@ -324,11 +332,7 @@ class Rc:
             grant, sender = grant_of(command["grant"]), "/".join(str(query.key_expr).split("/")[-2:])
             held = self.held.get(grant)
             if held is None:
-                codes = (
-                    ("ended", grant in self.ended),
-                    ("not_yet", grant > (self.term, self.seq)),
-                    ("free", not self.held),
-                )
+                codes = (("ended", grant in self.ended), ("not_yet", self.early(grant)), ("free", not self.held))
                 raise Refused(
                     next((code for code, so in codes if so), "not_holder"), f"not held under {grant}", self.term
                 )
@@ -429,6 +433,8 @@ class Client(Peer):
         self.unknown: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.token: Any = None
         self.shown = 0
+        self.ahead = False
+        """An RCM of a lower term has answered."""
 
     def begin(self) -> None:
         grants, notice = f"{self.base}/rcm/grants", f"{self.base}/client/{self.me}/notice"
@@ -521,13 +527,14 @@ class Client(Peer):
 
     def ask(self, request: Request) -> None:
         with self.lock:
-            message = self.told(request) | request.unconfirmed | {"op": "request", "term": self.term}
-            if self.term == NO_TERM:
-                del message["term"]
+            message = self.told(request) | request.unconfirmed | {"op": "request"}
+            if self.ahead or request.place is not None:
+                message["term"] = self.term
             request.due = now() + round(SECOND * 5 * self.rng.uniform(0.8, 1.2))
             dropped = request.last if request.state == "asking" else None
         replies = self.schedule("Ask", message)
         with self.lock:
+            self.ahead = any(good and term_of(answer["term"]) < self.term for good, answer in replies)
             if dropped is not None and request.state == "asking" and dropped != request.last:
                 self.renew()
             good = any(good and term_of(answer["term"]) >= self.term for good, answer in replies)

@@ -294,3 +294,22 @@ def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> N
         assert await client.granted(known) == FIRST
 
     kit.run(story())
+
+
+def test_who_shows_a_place_shows_the_term_as_well() -> None:
+    async def story() -> None:
+        mesh = SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)
+        client, known, asked = Client(cast("Mesh", mesh), default_fleet()), arc(), list[Any]()
+
+        async def query(operation: Any) -> None:
+            asked.append(operation.term)
+
+        client._rcm.query = query  # type: ignore[method-assign]
+        await client._rcm.ask(known)
+        client._rcm.accept(TERM)
+        known.take(notice(1, place=Place(TERM, 1)), NOW)
+        await client._rcm.ask(known)
+        # An RCM of a lower term steps down at that, and does not refuse the place as one that can't be.
+        assert asked == [None, TERM]
+
+    asyncio.run(story())

@@ -187,7 +187,9 @@ class RcmLink:
     async def ask(self, arc: OpenArc) -> Problem | None:
         """Asks once, and applies the answer. Returns why it was refused, if it was."""
         ask = arc.ask(self.mesh.now())
-        reply = await self.query(msgspec.structs.replace(ask, term=self.term) if self._is_ahead else ask)
+        # To an RCM that has been replaced and does not know it, a later one's place is one that can't be.
+        ahead = self._is_ahead or arc.place is not None
+        reply = await self.query(msgspec.structs.replace(ask, term=self.term) if ahead else ask)
         self._unanswered = reply is None
         if reply is None:
             return None
