@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 PEERS := .venv-peers
 PEERS_READY := $(PEERS)/.ready
 
-.PHONY: help setup demo test docs lint bench bench-peers model lock clean
+.PHONY: help setup demo test docs lint bench bench-peers model chaos soak lock clean
 
 help:
 	@echo "make demo   four robots in a simulated building hide and watch, on a live mesh"
@@ -15,6 +15,8 @@ help:
 	@echo "make lint   formatting, linting, strict types, the rooms' contracts, links of the docs"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"
 	@echo "make model  what the model checker TLC says of formal/ownership.tla; needs a Java runtime"
+	@echo "make chaos  20 minutes of faults in a real fleet, held against docs/promises.md; needs root, network namespaces, iproute2"
+	@echo "make soak HOURS=8   that long live and simulated: memory, links, descriptors, latency; needs what make chaos does"
 	@echo "make bench-peers   the same work done by Dask, Redis, etcd, labgrid and Ray"
 
 $(READY): requirements/dev.txt pyproject.toml
@@ -48,6 +50,15 @@ bench: $(READY)
 
 model: $(READY)
 	$(BIN)/python -m formal
+
+# More options: $(BIN)/python -m tests.chaos --help
+MINUTES ?= 20
+chaos: $(READY)
+	$(BIN)/python -m tests.chaos --minutes $(MINUTES)
+
+HOURS ?= 8
+soak: $(READY)
+	$(BIN)/python -m tests.chaos.soak --hours $(HOURS)
 
 # What the peers need stands apart from what zscout needs.
 $(PEERS_READY): benchmarks/peers/requirements.txt requirements/dev.txt pyproject.toml

@@ -1,0 +1,37 @@
+"""The chaos itself, for a few seconds, where there are network namespaces."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from tests.chaos import net
+from tests.chaos.__main__ import main
+
+try:
+    net.check()
+    why_not = ""
+except net.NoNamespaces as error:
+    why_not = str(error)
+
+pytestmark = pytest.mark.live
+
+
+@pytest.mark.skipif(bool(why_not), reason=why_not)
+def test_a_leader_is_killed_and_nothing_is_left() -> None:
+    command = [sys.executable, "-m", "tests.chaos", "--count", "1", "--only", "leader killed", "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    told, _ = process.communicate(timeout=120)
+    found = json.loads(told)
+    assert (process.returncode, found["violations"]) == (0, [])
+    assert found["figures"]["leader killed"]["next_grant"]["n"] == 1
+    assert f"{net.PREFIX}{process.pid}" not in net.ip("netns", "list") + net.ip("link")
+
+
+def test_where_it_can_t_run_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    assert main([]) == 2
+    assert capsys.readouterr().err == "chaos: network namespaces need root\n"
