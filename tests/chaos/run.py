@@ -55,6 +55,8 @@ class Tail:
         if not self._file.exists():
             return []
         with self._file.open("rb") as file:
+            if self._file.stat().st_size < self._at:
+                self._at = 0  # it was shortened
             file.seek(self._at)
             text = self._rest + file.read()
             self._at = file.tell()

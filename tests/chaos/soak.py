@@ -1,0 +1,169 @@
+"""`make soak`: a fleet at work for hours, live and in virtual time: what it uses in the beginning, in the middle and at
+the end. Exit code 0: nothing grew, 1: something did or a promise was broken, 2: it can't run here."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import gc
+import json
+import shutil
+import statistics
+import sys
+import tempfile
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import psutil
+
+from tests.chaos import net
+from tests.chaos.run import Fleet, NotServed
+from tests.chaos.work import NODES, OWN_CLIENTS
+from zscout.lab.faults import simulation
+from zscout.lab.faults.simulation import Result, Simulation, Size, simulate
+
+Figures: TypeAlias = dict[str, float]
+LOOKS: Final = 60
+"""Of a live run; the beginning, the middle and the end are the medians of a tenth of them."""
+ROOM: Final = {"links": 0, "descriptors": 4, "memory_mb": 12, "latency_ms": 5, "objects": 20_000}
+"""How much more there may be at the end than in the beginning, besides a tenth."""
+FAULTS_PER_HOUR: Final = 60
+COLLECT_EVERY: Final = 20.0
+
+
+def live(hours: float, folder: Path) -> tuple[list[dict[str, Figures]], list[str]]:
+    """What each of zscout's own processes uses, look by look, without faults; and what went wrong."""
+    looks: list[dict[str, Figures]] = []
+    with Fleet(folder, "soak", traced=False) as fleet:
+        for _ in range(LOOKS):
+            fleet.watch.waits.clear()
+            try:
+                fleet.rest(hours * 3600 / LOOKS, lambda: shorten(folder))
+            except NotServed as error:
+                return looks, [str(error)]
+            standing = fleet.links.standing(fleet.processes.pids())
+            used = {host: use(fleet.processes.pids()[host]) for host in NODES + OWN_CLIENTS}
+            for host, figures in used.items():
+                figures["links"] = sum(len(ports) // 2 for pair, ports in standing.items() if host in pair)
+            used["near clients"] = {"latency_ms": round(1000 * statistics.median(fleet.watch.waits or [60.0]), 2)}
+            looks.append(used)
+    return looks, []
+
+
+def use(pid: int) -> Figures:
+    process = psutil.Process(pid)
+    return {"memory_mb": round(process.memory_info().rss / 1e6, 1), "descriptors": process.num_fds()}
+
+
+def shorten(folder: Path) -> None:
+    """What was looked at is not kept."""
+    for log in folder.glob("*.log"):
+        if log.stat().st_size > 20_000_000:
+            with log.open("r+b") as file:
+                file.truncate(0)
+
+
+class Soaked(Simulation):
+    """Counts what is in memory now and then, and keeps no story of the run, which would be the most of it."""
+
+    looks: list[dict[str, Figures]]
+
+    def __init__(self, *words: Any, **more: Any) -> None:
+        super().__init__(*words, **more)
+        self.result.lines = deque(maxlen=1000)  # type: ignore[assignment]
+        Soaked.looks = []
+
+    async def _look(self) -> None:
+        collecting = asyncio.create_task(self._collect())
+        try:
+            await super()._look()
+        finally:
+            collecting.cancel()
+
+    async def _collect(self) -> None:
+        every, due = self.size.span / LOOKS, self.size.span / LOOKS
+        while True:
+            await asyncio.sleep(COLLECT_EVERY)
+            gc.collect()
+            if (due := due - COLLECT_EVERY) <= 0:
+                due += every
+                memory = round(psutil.Process().memory_info().rss / 1e6, 1)
+                Soaked.looks.append({"simulated fleet": {"memory_mb": memory, "objects": len(gc.get_objects())}})
+
+
+def virtual(hours: float) -> tuple[list[dict[str, Figures]], Result]:
+    size = Size(hosts=3, clients=6, faults=round(FAULTS_PER_HOUR * hours), span=hours * 3600, pause=30.0)
+    whole, simulation.Simulation = simulation.Simulation, Soaked  # type: ignore[misc]
+    try:
+        result = simulate(1, size)
+        return Soaked.looks, result
+    finally:
+        simulation.Simulation = whole  # type: ignore[misc]
+
+
+def thirds(looks: list[dict[str, Figures]]) -> dict[str, dict[str, list[float]]]:
+    """By process and measure: in the beginning, in the middle, at the end."""
+    some = max(1, len(looks) // 10)
+    # What is allocated once is allocated by the second look.
+    parts = [looks[1 : 1 + some] or looks[:1], looks[len(looks) // 2 :][:some], looks[-some:]]
+    who = {host: list(figures) for host, figures in looks[0].items()}
+    return {
+        host: {name: [statistics.median(look[host][name] for look in part) for part in parts] for name in names}
+        for host, names in who.items()
+    }
+
+
+def grown(found: dict[str, dict[str, list[float]]]) -> list[str]:
+    return [
+        f"{host}: {name} {begin:g} -> {middle:g} -> {end:g}"
+        for host, measures in found.items()
+        for name, (begin, middle, end) in measures.items()
+        if end > 1.1 * begin + ROOM[name]
+    ]
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(prog="python -m tests.chaos.soak", description=__doc__)
+    options.add_argument("--hours", type=float, default=8.0, help="live, and in virtual time (8)")
+    options.add_argument("--live", type=float, help="hours live, where that is another number")
+    options.add_argument("--virtual", type=float, help="hours of virtual time, where that is another number")
+    options.add_argument("--json", action="store_true", help="the report as JSON; so it is in a pipe, too")
+    asked = options.parse_args()
+    hours = {"live": asked.live, "virtual": asked.virtual}
+    hours = {name: asked.hours if value is None else value for name, value in hours.items()}
+    found: dict[str, Any] = {"hours": hours, "wrong": []}
+    if hours["live"]:
+        try:
+            net.check()
+        except net.NoNamespaces as error:
+            print(f"soak: {error}", file=sys.stderr)
+            return 2
+        folder = Path(tempfile.mkdtemp(prefix="zscout-soak-"))
+        try:
+            looks, wrong = live(hours["live"], folder)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+        found["live"] = thirds(looks) if looks else {}
+        found["wrong"] += wrong
+    if hours["virtual"]:
+        began = time.monotonic()
+        looks, result = virtual(hours["virtual"])
+        found["virtual"] = thirds(looks) if looks else {}
+        found["virtual_took_s"] = round(time.monotonic() - began)
+        found["wrong"] += result.broken
+    found["wrong"] += [text for part in ("live", "virtual") for text in grown(found.get(part, {}))]
+    if asked.json or not sys.stdout.isatty():
+        print(json.dumps(found))
+    else:
+        for part in ("live", "virtual"):
+            for host, measures in found.get(part, {}).items():
+                for name, values in measures.items():
+                    print(f"{part:8} {host:16} {name:12}" + "".join(f"{value:>12g}" for value in values))
+        print("\n".join(found["wrong"]) or "nothing grew")
+    return 1 if found["wrong"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
