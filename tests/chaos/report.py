@@ -53,8 +53,8 @@ def around(violation: Violation, faults: Sequence[Fault], start: int) -> str:
     """The violation, with the last faults before it."""
     last = [fault for fault in faults if fault.at <= violation.at][-2:]
     told = "; ".join(
-        f"{fault.kind} of {', '.join(fault.hosts or fault.touched)} from {(fault.at - start) / SECOND:.2f} s"
-        f" for {(fault.mended - fault.at) / SECOND:.2f} s"
+        f"{fault.kind} ({fault.how}) of {', '.join(fault.hosts or fault.touched)}"
+        f" from {(fault.at - start) / SECOND:.2f} s for {(fault.mended - fault.at) / SECOND:.2f} s"
         for fault in last
     )
     return (
