@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import random
 import re
@@ -214,6 +215,10 @@ class Fleet:
             self._linked = now()
         self._standing = standing
 
+    def _without_link(self) -> str:
+        pairs = (frozenset(pair) for pair in itertools.combinations(HOSTS, 2) if not set(pair) <= set(CLIENTS))
+        return ", ".join("-".join(sorted(pair)) for pair in pairs if pair not in self._standing)
+
     # Faults
 
     def begin(self, fault: Fault) -> None:
@@ -264,7 +269,9 @@ class Fleet:
         try:
             self.until(served, RECOVER_WITHIN, f"all are served after {fault.kind} ({', '.join(fault.touched)})")
         except NotServed as error:
-            self.found.append(Violation(now(), "16 all is served", str(error)))
+            late = [client for client in CLIENTS if self.watch.entered.get(client, 0) <= fault.mended]
+            text = f"{error}; late: {', '.join(late)}; no link: {self._without_link() or 'all stand'}"
+            self.found.append(Violation(now(), "16 all is served", text))
             return
         fault.served = max(self.watch.entered[client] for client in CLIENTS)
         fault.linked = min(max(fault.mended, self._linked, self.watch.token_back), fault.served)
