@@ -102,6 +102,12 @@ def _one_way(rng: random.Random) -> frozenset[Way]:
     return frozenset((rng.choice(sorted(_pair(rng))),))
 
 
+def _two_frozen(rng: random.Random, _leader: str) -> Fault:
+    """Neither closes their link: each finds it as it was."""
+    one = rng.choice(NODES)
+    return Fault("", "freeze", rng.uniform(1.0, 3.5), (one, rng.choice([host for host in HOSTS if host != one])))
+
+
 def _blackout(rng: random.Random, _leader: str) -> Fault:
     return Fault("", "kill", rng.uniform(0.0, 3.0), NODES)
 
@@ -113,6 +119,7 @@ KINDS: Final[dict[str, tuple[int, Callable[[random.Random, str], Fault]]]] = {
     "leader away": (6, _away),
     "killed": (3, _any("kill", *HOSTS)),
     "frozen": (4, _any("freeze", *HOSTS)),
+    "two frozen": (2, _two_frozen),
     "cut": (4, _any("cut", *HOSTS)),
     "unplugged": (2, _any("cable", *HOSTS)),
     "partition": (4, _ways(groups)),
