@@ -302,8 +302,8 @@ def random_faults(fleet: Fleet, rng: random.Random, kinds: list[str], until: Cal
         fleet.mend(fault)
         if single or rng.random() < 0.8:
             fleet.recover(fault)
-            for one in faults[-2:]:
-                one.served = one.served or fault.served
+            if second is not None:
+                second.served = fault.served
             fleet.rest(rng.uniform(0.3, 1.0))
         else:
             fault.alone = False
