@@ -38,7 +38,8 @@ def main(words: list[str] | None = None) -> int:
     except net.NoNamespaces as error:
         print(f"chaos: {error}", file=sys.stderr)
         return 2
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell in the background has its programs ignore the first
+        signal.signal(number, signal.default_int_handler)
     if asked.logs is not None:
         asked.logs.mkdir(parents=True, exist_ok=True)
     folder = asked.logs or Path(tempfile.mkdtemp(prefix="zscout-chaos-"))
