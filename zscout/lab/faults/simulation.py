@@ -410,11 +410,9 @@ class Simulation:
                 process.main = process.run(asyncio.create_task, self._guard(self._spare(rc, mesh, leaves)))
                 end = leaves.set if fault.both else lambda: self._kill_spare(name, rc)
             case "fail":
-                (name,) = fault.whom
-                failing = [(key, rc) for key, rc in self.rcs.items() if rc.name == name]
-                for key, rc in failing:
-                    self._at(key, rc.fail, "its device failed")
-                end = lambda: [self._at(key, rc.recover) for key, rc in failing]  # noqa: E731
+                failing = {key: rc for key, rc in self.rcs.items() if rc.name == fault.whom[0]}
+                self._each(failing, lambda rc: rc.fail("its device failed"))
+                end = lambda: self._each(failing, ResourceController.recover)  # noqa: E731
             case "forget":
                 pairs = self._pairs(fault)
                 self.cuts.update(pairs)
@@ -424,11 +422,12 @@ class Simulation:
         self.promises.in_contradiction |= fault.kind == "forget"
         self.loop.call_later(fault.lasts, self._end, fault, end)
 
-    def _at(self, key: str, call: Callable[..., None], *args: Any) -> None:
-        """Has an RC's process do something when it goes on, if it lives."""
-        process, _ = self.running[key.split()[0]]
-        if key in self.rcs and not process.dead:
-            process.run(self.loop.call_soon, call, *args)
+    def _each(self, rcs: Mapping[str, ResourceController], call: Callable[[ResourceController], None]) -> None:
+        """Has the processes of these RCs do something when they go on, as far as they live."""
+        for key, rc in rcs.items():
+            process, _ = self.running[key.split()[0]]
+            if self.rcs.get(key) is rc and not process.dead:
+                process.run(self.loop.call_soon, call, rc)
 
     def _end(self, fault: Fault, end: Callable[[], object]) -> None:
         self.log(f"OVER  {fault.kind} {' '.join(fault.whom)}")
