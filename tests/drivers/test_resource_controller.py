@@ -16,7 +16,7 @@ from zscout.drivers.resource_controller import EARLY_PER_HOST, CommandQuery, Res
 from zscout.keyexpr import Role, Sender
 from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import Mesh
-from zscout.messages import Grants, RcState
+from zscout.messages import Grants, RcmState, RcState
 from zscout.types import SECOND, Grant
 
 Story = Callable[[Rcm, ResourceController, Device, Mesh], Awaitable[None]]
@@ -160,6 +160,22 @@ def test_an_rc_that_fails_leaves_the_mesh_with_its_device_safe_and_tells_its_own
         assert device.calls.count("safe") == 1
 
     run(story())
+
+
+def test_a_command_under_a_grant_that_was_missed_waits_until_that_was_read() -> None:
+    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+        rcm.publish()
+        await until(lambda: not rc.holds.held)
+        rcm.hangs, rcm.seq = True, rcm.seq + 2
+        granted = rcm.seq
+        rcm.publish(rc="robot/another")
+        await until(lambda: rcm.asked and rc.holds.seq == rcm.seq)
+        asking = asyncio.create_task(answer(client, grant(granted)))
+        await until(lambda: rc.queue.commands)
+        rcm.asked[-1].answer(RcmState(TERM, rcm.seq, "rcm", [rcm.view(granted)]))
+        assert await asking == "done"
+
+    play(story)
 
 
 def test_figures_are_published_when_they_change() -> None:

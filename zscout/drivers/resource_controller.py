@@ -11,6 +11,8 @@ from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection
 from typing import Any, TypeAlias
 
+from msgspec import structs
+
 from zscout import messages, trace
 from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
@@ -345,7 +347,11 @@ class ResourceController:
         client, held, directory = str(sender), self.holds.held.get(grant), self.directory
         if held and directory and directory.is_node_of_gang(sender, held.holder, self.name):
             client = held.holder.client
-        return self.holds.check(grant, client, self.mesh.now())
+        problem = self.holds.check(grant, client, self.mesh.now())
+        if self._missed and problem is not None and problem.code in ("free", "not_holder"):
+            # What is being read may name it.
+            return structs.replace(problem, code="not_yet", message=f"{self.name} has missed something, and reads it")
+        return problem
 
     def _waited(self, query: CommandQuery) -> Ns:
         """How long a command may have waited: in our queue, and before it in the network through a stall."""

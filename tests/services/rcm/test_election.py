@@ -172,6 +172,14 @@ def test_who_was_deposed_waits_only_for_a_leader_that_is_there(others: list[bool
     assert seen.must_wait(others, [], LATER + SILENCE // 2, "a") == waits
 
 
+def test_who_was_deposed_and_sees_nobody_else_waits_as_well() -> None:
+    """A client may have told it of the higher term, which it would tell the other leader of the next one in turn."""
+    seen = election()
+    seen.deposed(LATER, JITTER)
+    assert seen.must_wait([], [False], LATER + SILENCE // 2, "a")
+    assert not seen.must_wait([], [False], LATER + SILENCE, "a")
+
+
 @pytest.mark.parametrize(
     ("others", "own", "lost", "waits"),
     [

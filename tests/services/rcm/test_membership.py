@@ -166,3 +166,43 @@ def test_a_grant_that_was_answered_and_never_published_is_lost_before_any_vote()
         assert (await client.ask("tally", "radio/rf0:5", grant=HELD.grant, rcs=["radio/rf0"])).grant == granted
 
     run(story())
+
+
+@pytest.mark.parametrize("seconds", [1.01, 1.5])
+def test_a_leader_that_is_cut_off_for_longer_than_the_lease_drops_nobody(seconds: float) -> None:
+    """It loses its links to all hosts, one after the other, and takes that for no death."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm, rc, client = fleet.rcm(), fleet.rc("robot/a"), fleet.client("one")
+        await fleet.joined(rc)
+        running = await client.ask("tally", "robot/a", seconds=60)
+        assert running.state == "running"
+        for other, late in ((client.mesh, 0.0), (rc.mesh, 0.1), (fleet.watcher, 0.15)):
+            await asyncio.sleep(late)
+            for ends in ((rcm.mesh, other), (other, rcm.mesh)):
+                fleet.network.cut(*ends)
+        await asyncio.sleep(seconds - 0.1)
+        fleet.network.heal()
+        await asyncio.sleep(3)
+        (hold,) = (await fleet.state()).holds
+        assert hold.grant == running.grant
+        assert not [revoked for grants in fleet.published for revoked in grants.revoked]
+        rcm.stop()
+
+    run(story())
+
+
+def test_a_client_whose_whole_host_dies_is_dropped_as_soon_as_another_host_answers() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm, rc, client = fleet.rcm(), fleet.rc("robot/a"), fleet.client("one")
+        await fleet.joined(rc)
+        await client.ask("tally", "robot/a", seconds=60)
+        fleet.network.kill(client.mesh)
+        died = fleet.watcher.now()
+        await until(lambda: any(grants.revoked for grants in fleet.published))
+        assert fleet.watcher.now() - died < SECOND // 20
+        rcm.stop()
+
+    run(story())

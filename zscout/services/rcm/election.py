@@ -92,9 +92,12 @@ class Election:
             self._alone_since = None
             yields = now < self._yields_until and (self._heard_lately(now) or any(others))
             return yields or sum(others) * 2 > len(others)
+        if now < self._yields_until:
+            # Who deposed this candidate goes on, though nobody who could say so is seen: the two would take turns.
+            return True
         cut_off = any(now - at <= self.silence for host, at in self._lost.items() if host not in (leader, self.host))
         if sum(own) * 2 <= len(own) and not cut_off and self._alone_since is None:
-            return now < self._yields_until and self._heard_lately(now)
+            return False
         self._alone_since = now if self._alone_since is None else self._alone_since
         return now - self._alone_since < self.silence
 

@@ -10,6 +10,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from msgspec import Struct
@@ -31,6 +32,10 @@ SEEK_EVERY: Final = 1.0
 """Seconds."""
 SEEK_TIMES: Final = 20
 MAX_SOUGHT: Final = 256
+DYING: Final = 0.003
+"""Seconds within which all tokens of one link go."""
+MAX_ASKED: Final = 3
+"""Other hosts that are asked whether this one is away."""
 NEAR_END: Ns = SECOND // 20
 """A hold with less than this left may have ended at its RC already: clocks differ a little."""
 
@@ -86,6 +91,10 @@ class Membership:
         """Called when the instances of an RC are to hear which one is meant."""
         self._named: dict[RcName, tuple[str, HostName]] = {}
         """The instance that is meant of each RC, and its host."""
+        self._dying: list[Callable[[], None]] = []
+        """What is to be judged of tokens that went just now."""
+        self._doubted: set[ClientId] = set()
+        """Clients that went as it was not known whether this leader was away."""
         self._sought: dict[str, int] = {}
         """By key: how often those whose tokens went without them are still asked."""
         self._departed: dict[RcName, RcState] = {}
@@ -147,22 +156,71 @@ class Membership:
         instances.discard(token.instance)
         if not instances:
             del self.clients[client]
-            if self._is_away(token):
-                self.expect(client)
-            else:
-                self._client_lost(client)
+            self._dies(partial(self._judge_client, client, token))
+
+    def _dies(self, judge: Callable[[], None]) -> None:
+        """The tokens of a host that is lost go one after the other: what that means is judged by all of them."""
+        self._dying.append(judge)
+        if len(self._dying) == 1:
+            self._supervisor.call_later(DYING, self._bury)
+
+    def _bury(self) -> None:
+        dying, self._dying = self._dying, []
+        for judge in dying:
+            judge()
+
+    def _judge_client(self, client: ClientId, token: Token) -> None:
+        if client in self.clients:
+            return
+        if self._is_away(token):
+            self._doubted.add(client)
+            self.expect(client)
+        else:
+            self._client_lost(client)
 
     def _is_away(self, token: Token) -> bool:
-        """Whether `token` may have gone because this leader was away: it stood still, or lost several hosts at once."""
+        """Whether `token` may have gone because this leader was away: it stood still, or lost several hosts at once. Of
+        one host that goes it is not known for the moment that others take to answer."""
         now, span = self.mesh.now(), round(AWAY * self._lease * SECOND)
-        if not self._sees(token.host):
+        if alone := not self._sees(token.host):
             self._gone.append((now, token.host))
         while self._gone and self._gone[0][0] < now - span:
             self._gone.popleft()
         stood_still = self._stall.fresh() and self._stall.length > span
         if stood_still or len({host for _, host in self._gone}) > 1:
             self._away_until = now + round(self._lease * SECOND)
+        elif alone and now >= self._away_until and (others := self._others(token.host)):
+            # Of several links that are lost, one is the first.
+            self._away_until = now + round(self._lease * SECOND)
+            self._doubted.clear()
+            self._supervisor.spawn(self._ask_others(others))
         return now < self._away_until
+
+    def _others(self, gone: HostName) -> list[tuple[str, type[Struct]]]:
+        """Whom to ask on hosts other than this one and the one that is `gone`, and what they answer with."""
+        keys, here = self.mesh.keys, (gone, self.mesh.me.host)
+        rcs = {one.host: keys.rc_state(rc) for rc, tokens in self._rc_tokens.items() for one in tokens.values()}
+        clients = {(one := client_of(client)).host: keys.requests(one) for client in self.clients}
+        asked: dict[str, tuple[str, type[Struct]]] = {host: (key, ClientRequests) for host, key in clients.items()}
+        asked |= {host: (key, RcState) for host, key in rcs.items()}
+        return [asked[host] for host in sorted(asked) if host not in here][:MAX_ASKED]
+
+    async def _ask_others(self, others: list[tuple[str, type[Struct]]]) -> None:
+        """If anybody else answers, this leader is not away, and what went has gone."""
+        timeout = AWAY * self._lease
+        await asyncio.gather(*(self._ask_other(key, kind, timeout) for key, kind in others))
+
+    async def _ask_other(self, key: str, kind: type[Struct], timeout: float) -> None:
+        reply = await self.mesh.ask_one(key, RcAsk(), kind, timeout=timeout)
+        if reply is None or len({host for _, host in self._gone}) > 1:
+            return
+        self._away_until = 0
+        doubted, self._doubted = self._doubted, set()
+        for client in sorted(doubted):
+            if timer := self._unseen.pop(client, None):
+                timer.cancel()
+                self._client_lost(client)
+        self._drop_unseen()
 
     def _sees(self, host: HostName) -> bool:
         """Whether any program of a host shows itself."""
@@ -226,15 +284,22 @@ class Membership:
         tokens.pop(token.instance, None)
         if token.name in self._pending and self._pending[token.name].state.instance == token.instance:
             del self._pending[token.name]
-        if current is not None and current.instance == token.instance:
-            if self._is_away(token):
-                self._blinked.add(token.instance)
-                self._supervisor.call_later(self._lease, self._drop_unseen)
-            else:
-                self._drop(token.name)
         if not tokens:
             del self._rc_tokens[token.name], self._rc_seen[token.name]
             self._settle()
+        if current is not None and current.instance == token.instance:
+            self._dies(partial(self._judge_rc, token))
+
+    def _judge_rc(self, token: Token) -> None:
+        current = self._joined.get(token.name)
+        back = token.instance in self._rc_tokens.get(token.name, {})
+        if current is None or current.instance != token.instance or back:
+            return
+        if not current.leaving and self._is_away(token):
+            self._blinked.add(token.instance)
+            self._supervisor.call_later(self._lease, self._drop_unseen)
+        else:
+            self._drop(token.name)
 
     async def _greet(self, name: RcName) -> None:
         """Asks an RC whose token has come back, so that it knows to be seen."""
@@ -256,6 +321,8 @@ class Membership:
         self._supervisor.call_later(self._hold_lease, self._free, gone)
         self._seek(self.mesh.keys.rc_state(name), RcState, lambda: name in self._rc_tokens)
         self._emit(RcLost(name))
+        if gone.leaving:
+            self._free(gone)
         for other in self._rc_tokens.get(name, {}).values():
             self._supervisor.spawn(self._join(other))
 
@@ -365,6 +432,9 @@ class Membership:
         if known is None or known.instance != state.instance:
             return
         self._joined[name] = state
+        if state.leaving and state.instance not in self._rc_tokens.get(name, {}):
+            self._drop(name)
+            return
         if state.health != "ok":
             if known.health == "ok":
                 self._emit(RcLost(name, state.health))
