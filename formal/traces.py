@@ -146,6 +146,9 @@ class Behaviour:
 
     # Leaders
 
+    def _over(self, event: Mapping[str, Any]) -> None:
+        """Grants are what the model has; that an ARC is over shows in that none follows."""
+
     def _publish(self, event: Mapping[str, Any]) -> None:
         term = _term(event["term"])
         reign, number = self._reigns[term], self._terms[term]

@@ -2,6 +2,7 @@
 model.
 
     publish   an RCM: the holders of the RCs that it names
+    over      an RCM: an ARC that it will never grant again
     promise, hear, read, end, command   an RC: what it heard, and what it holds then
 
 Each has the time `at` on this host's monotonic clock, in nanoseconds."""

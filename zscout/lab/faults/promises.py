@@ -56,6 +56,8 @@ class Promises:
         """By grant that was published: the ARC that it was for."""
         self.in_contradiction = False
         """Whether links have come back without all declarations: what a client ends may not reach who leads."""
+        self._ended_by: dict[str, set[str]] = {}
+        """By term: ARCs that its RCM has ended for good."""
         self._over: dict[str, float] = {}
         """ARCs that their clients have ended, and when."""
         self._places: dict[tuple[str, str], Place] = {}
@@ -72,10 +74,16 @@ class Promises:
     def event(self, what: Mapping[str, Any]) -> None:
         """A line of `zscout.trace`: at every event, what an RC may not do whatever it hears."""
         if what["do"] == "publish":
+            ended = self._ended_by.setdefault(str(what["term"]), set())
             for rc, holders in what["rcs"].items():
                 for grant, arc, *_ in holders:
                     if str(grant) not in self._arc_of:
                         self._granted(rc, str(grant), arc)
+                    if arc in ended:
+                        self._broken(f"{rc} is held by {arc}, which the same RCM has ended")
+            return
+        if what["do"] == "over":
+            self._ended_by.setdefault(str(what["term"]), set()).add(what["arc"])
             return
         rc, instance, known = what["rc"], what["instance"], (what["term"], what["seq"])
         before = self._heard.get(instance, known)

@@ -12,6 +12,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from zscout import trace
 from zscout.keyexpr import BadName, client_of, is_pattern
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
@@ -27,6 +28,8 @@ log = logging.getLogger(__name__)
 REMEMBER: Ns = 60 * SECOND
 """How long ended requests are known: longer than any query's timeout and a lease together."""
 MAX_REMEMBERED = 20_000
+FINAL = (Outcome.RELEASED, Outcome.CANCELLED, Outcome.COMPLETED)
+"""What has ended so is never granted again."""
 REASONS_EVERY = 0.1
 """Seconds at most until a changed reason to wait is published: in a busy queue every grant changes many
 reasons, and only the last is of use."""
@@ -208,6 +211,8 @@ class RequestRegistry:
 
     def _remember(self, arc: ArcId, notice: Notice) -> None:
         now = self._mesh.now()
+        if trace.enabled() and notice.outcome in FINAL:
+            trace.write(now, "over", term=self._term, arc=arc)
         self._names.pop(arc, None)
         self._estimated.discard(arc)
         self._ended[arc] = (now + REMEMBER, notice)
