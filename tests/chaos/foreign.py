@@ -38,6 +38,7 @@ AGAIN = ("not_yet", "stale", "busy", "unknown")
 NOT_MINE = ("ended", "free", "not_holder", "wrong_client")
 MAX_COUNTER, MAX_JUMP = 2**52, 1_000_000
 REMEMBERED = 256
+PATIENCE, REJOIN = 2 * SECOND, 10 * SECOND
 
 Term = tuple[int, str]
 Grant = tuple[Term, int]
@@ -61,8 +62,16 @@ class Refused(Exception):
 class Peer:
     """What clients and RCs have in common: a session, whom they obey, and standstills of their own."""
 
-    def __init__(self, session: zenoh.Session, fleet: str, host: str, seed: str) -> None:
-        self.session, self.host, self.base = session, host, f"zscout/{fleet}"
+    def __init__(self, join: Callable[[], zenoh.Session], program: str, fleet: str, host: str, seed: str) -> None:
+        self.session, self.host, self.base = join(), host, f"zscout/{fleet}"
+        self._join, self._program = join, program
+        self._makes: list[Callable[[zenoh.Session], Any]] = []
+        self.tokens: set[str] = set()
+        self._sessions: dict[str, bool] = {}
+        """Every session that has shown itself, and whether its token lives."""
+        self._suspected: dict[str, tuple[int, int]] = {}
+        """When each contradiction was seen first and last."""
+        self._joined, self._pause = 0, REJOIN
         self.rng = random.Random(seed)  # noqa: S311
         self.lock = threading.RLock()
         self.heard = now()
@@ -71,22 +80,89 @@ class Peer:
         self._stall = (0, 0)
         """Its end and its length."""
         self.declared: list[Any] = []
+        self.declare(lambda session: self.show(session, "session", program, str(session.info.zid())))
+
+    # "Links that come back"
+
+    def declare(self, make: Callable[[zenoh.Session], Any]) -> None:
+        self._makes.append(make)
+        self.declared.append(make(self.session))
+
+    def suspect(self, what: str, *, so: bool = True) -> None:
+        """`so`: what is seen contradicts itself. If that lasts the mesh is joined anew."""
+        with self.lock:
+            at = now()
+            first, last = self._suspected.get(what, (at, at))
+            first = at if at - last > 30 * SECOND else first
+            if not so:
+                self._suspected.pop(what, None)
+                return
+            self._suspected[what] = first, at
+            if at - first < PATIENCE or at - self._joined < self._pause:
+                return
+            self._pause = REJOIN if at - self._joined > 10 * self._pause else 2 * self._pause
+            self._joined = at
+            self._suspected.clear()
+        say("rejoined", why=what)
+        threading.Thread(target=self._rejoin, daemon=True).start()
+
+    def _rejoin(self) -> None:
+        before, session = self.session, self._join()
+        threading.Event().wait(1.0)  # until it has its links
+        with self.lock:
+            self.session = session
+            self.declared, old = [make(session) for make in self._makes], self.declared
+        threading.Event().wait(0.5)
+        before.close()  # type: ignore[no-untyped-call]
+        old.clear()
+
+    def look(self) -> None:
+        """Now and then."""
+        with self.lock:
+            for peer in map(str, self.session.info.peers_zid()):
+                self.suspect(f"the token of {peer} is missing", so=self._sessions.get(peer) is False)
 
     def watch(self, on_leader: Callable[[], None]) -> None:
         def on_token(sample: zenoh.Sample) -> None:
             key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
             say("token", token=key.partition("/alive/")[2], alive=alive)
+            with self.lock:
+                (self.tokens.add if alive else self.tokens.discard)(key)
+            if "/session/" in key:
+                self._sessions[key.rpartition("/")[2]] = alive
             if "/rcm/" in key:
                 with self.lock:
                     (self.leaders.add if alive else self.leaders.discard)(key)
                 if alive:
                     on_leader()
 
-        watched = self.session.liveliness().declare_subscriber(f"{self.base}/alive/**", on_token, history=True)
-        self.declared.append(watched)
+        self.declare(lambda session: self._watched(session, on_token))
 
-    def show(self, role: str, name: str, instance: str) -> Any:
-        return self.session.liveliness().declare_token(f"{self.base}/alive/{self.host}/{role}/{name}/{instance}")
+    def _watched(self, session: zenoh.Session, on_token: Callable[[zenoh.Sample], None]) -> Any:
+        def on_sample(sample: zenoh.Sample) -> None:
+            # What a session hears that is being left is its own end.
+            if session is self.session:
+                on_token(sample)
+
+        return session.liveliness().declare_subscriber(f"{self.base}/alive/**", on_sample, history=True)
+
+    def show(self, session: zenoh.Session, role: str, name: str, instance: str) -> Any:
+        return session.liveliness().declare_token(f"{self.base}/alive/{self.host}/{role}/{name}/{instance}")
+
+    def queryable(self, key: str, on_query: Callable[[zenoh.Query], None]) -> None:
+        def make(session: zenoh.Session) -> Any:
+            def once(query: zenoh.Query) -> None:
+                if session is self.session:
+                    on_query(query)
+                else:
+                    query.drop()  # type: ignore[no-untyped-call]
+
+            return session.declare_queryable(f"{self.base}/{key}", once)
+
+        self.declare(make)
+
+    def subscribe(self, key: str, on_sample: Callable[[zenoh.Sample], None]) -> None:
+        self.declare(lambda session: session.declare_subscriber(f"{self.base}/{key}", on_sample))
 
     def tick(self) -> None:
         """Called often: a step that was too long was a standstill."""
@@ -135,7 +211,7 @@ class Peer:
         def on_query(query: zenoh.Query) -> None:
             respond(query, f"{self.base}/{key}", answer, schema)
 
-        self.declared.append(self.session.declare_queryable(f"{self.base}/{key}", on_query))
+        self.queryable(key, on_query)
 
 
 def encoding(schema: str) -> zenoh.Encoding:
@@ -176,24 +252,29 @@ class Rc:
         self.awaited: set[Grant] = set()
         """What a snapshot named while something else was held."""
         self.commands: queue.Queue[tuple[int, zenoh.Query]] = queue.Queue(64)
-        self.publisher = peer.session.declare_publisher(
-            f"{peer.base}/rc/{name}/state",
-            encoding=encoding("RcState"),
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.INTERACTIVE_HIGH,
-            express=True,
-        )
+        self.promised = NO_TERM
+        self.led: set[str] = set()
+        """The RCMs that were seen at the last look."""
 
     def begin(self) -> None:
         """ "Beginning", but for the subscriptions, which the process has once."""
         self.read()
         self.peer.serve(f"rc/{self.name}/state", self.on_state, "RcState")
-        key = f"{self.peer.base}/rc/{self.name}/command/*/*"
-        self.peer.declared.append(self.peer.session.declare_queryable(key, self.on_command))
+        self.peer.queryable(f"rc/{self.name}/command/*/*", self.on_command)
         if self.capacity is not None:
             self.peer.serve(f"rc/{self.name}/vote", self.on_vote, "Ballot")
         threading.Thread(target=self.work, daemon=True).start()
-        self.peer.declared.append(self.peer.show("rc", self.name, self.instance))
+        self.peer.declare(lambda session: self.peer.show(session, "rc", self.name, self.instance))
+
+    def look(self) -> None:
+        """An RCM that is seen publishes, and asks for a promise."""
+        heard = now() - self.peer.heard < HOLD_LEASE // 2
+        leaders = {key.rpartition("/")[2] for key in self.peer.leaders}
+        if self.promised[1] in self.led - leaders:
+            self.promised = NO_TERM
+        self.led = leaders
+        self.peer.suspect("an RCM is seen and not heard", so=bool(self.peer.leaders) and not heard)
+        self.peer.suspect(f"{self.name} is not asked", so=heard and self.promised != self.term)
 
     def trace(self, do: str, **what: Any) -> None:
         known = {"rc": self.name, "instance": self.instance, "sharable": self.capacity is not None}
@@ -215,7 +296,14 @@ class Rc:
         }
 
     def publish(self, ended: list[Json] | None = None) -> None:
-        self.publisher.put(json.dumps(self.state(ended)))
+        self.peer.session.put(
+            f"{self.peer.base}/rc/{self.name}/state",
+            json.dumps(self.state(ended)),
+            encoding=encoding("RcState"),
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=True,
+        )
 
     # "What an RCM says"
 
@@ -368,6 +456,7 @@ class Rc:
                     raise Refused("old_term", "a higher term is obeyed", self.term)
                 if term != self.term:
                     self.term, self.seq = term, 0
+                self.promised = term
                 self.trace("promise", promised=term)
             return self.state()
 
@@ -389,17 +478,23 @@ def run_rcs(peer: Peer, over: threading.Event) -> None:
         while True:
             missed.get().read()
 
-    peer.declared.append(peer.session.declare_subscriber(f"{peer.base}/rcm/grants", on_grants))
+    peer.subscribe("rcm/grants", on_grants)
     peer.watch(lambda: None)
     for rc in rcs:
         rc.begin()
     threading.Thread(target=read, daemon=True).start()
     say("up")
+    looked = now()
     while not over.wait(0.02):
         with peer.lock:
             for rc in rcs:
                 rc.expire()
         peer.tick()
+        if now() - looked > SECOND:
+            looked = now()
+            peer.look()
+            for rc in rcs:
+                rc.look()
 
 
 # "A client"
@@ -424,34 +519,34 @@ class Request:
 class Client(Peer):
     """Three threads, one for each job, each with one request at a time."""
 
-    def __init__(self, session: zenoh.Session, fleet: str, host: str, seed: str) -> None:
-        super().__init__(session, fleet, host, seed)
+    def __init__(self, join: Callable[[], zenoh.Session], program: str, fleet: str, host: str, seed: str) -> None:
+        super().__init__(join, program, fleet, host, seed)
         self.me = f"{host}/{CLIENT}"
         self.term = NO_TERM
         self.requests: dict[str, Request] = {}
         self.news = threading.Condition(self.lock)
         self.unknown: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.token: Any = None
+        self.instance = ""
         self.shown = 0
         self.ahead = False
         """An RCM of a lower term has answered."""
 
     def begin(self) -> None:
-        grants, notice = f"{self.base}/rcm/grants", f"{self.base}/client/{self.me}/notice"
-        self.declared.append(self.session.declare_subscriber(notice, self.on_notice))
-        self.declared.append(self.session.declare_subscriber(grants, self.on_grants))
+        self.subscribe(f"client/{self.me}/notice", self.on_notice)
+        self.subscribe("rcm/grants", self.on_grants)
         self.watch(self.ask_all)
         self.serve(f"client/{self.me}/requests", self.on_requests, "ClientRequests")
-        self.renew()
+        self.instance, self.shown = secrets.token_hex(6), now()
+        self.declare(lambda session: self.show(session, "client", CLIENT, self.instance))
 
     def renew(self) -> None:
         """A new token before the old one goes, at most twice a second."""
         with self.lock:
             if now() - self.shown > SECOND // 2:
-                before, self.token = self.token, self.show("client", CLIENT, secrets.token_hex(6))
-                self.shown = now()
-                if before is not None:
-                    before.undeclare()
+                self.instance, self.shown = secrets.token_hex(6), now()
+                before = self.declared[-1]
+                self.declared[-1] = self._makes[-1](self.session)
+                before.undeclare()
 
     # What is heard
 
@@ -523,6 +618,8 @@ class Client(Peer):
         for good, answer in replies:
             if good:
                 self.take(answer)
+        heard = now() - self.heard < HOLD_LEASE // 2
+        self.suspect("an RCM is seen that does not answer", so=not replies and (heard or bool(self.leaders)))
         return replies
 
     def ask(self, request: Request) -> None:
@@ -568,6 +665,8 @@ class Client(Peer):
                     break
                 threading.Event().wait(min(pause, max(0.0, (until - now()) / SECOND)))
                 pause *= 2
+            seen = any(f"/rc/{rc}/" in key for key in list(self.tokens))
+            self.suspect(f"{rc} is seen and does not answer", so=seen and code == "unknown")
             if code:
                 refused.append(rc)
 
@@ -671,9 +770,13 @@ def run_client(client: Client, quiet: threading.Event, over: threading.Event) ->
     for thread in threads:
         thread.start()
     say("up")
+    looked = now()
     while not over.wait(0.05):
         client.watch_lease()
         client.tick()
+        if now() - looked > SECOND:
+            looked = now()
+            client.look()
 
 
 def main() -> None:
@@ -694,16 +797,17 @@ def main() -> None:
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
     }.items():
         config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as session:
-        peer = (Client if what == "client" else Peer)(session, fleet, host, seed)
-        say("imported", modules=sorted(name for name in sys.modules if name.split(".")[0] == "zscout"))
-        if isinstance(peer, Client):
-            run_client(peer, quiet, over)
-        else:
-            run_rcs(peer, over)
-        with contextlib.suppress(zenoh.ZError):
-            for declared in peer.declared:
-                declared.undeclare()
+    program = "program" if what == "client" else "rcs"
+    peer = (Client if what == "client" else Peer)(lambda: zenoh.open(config), program, fleet, host, seed)
+    say("imported", modules=sorted(name for name in sys.modules if name.split(".")[0] == "zscout"))
+    if isinstance(peer, Client):
+        run_client(peer, quiet, over)
+    else:
+        run_rcs(peer, over)
+    with contextlib.suppress(zenoh.ZError):
+        for declared in peer.declared:
+            declared.undeclare()
+        peer.session.close()  # type: ignore[no-untyped-call]
 
 
 if __name__ == "__main__":
