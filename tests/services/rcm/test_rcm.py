@@ -10,7 +10,8 @@ import pytest
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, Refusal, grant_of
 from zscout.messages import Cancel, EndedHold, HandOver, Release
-from zscout.types import Grant, Term
+from zscout.scheduling.model import Adopted, ArcRequest, RcJoined, RecoveredHold
+from zscout.types import SECOND, Grant, Place, Term
 
 
 def test_a_grant_is_published_then_the_loser_is_told_then_the_asker_is_answered() -> None:
@@ -256,5 +257,24 @@ def test_a_hand_over_is_one_publication_and_can_be_repeated() -> None:
         await new.do(Cancel("second"))
         again = await old.ask("first", "robot/a", place=first.place)
         assert (again.outcome, again.reason) == ("handed_over", "handed over to another client")
+
+    run(story())
+
+
+def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it_ended() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm, one, two = fleet.rcm(counter=5), fleet.client("one"), fleet.client("two")
+        await until(lambda: rcm.membership.clients.keys() >= {one.name, two.name})
+        assert (await two.ask("next", "robot/a")).state == "queued"
+        before, at = Term(4, "before"), rcm.mesh.now()
+        kept = ArcRequest(f"{one.name}/id", one.name, {"robot/a": {}}, 0, SECOND, keep=True, label="tally")
+        held = RecoveredHold(kept, Place(before, 1), Grant(before, 3), at - 5 * SECOND, at - 4 * SECOND)
+        rcm._receive(RcJoined("robot/a", sharable=False), Adopted(held))
+        await until(lambda: one.notices)
+        assert [(told.state, told.outcome, told.grant) for told in one.notices] == [
+            ("ended", "completed", Grant(before, 3))
+        ]
+        rcm.stop()
 
     run(story())

@@ -164,7 +164,8 @@ class RequestRegistry:
             match effect:
                 case Granted(arc=arc, rcs=rcs):
                     self.record(arc, f"granted {', '.join(rcs)}")
-                    if arc not in answered:
+                    # One that ended in the same instant is told of that alone: see below.
+                    if arc not in answered and self._core.arc(arc) is not None:
                         self._put(self.notice(arc))
                 case HoldEnded(arc=arc) | Dropped(arc=arc):
                     notice = self._close(effect)
