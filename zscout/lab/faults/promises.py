@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from itertools import product
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
+from zscout.drivers.instances import InstanceState
 from zscout.scheduling.model import ArcStatus
 from zscout.scheduling.reason import ReasonCode
 from zscout.types import ArcId, Grant, Ns, Place, RcName, Term
@@ -153,7 +154,12 @@ class Promises:
         lasting = dict.fromkeys(_half_gangs(clients, rcs), self._half_a_gang)
         lasting |= dict.fromkeys(_unled(rcs, silence), UNLED)
         if calm:
-            come_right = (*_left(leaders, rcs), *_worse_places(clients, leaders), *_doubles(rcs))
+            come_right = (
+                *_left(leaders, rcs),
+                *_worse_places(clients, leaders),
+                *_doubles(rcs),
+                *_at_odds(leaders, rcs),
+            )
             lasting |= dict.fromkeys(come_right, COME_RIGHT)
         self._since = {key: self._since.get(key, self._now()) for key in lasting}
         for key, longest in lasting.items():
@@ -203,6 +209,16 @@ def _half_gangs(clients: Mapping[str, Client], rcs: Mapping[str, ResourceControl
         for arc in client._store.open:
             if arc.grant is not None and not all((rc, arc.grant) in held for rc in arc.rcs):
                 yield name, "believes in", arc.grant, "which not all of its RCs hold"
+
+
+def _at_odds(leaders: Mapping[str, Rcm], rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
+    """RCs that hold something else than the RCM says that they obey."""
+    for rcm in leaders.values():
+        for rc in rcs.values():
+            if rc.holds.term == rcm.term and rc.instances.state is InstanceState.SERVES:
+                known = {arc.hold.grant for arc in rcm.core.holders(rc.name) if arc.hold is not None}
+                for grant in known ^ rc.holds.held.keys():
+                    yield rc.name, "holds" if grant in rc.holds.held else "lacks", grant, "against its RCM's word"
 
 
 def _unled(rcs: Mapping[str, ResourceController], silence: Mapping[str, Ns]) -> Iterator[tuple[object, ...]]:
