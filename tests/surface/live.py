@@ -103,7 +103,7 @@ class Story:
     def _components(self) -> None:
         self.call("components", "--kinds")
         self.call("start", "counter", "--host", "anvil", "--host", "bellows")
-        host = self.call("components")["components"][0]["host"]
+        host = self.call("components", until=_measured)["components"][0]["host"]
         self.look("components")
         other = ({"anvil", "bellows"} - {host}).pop()
         self.call("migrate", "counter", "--to", other)
@@ -211,6 +211,11 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 def _reported(state: Any) -> set[str]:
     return {host["host"] for host in state["hosts"] if host.get("load")}
+
+
+def _measured(out: str) -> bool:
+    """Whether the first load report with what the component uses has come."""
+    return out.startswith("{") and all(one["cpu"] is not None for one in json.loads(out)["components"])
 
 
 def _whole(keys: str) -> bool:

@@ -32,7 +32,7 @@ AGAIN: Final = 2.0
 """Seconds until a placer that did not answer is asked again."""
 TRIES: Final = 5
 """Past it, it is asked when an RCM comes or something was missed."""
-DRAIN: Final = 0.5
+DRAIN: Final = 2.0
 """Seconds for what was published before the end and is still on its way."""
 CHECK_EVERY: Final = 1.0
 """Seconds between two checks whether anything was dropped here."""
