@@ -75,10 +75,12 @@ class MemoryNetwork:
     """The processes of a fleet, and the links between them.
 
     All times are seconds. `delay` is that of every link, and `lease` how long a process waits for a silent peer, less
-    up to `impatience` of it."""
+    up to `impatience` of it. A link that was lost stands again up to `relink` after it could."""
 
-    def __init__(self, *, delay: float = 0.0002, lease: float = 1.0, impatience: float = 0.0, seed: int = 0) -> None:
-        self.delay, self.lease, self.impatience = delay, lease, impatience
+    def __init__(
+        self, *, delay: float = 0.0002, lease: float = 1.0, impatience: float = 0.0, relink: float = 0.0, seed: int = 0
+    ) -> None:
+        self.delay, self.lease, self.impatience, self.relink = delay, lease, impatience, relink
         self.random = random.Random(seed)  # noqa: S311 - what failed once must fail again
         self.nodes: list[MemoryTransport] = []
         self.trace: Callable[[str, str, str, tuple[Any, ...]], None] | None = None
@@ -195,11 +197,16 @@ class MemoryNetwork:
             for publisher in node.followed:
                 publisher.update()
 
-    def _connect(self, one: MemoryTransport, other: MemoryTransport) -> None:
+    def _relink(self, link: MemoryLink, back: MemoryLink, forgetful: float) -> None:
+        link.relinking = None
+        if link.lost and not (link.blocked or back.blocked or link.source.gone or link.target.gone):
+            self._connect(link.source, link.target, forgetful)
+
+    def _connect(self, one: MemoryTransport, other: MemoryTransport, forgetful: float = 0.0) -> None:
         for source, target in dict.fromkeys([(one, other), (other, one)]):
             link = self.between(source, target)
             back, link.lost = link.lost, False
-            link.hidden = {one for one in source.declarations() if back and self.random.random() < self.forgetful}
+            link.hidden = {one for one in source.declarations() if back and self.random.random() < forgetful}
             for token in source.declared:
                 if token not in link.hidden:
                     link.send(target.on_token, source, token, True)
@@ -218,8 +225,12 @@ class MemoryNetwork:
                 if link.expiry is not None:
                     link.expiry.cancel()
                     link.expiry = None
-                if link.lost and not back.blocked:
-                    self._connect(link.source, link.target)
+                if link.lost and not back.blocked and not (link.relinking or back.relinking):
+                    if self.relink:
+                        late = self.relink * self.random.random()
+                        link.relinking = link.call_in(late, self._relink, link, back, self.forgetful)
+                    else:
+                        self._connect(link.source, link.target, self.forgetful)
                 link.pump()
 
     def _expire(self, *links: MemoryLink) -> None:
@@ -254,6 +265,7 @@ class MemoryLink:
         self.answers: dict[str, bytes] = {}
         """The last answer on each key, while answers are disturbed."""
         self.expiry: asyncio.TimerHandle | None = None
+        self.relinking: asyncio.TimerHandle | None = None
         self.queue: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
         self._last = 0.0
         """When what was sent last is due: what comes in order comes no sooner."""

@@ -25,7 +25,11 @@ KINDS: tuple[FaultKind, ...] = (
     "forget",
     "fail",
 )
+LASTING, SHARES = ((0.5, 1.5), (0.05, 3.0), (3.0, 8.0)), (7, 2, 1)
+"""Seconds, and how often: about a lease is the worst there is; longer than the hold lease is seldom."""
 HEALED = 45.0
+RELINK = 1.0
+"""Seconds after which links that were lost stand again, at most."""
 MESSAGES = ("grants", "rc/state", "rcm/state", "schedule", "notice", "requests", "command", "vote", "alive")
 """Kinds of messages that may be disturbed."""
 
@@ -46,9 +50,9 @@ class Fault:
 
     @property
     def felt(self) -> float:
-        """Seconds for which it goes on when it is over: until every process that it left in contradiction has joined
-        anew."""
-        return HEALED if self.kind == "forget" else 0.0
+        """Seconds for which it goes on when it is over: until links stand again, or every process that it left in
+        contradiction has joined anew."""
+        return HEALED if self.kind == "forget" else RELINK
 
     def __str__(self) -> str:
         what = {
@@ -74,7 +78,7 @@ def draw(
     faults = []
     for _ in range(count):
         at = 3.0 + rng.random() * (span - 3.0)
-        lasts = rng.uniform(0.5, 1.5) if rng.random() < 0.7 else rng.uniform(0.05, 6.0)
+        lasts = rng.uniform(*rng.choices(LASTING, SHARES)[0])
         kind = rng.choice(KINDS)
         whom: tuple[str, ...] = ()
         match kind:

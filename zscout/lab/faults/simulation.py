@@ -161,7 +161,9 @@ class Simulation:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualTimeLoop)  # noqa: S101
         self.loop, loop.isolated = loop, True
-        self.network = MemoryNetwork(lease=self.fleet.mesh.lease, impatience=IMPATIENCE, seed=self.seed)
+        self.network = MemoryNetwork(
+            lease=self.fleet.mesh.lease, impatience=IMPATIENCE, relink=plan.RELINK, seed=self.seed
+        )
         self._digest = hashlib.blake2b(digest_size=16)
         self.network.trace = self._trace
         self.devices = {rc: self._device(rc) for rc in DEVICES}
