@@ -65,6 +65,8 @@ class Promises:
         self._heard: dict[str, tuple[Any, int]] = {}
         """By instance of an RC: the newest (term, seq)."""
         self._promised: dict[str, Any] = {}
+        self._answers: dict[tuple[str, str], set[str]] = {}
+        """By instance and term: what it said to hold when it promised that."""
         self._held: dict[str, set[str]] = {}
         self._ended: dict[str, set[str]] = {}
         self._since: dict[tuple[object, ...], float] = {}
@@ -78,6 +80,9 @@ class Promises:
             ended = self._ended_by.setdefault(str(what["term"]), set())
             for rc, holders in what["rcs"].items():
                 for grant, arc, *_ in holders:
+                    answer = self._answers.get((what["instances"].get(rc), str(what["term"])))
+                    if grant[0] != what["term"] and answer is not None and str(grant) not in answer:
+                        self._broken(f"{rc} is said to hold {grant} of before, and had answered that it does not")
                     if str(grant) not in self._arc_of:
                         self._granted(rc, str(grant), arc)
                     if arc in ended:
@@ -95,6 +100,7 @@ class Promises:
         if known[0] < promised:
             self._broken(f"{rc} obeys {known[0]}, and has promised {promised}")
         if what["do"] == "promise":
+            self._answers.setdefault((instance, str(what["promised"])), set()).update(map(str, what["holds"]))
             self._promised[instance] = max(what["promised"], promised)
         held, ended = {str(grant) for grant in what["holds"]}, self._ended.setdefault(instance, set())
         ended |= self._held.get(instance, set()) - held
