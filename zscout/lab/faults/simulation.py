@@ -370,7 +370,17 @@ class Simulation:
             for fault in self.faults
             if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
-        return any(fault.kind not in ("freeze", "stall", "kill") or names & {*fault.whom} for fault in faults)
+        return any(self._touches(fault, names) for fault in faults)
+
+    def _touches(self, fault: Fault, names: set[str]) -> bool:
+        """Whether a fault is one of these processes and RCs, or of what lies between them."""
+        if fault.kind in ("disturb", "forget"):
+            return True
+        if fault.kind not in ("cut", "isolate", "part"):
+            return bool(names & {*fault.whom})
+        hosts = {name.split("/")[0] for name in names if name in self.everybody}
+        # Where no candidate is, nobody leads when others are cut off.
+        return not hosts <= {*self.candidates_at} or any({*pair} <= hosts for pair in self._pairs(fault))
 
     def _begin(self, fault: Fault) -> None:
         self.log(f"FAULT {fault}")

@@ -77,6 +77,8 @@ class Membership:
         self._away_until: Ns = 0
         """Until then what goes is only unseen: this leader was away itself, and takes its own lost links for theirs."""
         self._rc_tokens: dict[RcName, dict[str, Token]] = {}
+        self._awaited: dict[RcName, Ns] = {}
+        """RCs that clients hold, and no token of which was ever seen: since when that is known."""
         self._blinked: set[str] = set()
         """Instances of RCs that count as there, and whose tokens went as this leader was away."""
         self._rc_seen: dict[RcName, Ns] = {}
@@ -256,12 +258,19 @@ class Membership:
     # RCs
 
     def awaits(self, rcs: Iterable[RcName]) -> bool:
-        """Whether it may soon be known what one of `rcs` holds: it is pending, or its token was seen for less than a
-        lease and it has not answered."""
-        since = self.mesh.now() - round(self._lease * SECOND)
-        return any(
-            rc in self._pending or (rc not in self._joined and self._rc_seen.get(rc, since) > since) for rc in rcs
-        )
+        """Whether it may soon be known what one of `rcs` holds: it is pending; or it has not answered, and its token was
+        seen for less than a lease, or this reign has never seen one and was asked for it less than a lease ago: links
+        come back one after the other."""
+        now, lease = self.mesh.now(), round(self._lease * SECOND)
+        for rc in rcs:
+            if rc in self._pending:
+                return True
+            if rc not in self._joined and rc not in self._named and len(self._awaited) < MAX_SOUGHT:
+                self._awaited.setdefault(rc, now)
+            since = self._rc_seen.get(rc, self._awaited.get(rc))
+            if rc not in self._joined and since is not None and now - since < lease:
+                return True
+        return False
 
     def _on_rc_token(self, token: Token, alive: bool) -> None:
         tokens = self._rc_tokens.setdefault(token.name, {})
