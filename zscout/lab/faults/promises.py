@@ -133,7 +133,8 @@ class Promises:
             self._over.setdefault(full, self._now())
         if arc.outcome == "lost" and arc.reason.startswith("the RCM refuses it"):
             self._broken(f"{name} {arc.name} was taken, and then refused: {arc.reason}")
-        if arc.outcome in ("lost", "client_lost") and not touched:
+        # A grant that was not confirmed is no hold that was lost: it never was one.
+        if arc.outcome in ("lost", "client_lost") and arc.unconfirmed is None and not touched:
             self._broken(f"{name} {arc.name} {arc.outcome}, though no fault touched it: {arc.reason}")
         if arc.place is not None:
             before = self._places.setdefault((name, arc.id), arc.place)

@@ -55,6 +55,8 @@ SERVED_WITHIN: Final = 60.0
 """Seconds after the last fault in which all that was asked must have been served."""
 FELT: Final = 5.0
 """Seconds for which a fault may be felt when it is over: links come back, and holds that were lost are told of."""
+OF_ONE: Final = ("freeze", "stall", "kill", "fail", "double")
+"""Kinds of faults that only those feel whom they name."""
 IMPATIENCE: Final = 0.25
 """Part of the lease before whose end a link may be given up already, as Zenoh does."""
 FORGOTTEN: Final = 0.3
@@ -370,17 +372,7 @@ class Simulation:
             for fault in self.faults
             if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
-        return any(self._touches(fault, names) for fault in faults)
-
-    def _touches(self, fault: Fault, names: set[str]) -> bool:
-        """Whether a fault is one of these processes and RCs, or of what lies between them."""
-        if fault.kind in ("disturb", "forget"):
-            return True
-        if fault.kind not in ("cut", "isolate", "part"):
-            return bool(names & {*fault.whom})
-        hosts = {name.split("/")[0] for name in names if name in self.everybody}
-        # Where no candidate is, nobody leads when others are cut off.
-        return not hosts <= {*self.candidates_at} or any({*pair} <= hosts for pair in self._pairs(fault))
+        return any(fault.kind not in OF_ONE or names & {*fault.whom} for fault in faults)
 
     def _begin(self, fault: Fault) -> None:
         self.log(f"FAULT {fault}")

@@ -258,9 +258,9 @@ class Membership:
     # RCs
 
     def awaits(self, rcs: Iterable[RcName]) -> bool:
-        """Whether it may soon be known what one of `rcs` holds: it is pending; or it has not answered, and its token was
-        seen for less than a lease, or this reign has never seen one and was asked for it less than a lease ago: links
-        come back one after the other."""
+        """Whether it may soon be known what one of `rcs` holds: it is pending; or it has not answered, and its token
+        was seen for less than a lease, or this reign has never seen one and was asked for it less than a lease ago:
+        links come back one after the other."""
         now, lease = self.mesh.now(), round(self._lease * SECOND)
         for rc in rcs:
             if rc in self._pending:
