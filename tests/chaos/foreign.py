@@ -253,6 +253,8 @@ class Rc:
         """What a snapshot named while something else was held."""
         self.commands: queue.Queue[tuple[int, zenoh.Query]] = queue.Queue(64)
         self.promised = NO_TERM
+        self.behind = False
+        """Something was missed that has not been read yet."""
         self.led: set[str] = set()
         """The RCMs that were seen at the last look."""
 
@@ -339,6 +341,7 @@ class Rc:
             self.trace("hear")
         if announce:
             self.publish()
+        self.behind |= missed
         return missed
 
     def _begin(self, grant: Grant, holder: Json) -> None:
@@ -358,7 +361,7 @@ class Rc:
             said = max(believed, key=lambda one: (term_of(one["term"]), one["seq"]), default=None)
             if said is None or not self._accepts(said):
                 return
-            self.peer.heard = now()
+            self.peer.heard, self.behind = now(), False
             views = {grant_of(view["grant"]): view for view in said.get("holds", []) if self.name in view["needs"]}
             named = said.get("instances", {}).get(self.name, [self.instance])[0]
             for grant, view in views.items() if named == self.instance else ():
@@ -409,7 +412,7 @@ class Rc:
             respond(query, str(query.key_expr), lambda query: self.obey(query, command, arrived), "Done")  # noqa: B023
 
     def early(self, grant: Grant) -> bool:
-        return grant > (self.term, self.seq) or grant in self.awaited
+        return self.behind or grant > (self.term, self.seq) or grant in self.awaited
 
     def obey(self, query: zenoh.Query, command: Json, arrived: int) -> Json:
         with self.peer.lock:
@@ -562,7 +565,7 @@ class Client(Peer):
             self.term = term
             request = self.requests.get(notice["id"])
             if request is None:
-                if notice["state"] == "running":
+                if notice["state"] != "ended":
                     self.unknown.put(notice["id"])
                 return
             order = (term, int(notice["step"]))

@@ -20,6 +20,8 @@ RETRY = SECOND // 10
 in rank would else try at the same moment."""
 CALM = 10 * SECOND
 """After so long without being deposed, a candidate waits as after the first time."""
+ALONE = 2
+"""Silences for which a deposed candidate waits at most that sees nobody else: its own RCs wait as well."""
 MAX_DOUBLINGS = 5
 
 
@@ -92,7 +94,7 @@ class Election:
             self._alone_since = None
             yields = now < self._yields_until and (self._heard_lately(now) or any(others))
             return yields or sum(others) * 2 > len(others)
-        if now < self._yields_until:
+        if self._deposed is not None and now < min(self._yields_until, self._deposed + ALONE * self.silence):
             # Who deposed this candidate goes on, though nobody who could say so is seen: the two would take turns.
             return True
         cut_off = any(now - at <= self.silence for host, at in self._lost.items() if host not in (leader, self.host))
