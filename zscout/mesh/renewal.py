@@ -100,10 +100,10 @@ class RenewableTransport(Transport):
                 except BaseException:
                     await fresh.close()
                     raise
-                # First all is declared anew: no token of this process goes in between.
-                for one in self._all():
-                    one.declare(fresh)
                 try:
+                    # First all is declared anew: no token of this process goes in between.
+                    for one in self._all():
+                        one.declare(fresh)
                     await asyncio.sleep(OVERLAP)
                 finally:
                     await old.close()
@@ -111,6 +111,8 @@ class RenewableTransport(Transport):
                         one.forget_old()
         except MeshError as error:
             log.warning("%s", error)
+        except Exception:
+            log.exception("this process could not join the mesh anew as a whole")
         finally:
             self._renewing = None
 
@@ -304,7 +306,8 @@ class _TokenView:
     def __init__(self, key: str, on_token: OnToken, owns: Callable[[str], bool]) -> None:
         self._key, self._on_token, self._owns = key, on_token, owns
         self._session = 0
-        self._lock = threading.Lock()
+        # A token that dies as it is looked through may be told of in the same thread.
+        self._lock = threading.RLock()
         self._alive: dict[str, int] = {}
         """By token: the last session that showed it."""
 

@@ -214,7 +214,7 @@ class Membership:
 
     async def _ask_other(self, key: str, kind: type[Struct], timeout: float) -> None:
         reply = await self.mesh.ask_one(key, RcAsk(), kind, timeout=timeout)
-        if reply is None or len({host for _, host in self._gone}) > 1:
+        if reply is None or self._stall.fresh() or len({host for _, host in self._gone}) > 1:
             return
         self._away_until = 0
         doubted, self._doubted = self._doubted, set()
