@@ -93,7 +93,7 @@ def test_a_contradiction_must_last_and_one_that_stays_is_acted_on_ever_more_seld
     suspicions = Suspicions(lambda: round(seconds * SECOND), lambda: renewed.append(seconds))
     suspicions.suspect("x")
     seconds += PATIENCE / 2
-    suspicions.clear("x")
+    suspicions.suspect("x", so=False)
     seconds += PATIENCE
     suspicions.suspect("x")
     seconds += LASTS

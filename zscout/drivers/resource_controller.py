@@ -20,8 +20,8 @@ from zscout.drivers.instances import Instances, InstanceState
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.supervision import StallWatch
-from zscout.mesh.terms import promised_elsewhere
-from zscout.types import NO_TERM, SECOND, Ns, Term
+from zscout.mesh.terms import LastTerms
+from zscout.types import NO_TERM, SECOND, Ns
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +132,7 @@ class ResourceController:
         """What it answers, by its standing among the instances of this RC."""
         self._declared: list[Declaration] = []
         self._warm_at: Ns = 0
-        self._catching_up: asyncio.Task[None] | None = None
+        self._last_terms = LastTerms(mesh, self.supervisor, self.holds.catch_up, timeout=REREAD_TIMEOUT)
         self._reading: asyncio.Task[None] | None = None
         self._missed = False
         """Something was missed that has not been read since."""
@@ -227,7 +227,7 @@ class ResourceController:
             self.holds.promised = NO_TERM
 
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
-        self._judge(grants.term)
+        self._last_terms.shown(grants.term, self.holds.term)
         before = self.holds.term, self.holds.seq
         change = self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable)
         if change or before != (self.holds.term, self.holds.seq):
@@ -249,17 +249,10 @@ class ResourceController:
         except Refused as refused:
             query.refuse(refused.problem)
 
-    def _judge(self, term: Term) -> None:
-        if messages.of_the_last(term, self.holds.term) and (self._catching_up is None or self._catching_up.done()):
-            self._catching_up = self.supervisor.spawn(self._catch_up())
-
-    async def _catch_up(self) -> None:
-        self.holds.catch_up(await promised_elsewhere(self.mesh, timeout=REREAD_TIMEOUT))
-
     def _promise(self, query: IncomingQuery[messages.RcAsk], *, above: bool) -> None:
         promise = query.message.promise
         if promise is not None:
-            self._judge(promise)
+            self._last_terms.shown(promise, self.holds.term)
         if promise is not None and not self.holds.promise(promise, self.mesh.now(), above=above):
             raise Refused("old_term", f"{self.name} obeys term {self.holds.term.counter}", self.holds.term)
         if promise is not None:
@@ -494,15 +487,12 @@ class ResourceController:
             and self.holds.promised != self.holds.term,
         }
         for sign, seen in signs.items():
-            if seen:
-                self.mesh.suspicions.suspect(sign)
-            else:
-                self.mesh.suspicions.clear(sign)
-        sign = f"{self.name}: candidates are seen, and no RCM"
-        if self._leaders or self._hears:
-            self.mesh.suspicions.clear(sign)
-        elif await self.mesh.living(self.mesh.keys.alive_any(Role.CANDIDATE), timeout=REREAD_TIMEOUT):
-            self.mesh.suspicions.suspect(sign, patience=LEADERLESS)
+            self.mesh.suspicions.suspect(sign, so=seen)
+        candidates = self.mesh.keys.alive_any(Role.CANDIDATE)
+        missed = not (self._leaders or self._hears) and await self.mesh.living(candidates, timeout=REREAD_TIMEOUT)
+        self.mesh.suspicions.suspect(
+            f"{self.name}: candidates are seen, and no RCM", so=bool(missed), patience=LEADERLESS
+        )
 
     @property
     def _hears(self) -> bool:

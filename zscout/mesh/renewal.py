@@ -46,8 +46,12 @@ class Suspicions:
         self._last: Ns | None = None
         self._pause = SHORTEST
 
-    def suspect(self, what: str, *, patience: float = PATIENCE) -> None:
-        """What is seen contradicts itself; to be said again while it lasts. `patience` is in seconds."""
+    def suspect(self, what: str, *, so: bool = True, patience: float = PATIENCE) -> None:
+        """What is seen contradicts itself, or no longer does (`so`); to be said again while it lasts. `patience` is in
+        seconds."""
+        if not so:
+            self._since.pop(what, None)
+            return
         now = self._now()
         self._since = {one: (first, last) for one, (first, last) in self._since.items() if now - last < LASTS * SECOND}
         first, _ = self._since.get(what, (now, now))
@@ -63,9 +67,6 @@ class Suspicions:
         self._since.clear()
         log.warning("%s: this process joins the mesh anew", what)
         self._renew()
-
-    def clear(self, what: str) -> None:
-        self._since.pop(what, None)
 
     def keep(self, those: Collection[str], prefix: str) -> None:
         """Of all that begins with `prefix` only `those` still last."""

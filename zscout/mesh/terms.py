@@ -3,11 +3,34 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 
 from zscout.keyexpr import BadName, Role, Token, client_of
 from zscout.mesh.session import Mesh
-from zscout.messages import ClientRequests, RcAsk, RcmState, RcState, StateAsk
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import ClientRequests, RcAsk, RcmState, RcState, StateAsk, of_the_last
 from zscout.types import NO_TERM, Term
+
+
+class LastTerms:
+    """Asks others, once at a time, when one of the last terms is shown; tells `believe` the highest that they say."""
+
+    def __init__(
+        self, mesh: Mesh, supervisor: Supervisor, believe: Callable[[Term], object], *, timeout: float
+    ) -> None:
+        self._mesh, self._supervisor, self._believe, self._timeout = mesh, supervisor, believe, timeout
+        self._asking: asyncio.Task[None] | None = None
+
+    def shown(self, term: Term, known: Term) -> bool:
+        """Whether `term` is one of the last, which nobody who knows `known` believes of one alone: others are asked."""
+        if not of_the_last(term, known):
+            return False
+        if self._asking is None or self._asking.done():
+            self._asking = self._supervisor.spawn(self._ask())
+        return True
+
+    async def _ask(self) -> None:
+        self._believe(await promised_elsewhere(self._mesh, timeout=self._timeout))
 
 
 async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:

@@ -17,6 +17,7 @@ from zscout.behaviors.client.request import CommandRefused, Needs, OpenArc, Requ
 from zscout.config.fleet import Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
+from zscout.mesh.renewal import PATIENCE
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Done, Foresight, Notice, Problem, RcmState
 from zscout.types import SECOND, Grant, Ns, Term
@@ -232,13 +233,10 @@ class Client(MovableClient):
 
     async def _look_at_silence(self, rc: str, *, silent: bool) -> None:
         """An RC that the RCM sees, and so should this client."""
-        sign = f"{rc} was granted and does not answer"
-        if not silent:
-            self.mesh.suspicions.clear(sign)
-        elif await self.mesh.living(self.mesh.keys.alive_rc(rc), timeout=CONFIRM_TIMEOUT):
-            self.mesh.suspicions.suspect(sign)
-        else:  # there may be no link to it: but for so long?
-            self.mesh.suspicions.suspect(sign, patience=UNREACHED)
+        seen = silent and await self.mesh.living(self.mesh.keys.alive_rc(rc), timeout=CONFIRM_TIMEOUT)
+        # There may be no link to one that is not seen: but for so long?
+        patience = PATIENCE if seen else UNREACHED
+        self.mesh.suspicions.suspect(f"{rc} was granted and does not answer", so=silent, patience=patience)
 
     async def end(self, arc: OpenArc) -> None:
         """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed

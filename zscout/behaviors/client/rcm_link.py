@@ -16,8 +16,8 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
-from zscout.mesh.terms import promised_elsewhere
-from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd, of_the_last
+from zscout.mesh.terms import LastTerms
+from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd
 from zscout.types import NO_TERM, SECOND, Ns, Term
 
 QUERY_TIMEOUT = 1.0
@@ -28,11 +28,9 @@ BACKOFF = (0.05, 1.0)
 END_TRIES = 3
 TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full", "old_term"})
 CHECKS_PER_LEASE = 10
-SILENT_RCM: Final = "an RCM is seen that does not answer"
-NO_RCM: Final = "candidates are seen, and no RCM"
+"""How often within a hold lease a client checks whether an RCM published."""
 LEADERLESS: Final = 5.0
 """Seconds: longer than an election takes."""
-"""How often within a hold lease a client checks whether an RCM published."""
 
 
 class _TermOnly(msgspec.Struct, frozen=True):
@@ -58,7 +56,7 @@ class RcmLink:
         self._leaders: set[Token] = set()
         self._last_contact: Ns = mesh.now()
         self._stall = StallWatch(mesh.now)
-        self._catching_up: asyncio.Task[None] | None = None
+        self._last_terms = LastTerms(mesh, supervisor, self._learn, timeout=QUERY_TIMEOUT)
 
     def start(self) -> list[Declaration]:
         keys, mesh = self.mesh.keys, self.mesh
@@ -81,14 +79,13 @@ class RcmLink:
         """Whether what is of `term` counts; the highest term is kept. `above`: the fleet must go above one that an RC
         obeys already."""
         if term < self.term or absurd(term, self.term, heard=self._hears and not above):
-            if of_the_last(term, self.term) and (self._catching_up is None or self._catching_up.done()):
-                self._catching_up = self._supervisor.spawn(self._catch_up())
+            self._last_terms.shown(term, self.term)
             return False
         self.term = term
         return True
 
-    async def _catch_up(self) -> None:
-        self.term = max(self.term, await promised_elsewhere(self.mesh, timeout=QUERY_TIMEOUT))
+    def _learn(self, term: Term) -> None:
+        self.term = max(self.term, term)
 
     @property
     def _hears(self) -> bool:
@@ -147,22 +144,19 @@ class RcmLink:
     async def query(self, operation: Operation) -> Reply[Notice] | None:
         """An RCM's answer to an operation; None: none came, and it was carried out or not."""
         reply = await self.mesh.ask_one(self.key, operation, Notice, timeout=QUERY_TIMEOUT)
-        await self._look_at_silence(silent=reply is None)
+        await self._look_for_contradictions(silent=reply is None)
         return reply
 
-    async def _look_at_silence(self, *, silent: bool) -> None:
-        """An RCM that is seen or heard answers; where candidates are seen one leads before long."""
-        suspicions, heard = (
-            self.mesh.suspicions,
-            self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease // 2,
-        )
-        if not silent:
-            suspicions.clear(SILENT_RCM)
-            suspicions.clear(NO_RCM)
-        elif self.leader is not None or heard:
-            suspicions.suspect(SILENT_RCM)
-        elif await self.mesh.living(self.mesh.keys.alive_any(Role.CANDIDATE), timeout=QUERY_TIMEOUT):
-            suspicions.suspect(NO_RCM, patience=LEADERLESS)
+    async def _look_for_contradictions(self, *, silent: bool) -> None:
+        """An RCM that is seen or heard answers, and one that answers is heard; where candidates are seen one leads
+        before long."""
+        heard = self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease // 2
+        there, suspect = self.leader is not None or heard, self.mesh.suspicions.suspect
+        suspect("an RCM is seen that does not answer", so=silent and there)
+        suspect("an RCM answers that does not publish", so=not silent and not heard)
+        candidates = self.mesh.keys.alive_any(Role.CANDIDATE)
+        missed = silent and not there and await self.mesh.living(candidates, timeout=QUERY_TIMEOUT)
+        suspect("candidates are seen, and no RCM", so=bool(missed), patience=LEADERLESS)
 
     async def submit(self, arc: OpenArc) -> None:
         """Asks until the RCM has answered; not while the client is paused. Raises RequestRefused."""

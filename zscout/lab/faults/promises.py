@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from zscout.drivers.instances import InstanceState
 from zscout.scheduling.model import ArcStatus
 from zscout.scheduling.reason import ReasonCode
-from zscout.types import ArcId, Grant, Ns, Place, RcName, Term
+from zscout.types import ArcId, Grant, Ns, Place, Term
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
@@ -83,8 +83,7 @@ class Promises:
                     answer = self._answers.get((what["instances"].get(rc), str(what["term"])))
                     if grant[0] != what["term"] and answer is not None and str(grant) not in answer:
                         self._broken(f"{rc} is said to hold {grant} of before, and had answered that it does not")
-                    if str(grant) not in self._arc_of:
-                        self._granted(rc, str(grant), arc)
+                    self._arc_of[str(grant)] = arc
                     if arc in ended:
                         self._broken(f"{rc} is held by {arc}, which the same RCM has ended")
             return
@@ -106,14 +105,12 @@ class Promises:
         ended |= self._held.get(instance, set()) - held
         if again := held & ended:
             self._broken(f"{rc} holds {', '.join(sorted(again))} again")
+        for arc in (self._arc_of[grant] for grant in held - self._held.get(instance, set()) if grant in self._arc_of):
+            if not self.in_contradiction and self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
+                self._broken(f"{rc} is granted to {arc}, which its client has ended")
         self._held[instance] = held
         if what["do"] == "command" and str(what["grant"]) not in held:
             self._broken(f"{rc} obeyed a command under {what['grant']}, which it does not hold")
-
-    def _granted(self, rc: RcName, grant: str, arc: str) -> None:
-        self._arc_of[grant] = arc
-        if not self.in_contradiction and self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
-            self._broken(f"{rc} is granted to {arc}, which its client has ended")
 
     def forget_client(self, name: str) -> None:
         """It died: what it was promised was to that life."""

@@ -16,8 +16,8 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_instance
 from zscout.mesh import Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.mesh.terms import promised_elsewhere
-from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd, of_the_last
+from zscout.mesh.terms import LastTerms
+from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
@@ -61,7 +61,6 @@ class Candidate:
         self._changed = asyncio.Event()
         self._failures = 0
         self._again: asyncio.TimerHandle | None = None
-        self._catching_up: asyncio.Task[None] | None = None
 
     async def stop(self) -> None:
         if self._again is not None:
@@ -77,6 +76,7 @@ class Candidate:
         silence = max(4 * self.fleet.timing.heartbeat, round(self.fleet.mesh.lease * SECOND))
         self.election = Election(mesh.me.host, self.fleet.candidates, silence=silence, now=self._since)
         self._supervisor = Supervisor("the candidate", self._failed)
+        self._last_terms = LastTerms(mesh, self._supervisor, self._learn, timeout=self._timeout)
         guard = self._supervisor.guard
         try:
             self._candidacy.callback(self.ledger.stop)
@@ -134,9 +134,7 @@ class Candidate:
     def _see(self, term: Term, refused_by: RcName | None = None) -> bool:
         """False: it is absurd. A term for which an RC that is seen refuses a lower one is none."""
         heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, self.mesh.now())
-        if of_the_last(term, self.known):
-            if self._catching_up is None or self._catching_up.done():
-                self._catching_up = self._supervisor.spawn(self._catch_up())
+        if self._last_terms.shown(term, self.known):
             return False
         if absurd(term, self.known, heard=heard):
             if refused_by is None or absurd(term, self.known, heard=False):
@@ -144,8 +142,7 @@ class Candidate:
                 return False
             log.warning("%s obeys term %d: the fleet goes above", refused_by, term.counter)
             self._goes_above = True
-        if term > self.known:
-            self.known = term
+        self._learn(term)
         if self.rcm is not None and term > self.rcm.term:
             log.warning("stepping down: term %d of another RCM is above %d", term.counter, self.rcm.term.counter)
             self.election.deposed(self.mesh.now(), RANDOM.get().uniform(0.7, 1.3))
@@ -153,10 +150,8 @@ class Candidate:
             self._changed.set()
         return True
 
-    async def _catch_up(self) -> None:
-        term = await promised_elsewhere(self.mesh, timeout=self._timeout)
-        if term > self.known:
-            self.known = term
+    def _learn(self, term: Term) -> None:
+        self.known = max(self.known, term)
 
     # Leading
 

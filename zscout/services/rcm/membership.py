@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -18,24 +17,22 @@ from msgspec import Struct
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, Mesh
-from zscout.mesh.supervision import StallWatch, Supervisor
+from zscout.mesh.supervision import Supervisor
 from zscout.messages import ClientRequests, RcAsk, RcState
 from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
+from zscout.services.rcm.absence import Absence, Asked
 from zscout.services.rcm.recovery import gangs_of, recover
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
-AWAY: Final = 0.25
-"""A leader that stood still for this part of the mesh lease, or lost several peers within it, was away itself."""
 SEEK_EVERY: Final = 1.0
 """Seconds."""
 SEEK_TIMES: Final = 20
 MAX_SOUGHT: Final = 256
+"""How often who went without a token is asked, and of whom so many at a time."""
 DYING: Final = 0.003
 """Seconds within which all tokens of one link go."""
-MAX_ASKED: Final = 3
-"""Other hosts that are asked whether this one is away."""
 NEAR_END: Ns = SECOND // 20
 """A hold with less than this left may have ended at its RC already: clocks differ a little."""
 
@@ -71,11 +68,7 @@ class Membership:
         self.clients: dict[ClientId, set[str]] = {}
         """Instances alive of each client that has a token."""
         self._unseen: dict[ClientId, asyncio.TimerHandle] = {}
-        self._stall = StallWatch(mesh.now)
-        self._gone: deque[tuple[Ns, str]] = deque()
-        """Which hosts' last tokens went lately, and when."""
-        self._away_until: Ns = 0
-        """Until then what goes is only unseen: this leader was away itself, and takes its own lost links for theirs."""
+        self._absence = Absence(mesh, fleet.mesh.lease, supervisor, self._is_present)
         self._rc_tokens: dict[RcName, dict[str, Token]] = {}
         self._awaited: dict[RcName, Ns] = {}
         """RCs that clients hold, and no token of which was ever seen: since when that is known."""
@@ -116,7 +109,7 @@ class Membership:
     def watch(self) -> list[Declaration]:
         keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
         return [
-            Declaration(self._stall.start().stop),
+            self._absence.watch(),
             mesh.subscribe(keys.rc_state_any, RcState, guard(self._on_rc_state)),
             mesh.watch(keys.alive_any(Role.CLIENT), guard(self._on_client)),
             mesh.watch(keys.alive_any(Role.RC), guard(self._on_rc_token)),
@@ -181,42 +174,23 @@ class Membership:
             self._client_lost(client)
 
     def _is_away(self, token: Token) -> bool:
-        """Whether `token` may have gone because this leader was away: it stood still, or lost several hosts at once. Of
-        one host that goes it is not known for the moment that others take to answer."""
-        now, span = self.mesh.now(), round(AWAY * self._lease * SECOND)
-        if alone := not self._sees(token.host):
-            self._gone.append((now, token.host))
-        while self._gone and self._gone[0][0] < now - span:
-            self._gone.popleft()
-        stood_still = self._stall.fresh() and self._stall.length > span
-        if stood_still or len({host for _, host in self._gone}) > 1:
-            self._away_until = now + round(self._lease * SECOND)
-        elif alone and now >= self._away_until and (others := self._others(token.host)):
-            # Of several links that are lost, one is the first.
-            self._away_until = now + round(self._lease * SECOND)
+        """Whether `token` may have gone because this leader was away."""
+        if not self._absence.lasts:
             self._doubted.clear()
-            self._supervisor.spawn(self._ask_others(others))
-        return now < self._away_until
+        self._absence.token_went(token.host, last=not self._sees(token.host), others=partial(self._others, token.host))
+        return self._absence.lasts
 
-    def _others(self, gone: HostName) -> list[tuple[str, type[Struct]]]:
-        """Whom to ask on hosts other than this one and the one that is `gone`, and what they answer with."""
+    def _others(self, gone: HostName) -> list[Asked]:
+        """Where RCs and clients answer on hosts other than this one and the one that is `gone`: one of each host."""
         keys, here = self.mesh.keys, (gone, self.mesh.me.host)
-        rcs = {one.host: keys.rc_state(rc) for rc, tokens in self._rc_tokens.items() for one in tokens.values()}
-        clients = {(one := client_of(client)).host: keys.requests(one) for client in self.clients}
-        asked: dict[str, tuple[str, type[Struct]]] = {host: (key, ClientRequests) for host, key in clients.items()}
-        asked |= {host: (key, RcState) for host, key in rcs.items()}
-        return [asked[host] for host in sorted(asked) if host not in here][:MAX_ASKED]
+        clients = map(client_of, self.clients)
+        asked: dict[HostName, Asked] = {one.host: (keys.requests(one), ClientRequests) for one in clients}
+        tokens = [token for of_rc in self._rc_tokens.values() for token in of_rc.values()]
+        asked |= {one.host: (keys.rc_state(one.name), RcState) for one in tokens}
+        return [asked[host] for host in sorted(asked) if host not in here]
 
-    async def _ask_others(self, others: list[tuple[str, type[Struct]]]) -> None:
-        """If anybody else answers, this leader is not away, and what went has gone."""
-        timeout = AWAY * self._lease
-        await asyncio.gather(*(self._ask_other(key, kind, timeout) for key, kind in others))
-
-    async def _ask_other(self, key: str, kind: type[Struct], timeout: float) -> None:
-        reply = await self.mesh.ask_one(key, RcAsk(), kind, timeout=timeout)
-        if reply is None or self._stall.fresh() or len({host for _, host in self._gone}) > 1:
-            return
-        self._away_until = 0
+    def _is_present(self) -> None:
+        """This leader was not away: what went has gone."""
         doubted, self._doubted = self._doubted, set()
         for client in sorted(doubted):
             if timer := self._unseen.pop(client, None):
@@ -252,7 +226,7 @@ class Membership:
             reply = await self.mesh.ask_one(key, RcAsk(), kind, timeout=self._timeout)
             if reply is not None and not is_seen():
                 self.mesh.suspicions.suspect(sign)
-        self.mesh.suspicions.clear(sign)
+        self.mesh.suspicions.suspect(sign, so=False)
         del self._sought[key]
 
     # RCs

@@ -271,11 +271,7 @@ class Rcm:
         self, rc: RcName, proposal: int, overdue: asyncio.TimerHandle, reply: Reply[messages.Ballot] | None
     ) -> None:
         overdue.cancel()
-        sign = f"{rc} is seen and does not vote"
-        if reply is None:
-            self.mesh.suspicions.suspect(sign)
-        else:
-            self.mesh.suspicions.clear(sign)
+        self.mesh.suspicions.suspect(f"{rc} is seen and does not vote", so=reply is None)
         ballot = reply.message if reply is not None else None
         if ballot is not None and ballot.proposal == proposal:
             self._receive(Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON]))
