@@ -41,6 +41,8 @@ LOOK_PERIOD = 1.0
 """Seconds between two looks at whether leaders that are seen are heard, and ask."""
 FIGURES_PERIOD = 1.0
 """Seconds between two publications of changed figures."""
+SAY_AGAIN = 10.0
+"""Seconds after which an RC publishes its state though nothing has changed: who missed a change hears of it then."""
 
 CommandQuery: TypeAlias = IncomingQuery[messages.Command]
 
@@ -136,6 +138,8 @@ class ResourceController:
         self._reading: asyncio.Task[None] | None = None
         self._missed = False
         """Something was missed that has not been read since."""
+        self._published: Ns = 0
+        """When it published its state last."""
         self._timer: asyncio.TimerHandle | None = None
         self._stopping: asyncio.Task[None] | None = None
 
@@ -216,6 +220,7 @@ class ResourceController:
         self.publish()
 
     def publish(self, ended: list[messages.EndedHold] | None = None) -> None:
+        self._published = self.mesh.now()
         self._state.put(self._rc_state(ended or []))
 
     # What the RCM sends
@@ -469,7 +474,7 @@ class ResourceController:
         while True:
             published = self.driver.figures()
             await asyncio.sleep(FIGURES_PERIOD)
-            if self.driver.figures() != published:
+            if self.driver.figures() != published or self.mesh.now() - self._published > SAY_AGAIN * SECOND:
                 self.publish()
 
     async def _keep_looking(self) -> None:

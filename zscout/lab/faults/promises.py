@@ -55,8 +55,8 @@ class Promises:
         """By ARC: (term, step) of the newest that its client was told."""
         self._arc_of: dict[str, str] = {}
         """By grant that was published: the ARC that it was for."""
-        self.in_contradiction = False
-        """Whether links have come back without all declarations: what a client ends may not reach who leads."""
+        self._unheard = False
+        """Whether what a client ends may not reach who leads, nor what that one grants the client."""
         self._ended_by: dict[str, set[str]] = {}
         """By term: ARCs that its RCM has ended for good."""
         self._over: dict[str, float] = {}
@@ -106,11 +106,17 @@ class Promises:
         if again := held & ended:
             self._broken(f"{rc} holds {', '.join(sorted(again))} again")
         for arc in (self._arc_of[grant] for grant in held - self._held.get(instance, set()) if grant in self._arc_of):
-            if not self.in_contradiction and self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
+            if not self._unheard and self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
                 self._broken(f"{rc} is granted to {arc}, which its client has ended")
         self._held[instance] = held
         if what["do"] == "command" and str(what["grant"]) not in held:
             self._broken(f"{rc} obeyed a command under {what['grant']}, which it does not hold")
+
+    def unheard(self, *, lasts: bool) -> None:
+        """Links have come back without all declarations, or no notices arrive; or that is over."""
+        if self._unheard and not lasts:
+            self._over = dict.fromkeys(self._over, self._now())
+        self._unheard = lasts
 
     def forget_client(self, name: str) -> None:
         """It died: what it was promised was to that life."""

@@ -423,7 +423,7 @@ class Simulation:
                 self._cut()
                 end = lambda: self._come_back(pairs)  # noqa: E731
         self.present.append(fault)
-        self.promises.in_contradiction |= fault.kind == "forget"
+        self._look_who_hears()
         self.loop.call_later(fault.lasts, self._end, fault, end)
 
     def _each(self, rcs: Mapping[str, ResourceController], call: Callable[[ResourceController], None]) -> None:
@@ -440,8 +440,11 @@ class Simulation:
 
     def _forget_fault(self, fault: Fault) -> None:
         self.present.remove(fault)
-        self.promises.in_contradiction = any(fault.kind == "forget" for fault in self.present)
+        self._look_who_hears()
         self.calm_since = self.loop.now
+
+    def _look_who_hears(self) -> None:
+        self.promises.unheard(lasts=any(fault.kind == "forget" or fault.message == "notice" for fault in self.present))
 
     def _kill(self, name: str) -> None:
         self.end_process(name)
