@@ -138,7 +138,7 @@ class ResourceController:
         self._reading: asyncio.Task[None] | None = None
         self._missed = False
         """Something was missed that has not been read since."""
-        self._published: Ns = 0
+        self._published = mesh.now()
         """When it published its state last."""
         self._timer: asyncio.TimerHandle | None = None
         self._stopping: asyncio.Task[None] | None = None

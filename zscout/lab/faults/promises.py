@@ -56,7 +56,7 @@ class Promises:
         self._arc_of: dict[str, str] = {}
         """By grant that was published: the ARC that it was for."""
         self._unheard = False
-        """Whether what a client ends may not reach who leads, nor what that one grants the client."""
+        """Whether what clients end may not reach who leads."""
         self._ended_by: dict[str, set[str]] = {}
         """By term: ARCs that its RCM has ended for good."""
         self._over: dict[str, float] = {}
@@ -113,7 +113,7 @@ class Promises:
             self._broken(f"{rc} obeyed a command under {what['grant']}, which it does not hold")
 
     def unheard(self, *, lasts: bool) -> None:
-        """Links have come back without all declarations, or no notices arrive; or that is over."""
+        """What clients end may not reach who leads, nor what that one grants them; or it does again."""
         if self._unheard and not lasts:
             self._over = dict.fromkeys(self._over, self._now())
         self._unheard = lasts

@@ -444,7 +444,7 @@ class Simulation:
         self.calm_since = self.loop.now
 
     def _look_who_hears(self) -> None:
-        self.promises.unheard(lasts=any(fault.kind == "forget" or fault.message == "notice" for fault in self.present))
+        self.promises.unheard(lasts=any(_hides_ends(fault) for fault in self.present))
 
     def _kill(self, name: str) -> None:
         self.end_process(name)
@@ -483,6 +483,11 @@ class Simulation:
     def _cut(self) -> None:
         cuts = +self.cuts
         self.network.cut_where(lambda one, other: (one.split("/")[0], other.split("/")[0]) in cuts)
+
+
+def _hides_ends(fault: Fault) -> bool:
+    """Whether what a client ends may not reach who leads, nor what that one grants the client."""
+    return fault.kind == "forget" or (fault.kind == "disturb" and fault.message in ("notice", "schedule"))
 
 
 class _Lines(logging.Handler):
