@@ -51,6 +51,27 @@ def test_a_grant_is_published_then_the_loser_is_told_then_the_asker_is_answered(
     run(story())
 
 
+def test_who_missed_how_its_hold_ended_is_told_when_it_asks_again() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        robot = fleet.rc("robot/a")
+        await fleet.joined(robot)
+        survey, operator = fleet.client("survey"), fleet.client("operator")
+        held = grant_of(await survey.ask("survey", "robot/a"))
+        await operator.ask("drive", "robot/a", priority=10)
+        told = await survey.ask("survey", "robot/a", grant=held)
+        assert (told.state, told.outcome, told.by) == ("queued", "preempted", "desk/operator/drive")
+        # Of a grant that it can't know nothing is known but that it is none.
+        other = Grant(Term(1, "another"), 7)
+        assert (await survey.ask("survey", "robot/a", grant=other)).outcome == "lost"
+        await operator.do(Release("drive"))
+        await until(lambda: survey.notices[-1].state == "running")
+        assert (await survey.ask("survey", "robot/a", grant=held)).outcome is None
+
+    run(story())
+
+
 def test_what_arrives_in_one_burst_is_one_instant_and_ends_come_first() -> None:
     async def story() -> None:
         fleet = FakeFleet()

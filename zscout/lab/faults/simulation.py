@@ -38,7 +38,7 @@ from zscout.mesh.supervision import StallWatch
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
-from zscout.types import SECOND
+from zscout.types import SECOND, Grant
 
 T = TypeVar("T")
 
@@ -353,26 +353,43 @@ class Simulation:
     async def _client(self, name: str, mesh: MemoryMesh) -> None:
         client = self.programs[name] = Client(mesh, self.fleet).start()
         busy = self.busy[name] = set()
+        began: dict[str, tuple[Grant | None, float]] = {}
+        """By ARC: its last grant, and since when it was known here."""
 
         def watch(arc: OpenArc) -> None:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
-            self.promises.told(name, arc, client.term, touched=self._touched(name, *arc.rcs, *arc.needs))
+            grant, since = began.get(arc.id, (None, 0.0))
+            self.promises.told(name, arc, client.term, touched=self._touched(since, name, *arc.rcs, *arc.needs))
+            if arc.grant is not None and arc.grant != grant:
+                began[arc.id] = arc.grant, self.loop.now - START
 
         client.watch(watch)
         await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
 
     # Faults
 
-    def _touched(self, *whom: str) -> bool:
-        """Whether a fault may be felt by these processes and RCs: one of now, or one that was over lately."""
+    def _touched(self, since: float, *whom: str) -> bool:
+        """Whether a fault may be felt by these processes and RCs: one of now, or one that was over lately. What began
+        (`since`) while hosts were apart may be the grant of a leader that does not see all of its RCs yet."""
         names = {*whom, *(self.where[rc] for rc in whom if rc in self.where)}
+        hosts = {name.split("/")[0] for name in names} & {*self.hosts}
         lately = self.loop.now - START - FELT
         faults = [
             fault
             for fault in self.faults
             if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
-        return any(fault.kind not in OF_ONE or names & {*fault.whom} for fault in faults)
+        return any(
+            names & {*fault.whom} if fault.kind in OF_ONE else self._parts(fault, hosts, since) for fault in faults
+        )
+
+    def _parts(self, fault: Fault, hosts: set[str], since: float) -> bool:
+        """Whether it may part these hosts from one another, or from every candidate."""
+        if fault.kind not in ("isolate", "part") or since > fault.at:
+            return True
+        side = hosts & {*fault.whom}
+        there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
+        return bool(side and hosts - side) or not there & {*self.candidates_at}
 
     def _begin(self, fault: Fault) -> None:
         self.log(f"FAULT {fault}")

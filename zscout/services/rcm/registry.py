@@ -21,7 +21,7 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.reason import Reason
-from zscout.types import SECOND, ArcId, ClientId, Ns, Term
+from zscout.types import SECOND, ArcId, ClientId, Grant, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +74,8 @@ class RequestRegistry:
         """The number of the last notice."""
         self._names: dict[ArcId, str] = {}
         self._ended: OrderedDict[ArcId, tuple[Ns, Notice]] = OrderedDict()
+        self._interrupted: dict[ArcId, Notice] = {}
+        """How the last hold of each queued ARC ended here."""
         self._estimated: set[ArcId] = set()
         """ARCs whose notices say when they will start."""
         self._changed: dict[ArcId, None] = {}
@@ -140,6 +142,14 @@ class RequestRegistry:
             starts_in=self._starts_in(arc),
         )
 
+    def interrupted(self, arc: ArcId, believed: Grant) -> Notice:
+        """The present state of a queued request whose client believes in a hold: with how that ended, or as lost where
+        no RC, or not all of them, had it."""
+        notice, ending = self.notice(arc), self._interrupted.get(arc)
+        if ending is None or ending.grant != believed:
+            return replace(notice, outcome=Outcome.LOST)
+        return replace(notice, outcome=ending.outcome, by=ending.by, reason=ending.reason, why=ending.why)
+
     def handed_over(self, arc: ArcId, name: str) -> Notice:
         """That a request goes on in another client, where no more than that is known."""
         reason = "handed over to another client"
@@ -164,6 +174,7 @@ class RequestRegistry:
             match effect:
                 case Granted(arc=arc, rcs=rcs):
                     self.record(arc, f"granted {', '.join(rcs)}")
+                    self._interrupted.pop(arc, None)
                     # One that ended in the same instant is told of that alone: see below.
                     if arc not in answered and self._core.arc(arc) is not None:
                         self._put(self.notice(arc))
@@ -208,6 +219,8 @@ class RequestRegistry:
         notice = self._notice(effect.arc, "queued" if requeued else "ended", **details)
         if arc is None:
             self._remember(effect.arc, notice)
+        elif requeued:
+            self._interrupted[effect.arc] = notice
         return notice
 
     def _remember(self, arc: ArcId, notice: Notice) -> None:
@@ -215,6 +228,7 @@ class RequestRegistry:
         if trace.enabled() and notice.outcome in FINAL:
             trace.write(now, "over", term=self._term, arc=arc)
         self._names.pop(arc, None)
+        self._interrupted.pop(arc, None)
         self._estimated.discard(arc)
         self._ended[arc] = (now + REMEMBER, notice)
         self._ended.move_to_end(arc)

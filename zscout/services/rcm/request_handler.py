@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TypeAlias
 
-from msgspec.structs import replace
-
 from zscout.config.fleet import Fleet, RcmLimits
 from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
@@ -134,7 +132,7 @@ class RequestHandler:
                 self._emit(PlaceShown(arc, ask.place))
             if ask.grant is not None and ask.unconfirmed:
                 self._emit(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
-            query.answer(self._lost(arc) if self._may_hold(arc, ask) else self._registry.notice(arc))
+            query.answer(self._standing(arc, ask))
         elif self._registry.ended(arc) and not self._registry.reopens(arc):
             query.answer(self._registry.notice(arc))
         elif self._goes_on_elsewhere(ask):
@@ -148,7 +146,7 @@ class RequestHandler:
             if self._may_hold(arc, ask):
                 # It ends what it began under that grant before anybody is asked for a vote.
                 self._emit(Requested(request, ask.place, since))
-                query.answer(self._lost(arc))
+                query.answer(self._standing(arc, ask))
             else:
                 self._gather(query, arc, Requested(request, ask.place, since))
 
@@ -158,10 +156,11 @@ class RequestHandler:
         unknown = ask.grant is not None and ask.grant.term < self.core.term and not ask.unconfirmed
         return unknown and (known is None or known.hold is None) and not self._registry.ended(arc)
 
-    def _lost(self, arc: ArcId) -> Notice:
-        """How an ARC stands whose last hold nobody here knows: no RC, or not all of them, had it."""
-        notice = self._registry.notice(arc)
-        return replace(notice, outcome=Outcome.LOST) if notice.state == "queued" else notice
+    def _standing(self, arc: ArcId, ask: Ask) -> Notice:
+        """How an open ARC stands, for a client that may not have heard how its last hold ended."""
+        if ask.grant is not None and not ask.unconfirmed and self.core.is_queued(arc):
+            return self._registry.interrupted(arc, ask.grant)
+        return self._registry.notice(arc)
 
     def _resume(self) -> None:
         """Looks again at what was asked by clients that believe to hold."""
