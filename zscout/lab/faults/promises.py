@@ -31,8 +31,6 @@ TERMS_WITHIN: Final = 10.0
 """Seconds in which no more terms begin: two faults at one time cost one or two each."""
 UNLED: Final = 0.5
 """Seconds beyond the hold lease after which an RC that hears no RCM is held by nobody."""
-GIVEN_BACK: Final = 3.0
-"""Seconds after which no RC is granted any more to an ARC that its client has ended."""
 LEFT_OVER: Final = 7.0
 """Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
 
@@ -55,12 +53,10 @@ class Promises:
         """By ARC: (term, step) of the newest that its client was told."""
         self._arc_of: dict[str, str] = {}
         """By grant that was published: the ARC that it was for."""
-        self._unheard = False
-        """Whether what clients end may not reach who leads."""
         self._ended_by: dict[str, set[str]] = {}
         """By term: ARCs that its RCM has ended for good."""
-        self._over: dict[str, float] = {}
-        """ARCs that their clients have ended, and when."""
+        self._over: set[str] = set()
+        """ARCs that their clients have ended."""
         self._places: dict[tuple[str, str], Place] = {}
         self._heard: dict[str, tuple[Any, int]] = {}
         """By instance of an RC: the newest (term, seq)."""
@@ -105,18 +101,9 @@ class Promises:
         ended |= self._held.get(instance, set()) - held
         if again := held & ended:
             self._broken(f"{rc} holds {', '.join(sorted(again))} again")
-        for arc in (self._arc_of[grant] for grant in held - self._held.get(instance, set()) if grant in self._arc_of):
-            if not self._unheard and self._now() - self._over.get(arc, self._now()) > GIVEN_BACK:
-                self._broken(f"{rc} is granted to {arc}, which its client has ended")
         self._held[instance] = held
         if what["do"] == "command" and str(what["grant"]) not in held:
             self._broken(f"{rc} obeyed a command under {what['grant']}, which it does not hold")
-
-    def unheard(self, *, lasts: bool) -> None:
-        """What clients end may not reach who leads, nor what that one grants them; or it does again."""
-        if self._unheard and not lasts:
-            self._over = dict.fromkeys(self._over, self._now())
-        self._unheard = lasts
 
     def forget_client(self, name: str) -> None:
         """It died: what it was promised was to that life."""
@@ -131,9 +118,9 @@ class Promises:
             self._broken(f"{name} {arc.name} believes {arc.last} after {max(known, (term, 0))}")
         self._told[full] = max(arc.last, known)
         if arc.open:
-            self._over.pop(full, None)
+            self._over.discard(full)
         else:
-            self._over.setdefault(full, self._now())
+            self._over.add(full)
         if arc.outcome == "lost" and arc.reason.startswith("the RCM refuses it"):
             self._broken(f"{name} {arc.name} was taken, and then refused: {arc.reason}")
         # A grant that was not confirmed is no hold that was lost: it never was one.
@@ -169,6 +156,7 @@ class Promises:
                 *_worse_places(clients, leaders),
                 *_doubles(rcs),
                 *_at_odds(leaders, rcs),
+                *self._given_up(rcs),
             )
             lasting |= dict.fromkeys(come_right, COME_RIGHT)
         self._since = {key: self._since.get(key, self._now()) for key in lasting}
@@ -193,6 +181,12 @@ class Promises:
             if not arc.needs.keys() & sharable and (arc.reported is None or arc.reported.code is ReasonCode.HELD)
         }
 
+    def _given_up(self, rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
+        for rc in rcs.values():
+            for grant in rc.holds.held:
+                if (arc := self._arc_of.get(_written(grant))) in self._over:
+                    yield rc.name, "is held by", arc, "which its client has ended"
+
     def at_end(self, clients: Mapping[str, Client], leaders: Mapping[str, Rcm]) -> None:
         """Everything was served, and `LEFT_OVER` is over."""
         begun = sorted(self.terms.values())
@@ -207,6 +201,11 @@ class Promises:
             left = {arc.id for arc in (*state.running, *state.queued)} | requests.waiting.keys() | requests.given_up
             if left:
                 self._broken(f"the leader on {host} still keeps {', '.join(sorted(left))}")
+
+
+def _written(grant: Grant) -> str:
+    """As a trace has it."""
+    return str([[*grant.term], grant.seq])
 
 
 def _rank(arc: ArcStatus) -> Rank:

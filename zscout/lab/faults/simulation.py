@@ -440,7 +440,6 @@ class Simulation:
                 self._cut()
                 end = lambda: self._come_back(pairs)  # noqa: E731
         self.present.append(fault)
-        self._look_who_hears()
         self.loop.call_later(fault.lasts, self._end, fault, end)
 
     def _each(self, rcs: Mapping[str, ResourceController], call: Callable[[ResourceController], None]) -> None:
@@ -457,11 +456,7 @@ class Simulation:
 
     def _forget_fault(self, fault: Fault) -> None:
         self.present.remove(fault)
-        self._look_who_hears()
         self.calm_since = self.loop.now
-
-    def _look_who_hears(self) -> None:
-        self.promises.unheard(lasts=any(_hides_ends(fault) for fault in self.present))
 
     def _kill(self, name: str) -> None:
         self.end_process(name)
@@ -500,11 +495,6 @@ class Simulation:
     def _cut(self) -> None:
         cuts = +self.cuts
         self.network.cut_where(lambda one, other: (one.split("/")[0], other.split("/")[0]) in cuts)
-
-
-def _hides_ends(fault: Fault) -> bool:
-    """Whether what a client ends may not reach who leads, nor what that one grants the client."""
-    return fault.kind == "forget" or (fault.kind == "disturb" and fault.message in ("notice", "schedule"))
 
 
 class _Lines(logging.Handler):
