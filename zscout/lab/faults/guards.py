@@ -12,9 +12,10 @@ from typing import Any, Final, NamedTuple
 
 from msgspec.structs import replace
 
-from zscout.behaviors.client.client import Client
+from zscout.behaviors.client import rcm_link
 from zscout.behaviors.client.rcm_link import RcmLink
 from zscout.behaviors.client.request import OpenArc
+from zscout.drivers import holds
 from zscout.drivers.holds import HoldChange, HoldEntry, HoldTable
 from zscout.drivers.instances import Instances
 from zscout.drivers.resource_controller import ResourceController
@@ -25,7 +26,6 @@ from zscout.services.rcm.election import Election
 from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.registry import RequestRegistry
-from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import NO_TERM, Grant, Ns, Term
 
 ABSENT: Final = object()
@@ -104,8 +104,8 @@ async def _never(*_: object) -> None:
     await asyncio.Event().wait()
 
 
-async def _enter_at_once(*_: object) -> list[Any]:
-    return []
+async def _do_nothing(*_: object) -> None:
+    pass
 
 
 def _without_place(self: OpenArc, now: Ns, grant: Grant | None) -> dict[str, Any]:
@@ -162,11 +162,13 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "shown": Guard("a worse place is set right", {(OpenArc, "shows_place"): _no}),
         "notices": Guard("of two notices the newer counts", {(OpenArc, "take"): _take_any}),
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
+        "absurd": Guard(
+            "nobody believes a term far above the fleet's",
+            {(holds, "absurd"): _no, (rcm_link, "absurd"): _no, (candidate, "absurd"): _no},
+        ),
         "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
-        "believed": Guard("a client is told of a grant that no RC knows", {(RequestHandler, "_may_hold"): _no}),
-        "confirmed": Guard("a body is entered when all RCs confirm", {(Client, "_confirm"): _enter_at_once}),
         "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),
-        "withdrawn": Guard("what nobody asks for is given back", {(RcmLink, "_withdraw"): _enter_at_once}),
+        "withdrawn": Guard("what nobody asks for is given back", {(RcmLink, "give_back"): _do_nothing}),
     }
 )
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from zscout.lab.faults.memory import Disturbance
+from zscout.messages import MAX_COUNTER
 
 FaultKind: TypeAlias = Literal[
-    "freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "forget", "double", "fail"
+    "freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "forget", "double", "fail", "forge"
 ]
 
 KINDS: tuple[FaultKind, ...] = (
@@ -24,9 +25,12 @@ KINDS: tuple[FaultKind, ...] = (
     "double",
     "forget",
     "fail",
+    "forge",
 )
 LASTING, SHARES = ((0.5, 1.5), (0.05, 3.0), (3.0, 8.0)), (7, 2, 1)
 """Seconds, and how often: about a lease is the worst there is; longer than the hold lease is seldom."""
+JUMPS = (3, 10_000_000, MAX_COUNTER)
+"""How far a forged term is above the fleet's: it is believed; it is absurd; it is the last there is, at most."""
 HEALED = 45.0
 RELINK = 1.0
 """Seconds after which links that were lost stand again, at most."""
@@ -47,6 +51,7 @@ class Fault:
     """Of a cut: in both directions. Of a double: it leaves in order."""
     message: str = ""
     how: Disturbance = field(default_factory=Disturbance)
+    jump: int = 0
 
     @property
     def felt(self) -> float:
@@ -65,6 +70,7 @@ class Fault:
             "disturb": f"disturbed: {self.message} {self.how}",
             "double": "offers it as well",
             "fail": "fails, and works again",
+            "forge": f"has a stranger that says to lead in a term {self.jump} higher",
             "forget": "is cut off, and its links come back without all that was declared",
         }[self.kind]
         return f"{self.at:7.3f} for {self.lasts:.3f} s: {' '.join(self.whom)} {what}"
@@ -86,7 +92,7 @@ def draw(
                 whom = (rng.choice(processes),)
             case "cut":
                 whom = tuple(rng.sample(hosts, 2))
-            case "isolate":
+            case "isolate" | "forge":
                 whom = (rng.choice(hosts),)
             case "forget":
                 whom, lasts = (rng.choice(hosts),), 1 + lasts
@@ -106,5 +112,5 @@ def draw(
                 by=rng.choice((0.05, 0.5, 2.0)),
                 old=rng.choice((0, 0, 0.2)),
             )
-        faults.append(Fault(at, lasts, kind, whom, rng.random() < 0.7, rng.choice(MESSAGES), how))
+        faults.append(Fault(at, lasts, kind, whom, rng.random() < 0.7, rng.choice(MESSAGES), how, rng.choice(JUMPS)))
     return sorted(faults, key=lambda fault: fault.at)

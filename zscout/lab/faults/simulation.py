@@ -35,10 +35,11 @@ from zscout.lab.faults.programs import Work
 from zscout.lab.faults.promises import LEFT_OVER, Promises
 from zscout.lab.faults.virtual_time import PROCESS, START, Process, VirtualTimeLoop
 from zscout.mesh.supervision import StallWatch
+from zscout.messages import MAX_COUNTER, Grants
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
-from zscout.types import SECOND, Grant
+from zscout.types import SECOND, Grant, Term
 
 T = TypeVar("T")
 
@@ -62,6 +63,7 @@ IMPATIENCE: Final = 0.25
 FORGOTTEN: Final = 0.3
 """Of what was declared, where links come back without all of it."""
 LOOK_EVERY: Final = 0.05
+FORGED_EVERY: Final = 0.25
 OPERATOR: Final = "h0/operator"
 
 
@@ -347,6 +349,14 @@ class Simulation:
         await rc.stop()
         self.rcs.pop(f"{mesh.me} {name}", None)
 
+    async def _forge(self, mesh: MemoryMesh, jump: int) -> None:
+        """Publishes as an RCM, of which nobody sees a token."""
+        highest = max((term.counter for term in self.promises.terms), default=0)
+        term = Term(min(highest + jump, MAX_COUNTER), new_instance())
+        while True:
+            mesh.put(mesh.keys.grants, Grants(term, 1, 1, FORGED_EVERY, {}, []))
+            await asyncio.sleep(FORGED_EVERY)
+
     def _on_failure(self, error: Exception) -> None:
         self.broken(f"a service failed: {error!r}")
 
@@ -430,6 +440,11 @@ class Simulation:
                 process, mesh = self.open_process(name)
                 process.main = process.run(asyncio.create_task, self._guard(self._spare(rc, mesh, leaves)))
                 end = leaves.set if fault.both else lambda: self._kill_spare(name, rc)
+            case "forge":
+                name = f"{fault.whom[0]}/stranger{self.result.counts['faults']}"
+                process, mesh = self.open_process(name)
+                process.main = process.run(asyncio.create_task, self._forge(mesh, fault.jump))
+                end = lambda: self.end_process(name)  # noqa: E731
             case "fail":
                 failing = {key: rc for key, rc in self.rcs.items() if rc.name == fault.whom[0]}
                 self._each(failing, lambda rc: rc.fail("its device failed"))
