@@ -455,6 +455,7 @@ class Simulation:
                 self._cut()
                 end = lambda: self._come_back(pairs)  # noqa: E731
         self.present.append(fault)
+        self._look_who_is_heard()
         self.loop.call_later(fault.lasts, self._end, fault, end)
 
     def _each(self, rcs: Mapping[str, ResourceController], call: Callable[[ResourceController], None]) -> None:
@@ -471,7 +472,12 @@ class Simulation:
 
     def _forget_fault(self, fault: Fault) -> None:
         self.present.remove(fault)
+        self._look_who_is_heard()
         self.calm_since = self.loop.now
+
+    def _look_who_is_heard(self) -> None:
+        disturbed = [fault for fault in self.present if fault.kind == "disturb" and fault.message == "grants"]
+        self.promises.unheard = any(fault.how.lost == 1 for fault in disturbed)
 
     def _kill(self, name: str) -> None:
         self.end_process(name)
