@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Literal, TypeAlias
 
 from zscout.lab.faults.memory import Disturbance
@@ -14,23 +15,28 @@ FaultKind: TypeAlias = Literal[
     "freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "forget", "double", "fail", "forge"
 ]
 
-KINDS: tuple[FaultKind, ...] = (
-    "freeze",
-    "stall",
-    "kill",
-    "cut",
-    "isolate",
-    "part",
-    "disturb",
-    "double",
-    "forget",
-    "fail",
-    "forge",
+KINDS: Mapping[FaultKind, int] = MappingProxyType(
+    {
+        "freeze": 3,
+        "stall": 3,
+        "kill": 2,
+        "cut": 2,
+        "isolate": 2,
+        "part": 2,
+        "disturb": 3,
+        "double": 1,
+        "forget": 1,
+        "fail": 1,
+        "forge": 1,
+    }
 )
+"""And how often each is drawn."""
 LASTING, SHARES = ((0.5, 1.5), (0.05, 3.0), (3.0, 8.0)), (7, 2, 1)
 """Seconds, and how often: about a lease is the worst there is; longer than the hold lease is seldom."""
 JUMPS = (3, 10_000_000, MAX_COUNTER)
 """How far a forged term is above the fleet's: it is believed; it is absurd; it is the last there is, at most."""
+LONGER = 1.0
+"""Seconds for which hosts are apart besides, at most: so that both sides have a leader."""
 HEALED = 45.0
 RELINK = 1.0
 """Seconds after which links that were lost stand again, at most."""
@@ -81,27 +87,32 @@ def draw(
 ) -> list[Fault]:
     """`count` faults within `span` seconds, most of them 0.5 to 1.5 s long: about a lease, the worst there is."""
     rng = random.Random(f"faults {seed}")  # noqa: S311 - what failed once must fail again
+    nodes = [name for name in processes if name.endswith("/node")]
     faults = []
     for _ in range(count):
         at = 3.0 + rng.random() * (span - 3.0)
         lasts = rng.uniform(*rng.choices(LASTING, SHARES)[0])
-        kind = rng.choice(KINDS)
+        kind = rng.choices(tuple(KINDS), tuple(KINDS.values()))[0]
         whom: tuple[str, ...] = ()
+        apart = lasts + LONGER * rng.random()
         match kind:
             case "freeze" | "stall" | "kill":
-                whom = (rng.choice(processes),)
+                # One of them leads, and that is felt most.
+                whom = (rng.choice(nodes if rng.random() < 0.5 else processes),)
             case "cut":
                 whom = tuple(rng.sample(hosts, 2))
-            case "isolate" | "forge":
+            case "forge":
                 whom = (rng.choice(hosts),)
+            case "isolate":
+                whom, lasts = (rng.choice(hosts),), apart
             case "forget":
-                whom, lasts = (rng.choice(hosts),), 1 + lasts
+                whom, lasts = (rng.choice(hosts),), LONGER + lasts
             case "fail":
                 whom = (rng.choice(rcs),)
             case "double":
                 whom, lasts = (rng.choice(rcs), rng.choice(hosts)), 5 * lasts
             case "part":
-                whom = tuple(sorted(rng.sample(hosts, rng.randrange(1, len(hosts)))))
+                whom, lasts = tuple(sorted(rng.sample(hosts, rng.randrange(1, len(hosts))))), apart
         how = Disturbance()
         if kind == "disturb":
             lasts *= 3
