@@ -56,8 +56,6 @@ SERVED_WITHIN: Final = 60.0
 """Seconds after the last fault in which all that was asked must have been served."""
 FELT: Final = 5.0
 """Seconds for which a fault may be felt when it is over: links come back, and holds that were lost are told of."""
-OF_ONE: Final = ("freeze", "stall", "kill", "fail", "double")
-"""Kinds of faults that only those feel whom they name."""
 IMPATIENCE: Final = 0.25
 """Part of the lease before whose end a link may be given up already, as Zenoh does."""
 FORGOTTEN: Final = 0.3
@@ -391,17 +389,24 @@ class Simulation:
             for fault in self.faults
             if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
-        return any(
-            names & {*fault.whom} if fault.kind in OF_ONE else self._parts(fault, hosts, since) for fault in faults
-        )
+        return any(self._touches(fault, names, hosts, since) for fault in faults)
 
-    def _parts(self, fault: Fault, hosts: set[str], since: float) -> bool:
-        """Whether it may part these hosts from one another, or from every candidate."""
-        if fault.kind not in ("isolate", "part") or since > fault.at:
-            return True
-        side = hosts & {*fault.whom}
-        there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
-        return bool(side and hosts - side) or not there & {*self.candidates_at}
+    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float) -> bool:
+        lease = self.fleet.mesh.lease
+        # Of a leader's links some are lost and some are not: nobody can tell that from a host that goes.
+        in_part = (1 - IMPATIENCE) * lease <= fault.lasts <= lease
+        match fault.kind:
+            case "stall" | "kill" | "fail" | "double":
+                return bool(names & {*fault.whom})
+            case "freeze":
+                return in_part or bool(names & {*fault.whom})
+            case "isolate" | "part":
+                side = hosts & {*fault.whom}
+                there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
+                parted = bool(side and hosts - side) or not there & {*self.candidates_at}
+                return in_part or parted or since > fault.at
+            case _:
+                return True
 
     def _begin(self, fault: Fault) -> None:
         self.log(f"FAULT {fault}")
