@@ -254,12 +254,15 @@ class Core:
         self._votes.forget_rc(name)
 
     def _show_place(self, arc_id: ArcId, place: Place) -> None:
-        arc = self._state.queued.get(arc_id)
-        if arc is not None and place < arc.place:
+        arc = self._state.arc(arc_id)
+        if arc is not None and arc.hold is None and place < arc.place:
+            held_back = arc.held_back
             self._state.dequeue(arc)
             arc.place = place
             arc.take(arc.request)
             self._state.enqueue(arc, arc.since)
+            if held_back is not None:
+                self._state.hold_back(arc, *held_back)
 
     def _not_confirmed(self, arc_id: ArcId, grant: Grant, rcs: tuple[RcName, ...]) -> None:
         """That hold ends, and no other. Its ARC keeps its place, and is held back, longer each time in a row."""
