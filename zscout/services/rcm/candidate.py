@@ -24,7 +24,7 @@ from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import take_over
-from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
+from zscout.types import NO_TERM, SECOND, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -131,16 +131,16 @@ class Candidate:
         self.election.candidate(token.host, alive=alive, now=self.mesh.now())
         self._changed.set()
 
-    def _see(self, term: Term, refused_by: RcName | None = None) -> bool:
+    def _see(self, term: Term, obeyed_by: str | None = None) -> bool:
         """False: it is absurd. A term for which an RC that is seen refuses a lower one is none."""
         heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, self.mesh.now())
         if self._last_terms.shown(term, self.known):
             return False
         if absurd(term, self.known, heard=heard):
-            if refused_by is None or absurd(term, self.known, heard=False):
+            if obeyed_by is None or absurd(term, self.known, heard=False):
                 log.warning("ignored term %d: absurdly far above %d", term.counter, self.known.counter)
                 return False
-            log.warning("%s obeys term %d: the fleet goes above", refused_by, term.counter)
+            log.warning("%s obeys term %d: the fleet goes above", obeyed_by, term.counter)
             self._goes_above = True
         self._learn(term)
         if self.rcm is not None and term > self.rcm.term:
@@ -216,7 +216,7 @@ class Candidate:
             seen = await self.mesh.living(keys.alive_any(), timeout=self._timeout)
             names = {keys.rc_state(one.name) for one in seen if one.role == Role.RC}
             names |= {keys.requests(Sender(one.host, one.name)) for one in seen if one.role == Role.CLIENT}
-        self._see(term, refused_by=key if key in names else None)
+        self._see(term, obeyed_by=key if key in names else None)
 
     def _credible(self, replies: list[Reply[R]], key_of: Callable[[R], str]) -> list[R]:
         """The messages of `replies` that name in themselves whom their key names; others prove nothing."""

@@ -57,7 +57,7 @@ class Membership:
         supervisor: Supervisor,
         emit: Callable[..., None],
         on_reported: Callable[[RcName, RcState], None],
-        on_newer: Callable[[Term, RcName | None], object],
+        on_newer: Callable[[Term, str | None], object],
     ) -> None:
         self.mesh, self.term = mesh, term
         self._lease = fleet.mesh.lease
@@ -336,7 +336,7 @@ class Membership:
         while self._is_wanted(token):
             for reply in await self.mesh.ask(key, RcAsk(promise=self.term), RcState, timeout=self._timeout):
                 if reply.problem is not None and reply.problem.term is not None:
-                    self.see(reply.problem.term, refused_by=token.name)
+                    self.see(reply.problem.term, obeyed_by=token.name)
                 state = reply.message
                 if state is not None and state.instance == token.instance and self._is_wanted(token):
                     self._answered(state)
@@ -405,8 +405,8 @@ class Membership:
         return gone is None or gone.host == token.host
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
-        self.see(state.term)
         name = self.mesh.keys.rc_of(key)
+        self.see(state.term, obeyed_by=name if state.instance in self._rc_tokens.get(name, {}) else None)
         if name in self._pending and self._pending[name].state.instance == state.instance:
             self._pending[name].state = state
         known, gone = self._joined.get(name), self._departed.get(name)
@@ -428,9 +428,10 @@ class Membership:
             self._emit(RcReported(name, rules_changed=True))
         self._on_reported(name, state)
 
-    def see(self, term: Term, refused_by: RcName | None = None) -> None:
+    def see(self, term: Term, obeyed_by: str | None = None) -> None:
+        """A term that somebody has heard of; `obeyed_by` an RC or a client that is seen."""
         if term > self.term:
-            self._on_newer(term, refused_by)
+            self._on_newer(term, obeyed_by)
 
 
 def discrepancies(

@@ -72,7 +72,7 @@ class Rcm:
         mesh: Mesh,
         fleet: Fleet,
         term: Term,
-        on_newer: Callable[[Term, RcName | None], object],
+        on_newer: Callable[[Term, str | None], object],
         on_failure: Callable[[Exception], object],
     ) -> None:
         self.mesh, self.fleet, self.term = mesh, fleet, term

@@ -116,7 +116,8 @@ class RequestHandler:
 
     def _ask(self, query: Query, ask: Ask, sender: Sender) -> None:
         if ask.term is not None and ask.term > self.core.term:
-            self._membership.see(ask.term)
+            client = str(sender)
+            self._membership.see(ask.term, obeyed_by=client if client in self._membership.clients else None)
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
         arc = arc_id(str(sender), ask.id)
         self._keep_order(arc)
