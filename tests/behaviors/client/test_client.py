@@ -23,7 +23,7 @@ from zscout.mesh.supervision import StallWatch
 from zscout.messages import Grants
 from zscout.services.rcm import request_handler
 from zscout.services.rcm.candidate import Candidate
-from zscout.types import SECOND
+from zscout.types import SECOND, Term
 
 RC, OTHER = "robot/x", "robot/y"
 ECHO = {"name": "echo", "value": 7}
@@ -241,6 +241,23 @@ def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -> None
             assert arc.ending is not None
             assert arc.ending.outcome == "lost"
             fleet.candidate("h1")
+            assert await one.granted(arc) is not None
+
+    run(test())
+
+
+def test_an_rcm_far_above_is_followed_once_no_other_is_heard() -> None:
+    """As where the fleet had to go above a forged term while this client was cut off."""
+
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            await until(lambda: one.term.counter)
+            await fleet.candidates.pop("h0").stop()
+            candidate = fleet.candidates["h1"] = Candidate(fleet.mesh("h1", "node"), FLEET)
+            candidate.known = far = Term(10**9, "far")
+            candidate.start()
+            await until(lambda: one.term > far, within=FLEET.timing.hold_lease / SECOND + 3)
+            arc = await one.request("first", {RC: {}}, min_runtime=600)
             assert await one.granted(arc) is not None
 
     run(test())

@@ -235,6 +235,28 @@ def test_the_fleet_goes_above_the_term_that_an_rc_obeys_however_high(has_token: 
     run(story())
 
 
+@pytest.mark.parametrize("who", ["a client", "an RC"])
+def test_a_leader_goes_above_what_somebody_whom_it_sees_obeys(who: str) -> None:
+    """Else nobody who obeys it would be served while the leader lives."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1")
+        robot = fleet.rc("robot/a")
+        candidate = fleet.candidate("h1")
+        await until(lambda: candidate.rcm and candidate.rcm.core.status().rcs)
+        far = Term(10**9, "mad")
+        if who == "an RC":
+            robot.term = far
+            robot.publish()
+        else:
+            with pytest.raises(Refusal, match="old_term"):
+                await fleet.client("one").ask("tally", "robot/a", term=far)
+        await until(lambda: candidate.rcm and candidate.rcm.term > far)
+        await candidate.stop()
+
+    run(story())
+
+
 def test_the_last_terms_come_one_by_one_and_who_does_not_know_them_asks() -> None:
     """Nobody uses up at once those that are left; a fleet that has come so far goes on."""
 
