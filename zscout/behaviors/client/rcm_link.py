@@ -128,7 +128,8 @@ class RcmLink:
             await asyncio.sleep(lease / SECOND / CHECKS_PER_LEASE)
             now = self.mesh.now()
             # As at the RCs: an RCM that was replaced, or whose term is absurd, keeps no hold alive.
-            if any([self.accept(one.term) for _, one in self._published.each()]):
+            believed = [self.accept(one.term) for _, one in self._published.each()]
+            if any(believed):
                 # It may have published right after the last check.
                 self._last_contact = now - lease // CHECKS_PER_LEASE
             if now - self._last_contact < lease or self._stall.fresh():

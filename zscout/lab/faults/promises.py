@@ -6,7 +6,7 @@ leaders believe. Some hold only once they had time to come right: their clocks s
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -26,9 +26,9 @@ HALF_A_GANG: Final = 2.0
 COME_RIGHT: Final = 3.0
 """Seconds without any fault within which a leader that RCs have left has stepped down, and the leader has everybody
 at the place that it knows of."""
-MOST_TERMS: Final = 4
+TERMS_OF_A_FAULT: Final = 2
 TERMS_WITHIN: Final = 10.0
-"""Seconds in which no more terms begin: two faults at one time cost one or two each."""
+"""Seconds in which no more terms begin than that for each fault, and for two at least."""
 UNLED: Final = 0.5
 """Seconds beyond the hold lease after which an RC that hears no RCM is held by nobody."""
 LEFT_OVER: Final = 7.0
@@ -192,10 +192,14 @@ class Promises:
                 if (arc := self._arc_of.get(_written(grant))) in self._over:
                     yield rc.name, "is held by", arc, "which its client has ended"
 
-    def at_end(self, clients: Mapping[str, Client], leaders: Mapping[str, Rcm]) -> None:
-        """Everything was served, and `LEFT_OVER` is over."""
+    def at_end(
+        self, clients: Mapping[str, Client], leaders: Mapping[str, Rcm], faults: Sequence[tuple[float, float]]
+    ) -> None:
+        """Everything was served, and `LEFT_OVER` is over. `faults`: when each began and was over."""
         for at in self._begun:
-            if (terms := sum(at <= other < at + TERMS_WITHIN for other in self._begun)) > MOST_TERMS:
+            terms = sum(at <= other < at + TERMS_WITHIN for other in self._begun)
+            felt = sum(begin < at + TERMS_WITHIN and end > at for begin, end in faults)
+            if terms > TERMS_OF_A_FAULT * max(2, felt):
                 self._broken(f"{terms} terms began within {TERMS_WITHIN:g} s")
         for name, client in clients.items():
             if left := {*client._store.arcs, *client._store.withdrawn}:

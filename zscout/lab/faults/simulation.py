@@ -211,7 +211,8 @@ class Simulation:
             self.broken(f"not served within {SERVED_WITHIN:g} s: {waiting}")
         self.result.served_after = self.loop.now - mended
         await asyncio.sleep(LEFT_OVER)
-        self.promises.at_end(self._alive(self.programs), self._leaders())
+        faults = [(START + fault.at, START + fault.at + fault.lasts + plan.RELINK) for fault in self.faults]
+        self.promises.at_end(self._alive(self.programs), self._leaders(), faults)
         self.result.counts["terms"] += len(self.promises.terms)
 
     # What is seen

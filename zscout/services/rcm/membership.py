@@ -80,6 +80,8 @@ class Membership:
         """The RCs that count as there, as they reported themselves last."""
         self._pending: dict[RcName, _Pending] = {}
         """RCs that answered with holds of earlier terms: the other RCs of those gangs may answer too."""
+        self._began_alone = False
+        """No RC of another host answered before the term began: links may be coming back, one after the other."""
         self.on_settled: Callable[[], None] = lambda: None
         """Called when RCs are not pending any more."""
         self.on_named: Callable[[RcName], None] = lambda _: None
@@ -98,7 +100,9 @@ class Membership:
     def join(self, rcs: dict[RcName, RcState], pending: Iterable[RcState]) -> list[Event]:
         """The RCs that promised to obey before the term began; those that are `pending` join later."""
         self._joined.update(rcs)
-        for state in (*rcs.values(), *pending):
+        states = (*rcs.values(), *pending)
+        self._began_alone = all(state.host == self.mesh.me.host for state in states)
+        for state in states:
             self._named[state.rc] = state.instance, state.host
         for state in pending:
             self._hold_up(state)
@@ -370,7 +374,7 @@ class Membership:
                 continue
             gangs = gangs_of(rc, {one: pending.state for one, pending in self._pending.items()})
             missing = gangs - self._joined.keys() - self._pending.keys()
-            seen = any(one in self._rc_tokens for one in missing)
+            seen = self._began_alone or any(one in self._rc_tokens for one in missing)
             if not missing or self._pending[rc].waited >= (self._lease if seen else self._timeout):
                 self._admit([self._pending.pop(one).state for one in sorted(gangs & self._pending.keys())])
 
