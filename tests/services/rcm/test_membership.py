@@ -78,6 +78,7 @@ def test_rcs_that_join_one_after_the_other_keep_what_they_hold_together(apart: f
         fleet = FakeFleet()
         rcm = fleet.rcm(5)
         client = fleet.client("one")
+        client.open = [OpenRequest("tally", "tally", {rc: {} for rc in HELD.rcs}, 0, Decimal(60), **BELIEVED)]
         first = holding(fleet, "robot/a")
         await until(lambda: first.asked)
         await asyncio.sleep(apart)
@@ -87,6 +88,22 @@ def test_rcs_that_join_one_after_the_other_keep_what_they_hold_together(apart: f
         assert [one.revoked for one in fleet.published] == [[]]
         assert [holder.grant for holder in (*first.holders, *second.holders)] == [HELD.grant] * 2
         assert rcm.core.waiting == 0
+
+    run(story())
+
+
+def test_what_its_client_gave_up_with_another_leader_ends_once_the_client_is_heard() -> None:
+    """That one's last word did not reach the RCs."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm(5)
+        robots = [holding(fleet, name) for name in HELD.rcs]
+        await fleet.joined(*robots)
+        assert [robot.arcs for robot in robots] == [["tally"]] * 2
+        fleet.client("one")
+        await until(lambda: not any(robot.holders for robot in robots))
+        assert [(one.grant, one.outcome) for one in fleet.published[-1].revoked] == [(HELD.grant, "released")]
 
     run(story())
 

@@ -31,6 +31,8 @@ TERMS_WITHIN: Final = 10.0
 """Seconds in which no more terms begin than that for each fault, and for two at least."""
 UNLED: Final = 0.5
 """Seconds beyond the hold lease after which an RC that hears no RCM is held by nobody."""
+JUST_NOW: Final = 0.1
+"""Seconds: two looks."""
 LEFT_OVER: Final = 7.0
 """Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
 
@@ -61,6 +63,8 @@ class Promises:
         """By term: ARCs that its RCM has ended for good."""
         self._over: set[str] = set()
         """ARCs that their clients have ended."""
+        self._dropped: dict[str, float] = {}
+        """ARCs whose clients were taken for gone, and when."""
         self._places: dict[tuple[str, str], Place] = {}
         self._heard: dict[str, tuple[Any, int]] = {}
         """By instance of an RC: the newest (term, seq)."""
@@ -134,6 +138,8 @@ class Promises:
             before = self._places.setdefault((name, arc.id), arc.place)
             if arc.place > before:
                 self._broken(f"the place of {name} {arc.name} got worse: {before}, then {arc.place}")
+        if arc.outcome == "client_lost":
+            self._dropped[full] = self._now()
         if arc.outcome == "client_lost" and not arc.open:
             self._broken(f"{name} lives, and was dropped")
 
@@ -174,7 +180,12 @@ class Promises:
         running, queued = self._running.get(rcm.term, set()), self._queued.get(rcm.term, {})
         status = rcm.core.status()
         granted = [arc for arc in status.running if arc.hold and arc.hold.grant not in running and arc.id in queued]
-        waited = [arc for arc in status.queued if queued.get(arc.id) == _rank(arc)]
+        # Who was taken for gone meanwhile has waited only since.
+        waited = [
+            arc
+            for arc in status.queued
+            if queued.get(arc.id) == _rank(arc) and self._now() - self._dropped.get(arc.id, 0) > JUST_NOW
+        ]
         for arc, other in product(granted, waited):
             if _rank(other) < _rank(arc) and other.needs.keys() <= arc.needs.keys():
                 self._broken(f"{arc.name} was granted before {other.name}, which ranks before it")

@@ -84,6 +84,9 @@ class Membership:
         """No RC of another host answered before the term began: links may be coming back, one after the other."""
         self.on_settled: Callable[[], None] = lambda: None
         """Called when RCs are not pending any more."""
+        self.on_requests: Callable[[ClientId, set[str]], None] = lambda *_: None
+        """Called with what a client that was asked says that it asks for: ids."""
+        self._asked: set[ClientId] = set()
         self.on_named: Callable[[RcName], None] = lambda _: None
         """Called when the instances of an RC are to hear which one is meant."""
         self._named: dict[RcName, tuple[str, HostName]] = {}
@@ -167,6 +170,24 @@ class Membership:
         dying, self._dying = self._dying, []
         for judge in dying:
             judge()
+
+    def ask_requests(self, client: ClientId) -> None:
+        """Has a client say what it asks for, as soon as it hears; `on_requests` is told."""
+        if client not in self._asked:
+            self._asked.add(client)
+            self._supervisor.spawn(self._ask_requests(client))
+
+    async def _ask_requests(self, client: ClientId) -> None:
+        key, ask = self.mesh.keys.requests(client_of(client)), RcAsk(promise=self.term)
+        while client in self.clients or client in self._unseen:
+            reply = await self.mesh.ask_one(key, ask, ClientRequests, timeout=self._timeout)
+            if reply is not None and reply.problem is not None and reply.problem.term is not None:
+                self.see(reply.problem.term, obeyed_by=client if client in self.clients else None)
+            if reply is not None and reply.message is not None:
+                self.on_requests(client, {request.id for request in reply.message.requests})
+                break
+            await asyncio.sleep(self._timeout)
+        self._asked.discard(client)
 
     def _judge_client(self, client: ClientId, token: Token) -> None:
         if client in self.clients:

@@ -40,6 +40,7 @@ from zscout.scheduling.model import (
     Propose,
     RcReported,
     RecoveredHold,
+    Released,
     Requested,
     Tick,
     Vote,
@@ -51,7 +52,7 @@ from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.services.rcm.registry import RequestRegistry, reason_info, request_id
 from zscout.services.rcm.request_handler import RequestHandler
-from zscout.types import SECOND, Ns, RcName, Term
+from zscout.types import SECOND, ClientId, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +82,7 @@ class Rcm:
         supervisor, receive = self.supervisor, self._receive
         self.registry = RequestRegistry(mesh, self.core, term, supervisor)
         self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer)
+        self.membership.on_requests = self._on_requests
         self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(mesh, fleet, self.core, self.registry, self.membership, supervisor, receive)
         self._heartbeat = fleet.timing.heartbeat
@@ -111,6 +113,8 @@ class Rcm:
         for request in requests:
             self.registry.enter(request.arc, request.name)
             self.membership.expect(request.client)
+        for client in {hold.request.client for hold in recovered.holds} - recovered.answered:
+            self.membership.ask_requests(client)
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*joined, lead], named=recovered.rcs)
@@ -155,6 +159,13 @@ class Rcm:
         if superfluous:
             self._publish([], [rc])
 
+    def _on_requests(self, client: ClientId, ids: Collection[str]) -> None:
+        """What a client does not ask for any more of earlier terms it gave up where this RCM could not hear of it."""
+        arcs = filter(None, map(self.core.arc, self.core.arcs_of(client)))
+        earlier = [arc.id for arc in arcs if arc.hold is not None and arc.hold.grant.term < self.term]
+        if given_up := [Released(arc) for arc in earlier if request_id(arc) not in ids]:
+            self._receive(*given_up)
+
     # Events, and out
 
     def _decide(self, events: Sequence[Event], named: Collection[RcName] | None = None) -> None:
@@ -171,6 +182,7 @@ class Rcm:
                     self.registry.enter(request.arc, request.name)
                     if client not in seen:
                         self.membership.expect(client)
+                    self.membership.ask_requests(client)
         self._publish(effects, named)
         self.registry.report(effects, self.requests.waiting, self.requests.given_up)
         self.requests.answer(effects)

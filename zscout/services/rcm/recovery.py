@@ -17,7 +17,7 @@ from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of,
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
 from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
 from zscout.services.rcm.registry import arc_id, request_id
-from zscout.types import NO_TERM, SECOND, ArcId, Grant, Need, Ns, RcName
+from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, Need, Ns, RcName
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +33,8 @@ class RecoveredState:
     """Of that, what its client does not ask for any more."""
     holds: list[RecoveredHold] = field(default_factory=list)
     waiting: list[Requested] = field(default_factory=list)
+    answered: set[ClientId] = field(default_factory=set)
+    """The clients that have said what they ask for."""
 
 
 def take_over(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:
@@ -42,6 +44,7 @@ def take_over(states: Iterable[RcState], clients: Collection[ClientRequests], no
     answered = {state.rc: state for state in sorted(by_host, key=_newest_grant)}
     pending = {rc for rc in answered if not gangs_of(rc, answered) <= answered.keys()}
     result = recover([state for rc, state in answered.items() if rc not in pending], clients, now)
+    result.answered = {one.client for one in clients}
     result.pending = [answered[rc] for rc in sorted(pending)]
     asked = {one.client: {request.id for request in one.requests} for one in clients}
     held = [holder for state in result.pending for holder in state.holders]
