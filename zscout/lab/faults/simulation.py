@@ -37,6 +37,7 @@ from zscout.lab.faults.virtual_time import PROCESS, START, Process, VirtualTimeL
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import MAX_COUNTER, Grants
 from zscout.services.node.component_host import ComponentHost
+from zscout.services.rcm.absence import AT_ONCE
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
 from zscout.types import SECOND, Grant, Term
@@ -393,19 +394,18 @@ class Simulation:
         return any(self._touches(fault, names, hosts, since) for fault in faults)
 
     def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float) -> bool:
-        lease = self.fleet.mesh.lease
-        # Of a leader's links some are lost and some are not: nobody can tell that from a host that goes.
-        in_part = (1 - IMPATIENCE) * lease <= fault.lasts <= lease
+        # Of a leader's links the first was lost as the others came back: nobody can tell that from a host that goes.
+        just_over = 0 <= self.loop.now - START - fault.at - fault.lasts < 2 * AT_ONCE
         match fault.kind:
             case "stall" | "kill" | "fail" | "double":
                 return bool(names & {*fault.whom})
             case "freeze":
-                return in_part or bool(names & {*fault.whom})
+                return just_over or bool(names & {*fault.whom})
             case "isolate" | "part":
                 side = hosts & {*fault.whom}
                 there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
                 parted = bool(side and hosts - side) or not there & {*self.candidates_at}
-                return in_part or parted or since > fault.at
+                return just_over or parted or since > fault.at
             case _:
                 return True
 

@@ -15,6 +15,8 @@ from zscout.types import SECOND, HostName, Ns
 
 AWAY: Final = 0.25
 """A leader that stood still for this part of the mesh lease, or lost several hosts within it, was away itself."""
+AT_ONCE: Final = 0.05
+"""Seconds within which others answer a leader that is not away. A later answer proves nothing: it may be back since."""
 MAX_ASKED: Final = 3
 """Other hosts that are asked whether this one is away."""
 
@@ -65,9 +67,8 @@ class Absence:
 
     async def _ask(self, key: str, kind: type[Struct]) -> None:
         """If anybody else answers, this leader is not away, and what went has gone."""
-        timeout = self._span / SECOND
-        reply = await self._mesh.ask_one(key, RcAsk(), kind, timeout=timeout)
-        # Who stood still meanwhile, or lost another host, does not believe an answer that was late.
+        reply = await self._mesh.ask_one(key, RcAsk(), kind, timeout=AT_ONCE)
+        # Who stood still meanwhile, or lost another host, does not believe it.
         if reply is not None and not self._stall.fresh() and not self._lost_several:
             self._until = 0
             self._on_present()
