@@ -136,8 +136,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "the device is safe before its next holder begins",
             {(ResourceController, "_carry_out_change"): _begin_first},
         ),
-        "gaps": Guard("an RC that missed a publication reads the state", {(HoldTable, "apply_grants"): _miss_nothing}),
-        "reports": Guard("a leader sets right what an RC reports otherwise", {(Rcm, "_compare"): _nothing}),
+        "missed": Guard(
+            "an RC that missed a publication reads the state, and a leader sets right what it reports otherwise",
+            {(HoldTable, "apply_grants"): _miss_nothing, (Rcm, "_compare"): _nothing},
+        ),
         "hold lease": Guard(
             "without an RCM for the hold lease a hold ends",
             {(HoldTable, "expire"): _expire_by_time, (RcmLink, "watch_lease"): _never},
@@ -159,7 +161,6 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "away": Guard("a leader that was away itself drops nobody for it", {(Membership, "_is_away"): _no}),
         "reopen": Guard("who was dropped and lives goes on at its place", {(RequestRegistry, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
-        "shown": Guard("a worse place is set right", {(OpenArc, "shows_place"): _no}),
         "notices": Guard("of two notices the newer counts", {(OpenArc, "take"): _take_any}),
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
         "absurd": Guard(

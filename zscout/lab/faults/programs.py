@@ -6,11 +6,13 @@ import asyncio
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from zscout.behaviors.client.arc import Held, Revoked, hold, holds
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.keyexpr import RANDOM
+
+LONG: Final = 4
 
 
 @dataclass(slots=True)
@@ -32,9 +34,11 @@ class Work:
         while not self.over:
             rcs = rng.sample(sorted(self.devices), rng.choice((1, 1, 2, 2, 3)))
             needs = {rc: {"rate": rng.choice((2, 4, 6))} if self.devices[rc] else {} for rc in rcs}
+            # Some go on through any fault, and its end.
+            times = LONG if rng.random() < 0.15 else 1
             how: dict[str, Any] = {
                 "priority": rng.choice((0, 0, 0, 1, 5)),
-                "min_runtime": round(rng.uniform(0.3, 3), 3),
+                "min_runtime": round(rng.uniform(0.3, 3) * times, 3),
                 "keep": rng.random() < 0.1,
             }
             self.counts["requests"] += 1
@@ -43,11 +47,11 @@ class Work:
             try:
                 if rng.random() < 0.5:
                     async with hold(client, arc, needs, **how) as held:
-                        await self._body(held)
+                        await self._body(held, times)
                 else:
                     async for attempt in holds(client, arc, needs, **how):
                         async with attempt as held:
-                            await self._body(held)
+                            await self._body(held, times)
             except Revoked as revoked:
                 self.counts[f"revoked {revoked.outcome}"] += 1
             except (RequestRefused, CommandRefused) as refused:
@@ -55,10 +59,10 @@ class Work:
             busy.discard(arc)
             await asyncio.sleep(rng.uniform(0.05, self.pause))
 
-    async def _body(self, held: Held) -> None:
+    async def _body(self, held: Held, times: int) -> None:
         rng = RANDOM.get()
         self.counts["grants"] += 1
-        for _ in range(rng.randrange(1, 12)):
+        for _ in range(rng.randrange(1, 12) * times):
             try:
                 await held.command(rng.choice(held.rcs), {"name": "echo", "value": 1})
                 self.counts["commands"] += 1

@@ -29,6 +29,8 @@ at the place that it knows of."""
 TERMS_OF_A_FAULT: Final = 2
 TERMS_WITHIN: Final = 10.0
 """Seconds in which no more terms begin than that for each fault, and for two at least."""
+SAID: Final = 1.5
+"""Seconds without any fault within which an RC holds what its RCM says, in one instance."""
 UNLED: Final = 0.5
 """Seconds beyond the hold lease after which an RC that hears no RCM is held by nobody."""
 JUST_NOW: Final = 0.1
@@ -162,14 +164,9 @@ class Promises:
         lasting = dict.fromkeys(_half_gangs(clients, rcs), self._half_a_gang)
         lasting |= dict.fromkeys(_unled(rcs, silence), UNLED)
         if calm:
-            come_right = (
-                *_left(leaders, rcs),
-                *_worse_places(clients, leaders),
-                *_doubles(rcs),
-                *_at_odds(leaders, rcs),
-                *self._given_up(rcs),
-            )
+            come_right = (*_left(leaders, rcs), *_worse_places(clients, leaders), *self._given_up(rcs))
             lasting |= dict.fromkeys(come_right, COME_RIGHT)
+            lasting |= dict.fromkeys((*_doubles(rcs), *_at_odds(leaders, rcs)), SAID)
         self._since = {key: self._since.get(key, self._now()) for key in lasting}
         for key, longest in lasting.items():
             if self._now() - self._since[key] > longest:
