@@ -63,7 +63,8 @@ class Fault:
     def felt(self) -> float:
         """Seconds for which it goes on when it is over: until links stand again, or every process that it left in
         contradiction has joined anew."""
-        return HEALED if self.kind == "forget" else RELINK
+        tokens_lost = self.kind == "disturb" and self.message == "alive" and self.how.lost > 0
+        return HEALED if self.kind == "forget" or tokens_lost else RELINK
 
     def __str__(self) -> str:
         what = {
