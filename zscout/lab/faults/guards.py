@@ -122,6 +122,10 @@ def _accept_any(self: RcmLink, term: Term, **_: object) -> bool:
     return True
 
 
+def _no_names(*_: object) -> dict[str, Any]:
+    return {}
+
+
 def _alone(rc: str, _states: object) -> set[str]:
     return {rc}
 
@@ -146,7 +150,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "snapshots": Guard("what a snapshot adds passes the RC's own vote", {(ResourceController, "_carries"): _yes}),
         "instances": Guard(
-            "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Instances, "take"): _nothing}
+            "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Membership, "named"): _no_names}
         ),
         "whole": Guard(
             "a new leader carries on whole gangs only", {(recovery, "all"): _yes, (membership, "all"): _yes}
