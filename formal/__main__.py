@@ -19,6 +19,7 @@ INSTANCES = (
     Instance("safety", terms=3, steps=3, joins=3),
     Instance("safety, more reigns", terms=4, steps=2, joins=2),
     Instance("progress", terms=3, steps=2, joins=3, losses=False, fair=True),
+    Instance("progress, longer reigns", terms=2, steps=3, joins=4, losses=False, fair=True),
 )
 WITHOUT = tuple(
     Instance(f"without {guard}", terms=2, steps=3, joins=3, guards=tuple(one for one in GUARDS if one != guard))

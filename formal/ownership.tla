@@ -161,21 +161,28 @@ Becomes(r, next) ==
     IN /\ hold' = [hold EXCEPT ![r] = begins]
        /\ ended' = [ended EXCEPT ![r] = IF hold[r] # None /\ hold[r] # begins THEN @ \cup {hold[r]} ELSE @]
 
-(* It hears a publication. *)
-Hear(r, t, said) ==
+Hearing(r, t, said) ==
     /\ On("older") => ~ Newer(heard[r][1], heard[r][2], <<t, said.seq>>)
     /\ heard' = [heard EXCEPT ![r] = <<t, said.seq>>]
+
+(* It hears a publication. *)
+Hear(r, t, said) ==
+    /\ Hearing(r, t, said)
     /\ IF r \in said.named THEN Becomes(r, said.table[r]) ELSE UNCHANGED <<hold, ended>>
     /\ <<heard', hold'>> # <<heard, hold>>
     /\ UNCHANGED <<answers, leaders, obeyed>>
 
 (* It reads an answer about the state: that ends nothing. *)
 Read(r, t, said) ==
-    /\ On("older") => ~ Newer(heard[r][1], heard[r][2], <<t, said.seq>>)
-    /\ heard' = [heard EXCEPT ![r] = <<t, said.seq>>]
+    /\ Hearing(r, t, said)
     /\ IF hold[r] = None THEN Becomes(r, said.table[r]) ELSE UNCHANGED <<hold, ended>>
     /\ <<heard', hold'>> # <<heard, hold>>
     /\ UNCHANGED <<answers, leaders, obeyed>>
+
+(* It hears a heartbeat: how far the reign is, though what was published there was lost. *)
+Beat(r, t, said) ==
+    /\ Hearing(r, t, said) /\ heard' # heard
+    /\ UNCHANGED <<answers, leaders, hold, ended, obeyed>>
 
 (* Its time is over, or no leader was heard for a hold lease. *)
 Expire(r) ==
@@ -198,7 +205,8 @@ Reign(t) ==
     \/ \E r \in RCs : Promise(r, t) \/ Lose(t, r) \/ Repeat(t, r)
     \/ \E c \in Clients : Revoke(t, c) \/ \E gang \in Needs[c] : Grant(t, c, gang)
     \/ \E c, d \in Clients : c # d /\ HandOver(t, c, d)
-    \/ \E i \in DOMAIN history[t] : \E r \in RCs : Hear(r, t, history[t][i]) \/ Read(r, t, history[t][i])
+    \/ \E i \in DOMAIN history[t] : \E r \in RCs : LET said == history[t][i] IN
+        Hear(r, t, said) \/ Read(r, t, said) \/ Beat(r, t, said)
 
 Next == (\E t \in Terms : Reign(t)) \/ \E r \in RCs : Expire(r) \/ Command(r)
 

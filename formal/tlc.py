@@ -91,8 +91,8 @@ def check(instance: Instance, *, workers: int = CORES) -> Outcome:
         # Symmetry is sound for safety alone.
         config += ["SPECIFICATION SpecOrdered", f"INVARIANTS {' '.join(INVARIANTS)}", f"PROPERTIES {' '.join(ACTIONS)}"]
         config += ["SYMMETRY Alike"]
-    # The bounds end every behaviour: that is no deadlock.
-    return run(module, config, workers=workers, options=["-deadlock"])
+    # The bounds end every behaviour: that is no deadlock. Progress is looked at once, when all states are known.
+    return run(module, config, workers=workers, options=["-deadlock", "-lncheck", "final"])
 
 
 def run(module: str, config: Sequence[str], *, workers: int = CORES, options: Sequence[str] = ()) -> Outcome:

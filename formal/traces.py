@@ -189,7 +189,12 @@ class Behaviour:
         becomes = reign.tables[step - 1].get(event["instance"]) if told else rc.holds
         if becomes in rc.ended:
             becomes = None
-        if rc.heard != (term, step) or becomes != rc.holds:
+        if holds == rc.holds != becomes:
+            # Not the publication: a heartbeat after it.
+            becomes = holds
+            if rc.heard != (term, step):
+                self._add(f"Beats({name}, {self._terms[term]}, {step})")
+        elif rc.heard != (term, step) or becomes != rc.holds:
             self._add(f"Hears({name}, {self._terms[term]}, {step}) /\\ {self._holds(name, becomes)}")
         self._takes(rc, becomes, (term, step))
         self._ends(event, name, rc, holds)
@@ -360,6 +365,7 @@ G(t, s, c, rcs) == [term |-> t, seq |-> s, client |-> c, rcs |-> rcs]
 \* By its number: what a leader said. None of those that may come is left out.
 Hears(r, t, s) == \E m \in DOMAIN history[t] : history[t][m].seq = s /\ Hear(r, t, history[t][m])
 Reads(r, t, s) == \E m \in DOMAIN history[t] : history[t][m].seq = s /\ Read(r, t, history[t][m])
+Beats(r, t, s) == \E m \in DOMAIN history[t] : history[t][m].seq = s /\ Beat(r, t, history[t][m])
 
 \* A leader says again what it has said.
 Again(t, named) == Says(t, Table(t), named) /\ UNCHANGED <<answers, joined, heard, hold, ended, obeyed>>
