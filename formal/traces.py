@@ -60,8 +60,6 @@ class Piece:
     actions: list[str] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
     """Of each action: the line of the trace that says so."""
-    note: str = ""
-    """What is wrong with the last action, which is none."""
     rcs: set[int] = field(default_factory=set)
     terms: set[int] = field(default_factory=set)
 
@@ -229,8 +227,7 @@ class Behaviour:
             self._add(f"Expire({name})")
             self._takes(rc, None, rc.heard)
         elif rc.holds != holds:
-            self._add("FALSE")
-            self.pieces[-1].note = f"RC {name} holds {holds}, and should hold {rc.holds}"
+            self._add(f"FALSE (* RC {name} holds {holds}, and should hold {rc.holds} *)")
 
     def _takes(self, rc: _Rc, holds: Grant | None, heard: tuple[Term, int]) -> None:
         if rc.holds is not None and holds != rc.holds:
@@ -484,7 +481,7 @@ def _follow(pieces: Sequence[Piece], verdict: Verdict, workers: int) -> tuple[in
     one = pieces[which - 1]
     if at > len(one.actions):
         return which - 1, at, "it does not lead to what the next piece begins with"
-    return which - 1, at, one.note if one.actions[at - 1] == "FALSE" else one.actions[at - 1]
+    return which - 1, at, one.actions[at - 1]
 
 
 def _function(values: Mapping[int, str]) -> str:
