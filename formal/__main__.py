@@ -1,17 +1,25 @@
 """`make model`: what TLC says of `ownership.tla`. Each guard of the protocol is taken out in turn as well, and must
-break something."""
+break something.
+
+`python -m formal traces FILE...` and `--simulated COUNT`: whether what a fleet did is a behaviour of the model."""
 
 from __future__ import annotations
 
+import argparse
 import sys
+import time
+from pathlib import Path
 
 from formal.tlc import GUARDS, Instance, NoTlc, check, jar
+from formal.traces import Behaviour, accept
 from zscout import terminal
+from zscout.lab.faults.simulation import simulate
 
 INSTANCES = (
-    Instance("safety", terms=3, steps=2, joins=2),
-    Instance("safety, longer reigns", terms=2, steps=3, joins=3),
-    Instance("progress", terms=2, steps=2, joins=4, losses=False, fair=True),
+    Instance("safety", terms=3, steps=3, joins=3),
+    Instance("safety, more reigns", terms=4, steps=2, joins=2),
+    Instance("progress", terms=3, steps=2, joins=3, losses=False, fair=True),
+    Instance("progress, longer reigns", terms=2, steps=3, joins=4, losses=False, fair=True),
 )
 WITHOUT = tuple(
     Instance(f"without {guard}", terms=2, steps=3, joins=3, guards=tuple(one for one in GUARDS if one != guard))
@@ -19,12 +27,16 @@ WITHOUT = tuple(
 )
 
 
-def main(names: list[str]) -> int:
+def main(words: list[str]) -> int:
     try:
         jar()
     except NoTlc as error:
         terminal.print_line(f"skipped: {error}")
         return 0
+    return traces(words[1:]) if words[:1] == ["traces"] else model(words)
+
+
+def model(names: list[str]) -> int:
     rows, failed = [], False
     for instance in (*WITHOUT, *INSTANCES):
         if names and instance.name not in names:
@@ -34,12 +46,39 @@ def main(names: list[str]) -> int:
         expected = instance in WITHOUT
         failed |= (outcome.violated is not None) != expected
         said = f"breaks {outcome.violated}" if outcome.violated else "holds"
-        bounds = f"{instance.terms} terms of {instance.steps} steps"
+        bounds = f"{instance.terms} terms of {instance.joins} steps"
         rows.append([instance.name, bounds, f"{outcome.states:,}", f"{outcome.took:.0f} s", said])
         if (outcome.violated is not None) != expected:
             terminal.print_line(outcome.text)
     terminal.print_table(["instance", "bounds", "states", "took", "outcome"], rows)
     return 1 if failed else 0
+
+
+def traces(words: list[str]) -> int:
+    options = argparse.ArgumentParser(prog="python -m formal traces", description=__doc__)
+    options.add_argument(
+        "files", nargs="*", type=Path, metavar="FILE", help="lines of zscout.trace, in the order of time"
+    )
+    options.add_argument("--simulated", type=int, default=0, metavar="COUNT", help="so many runs of the simulator")
+    options.add_argument("--seed", type=int, default=0, help="of the first of them (0)")
+    asked = options.parse_args(words)
+    seeds = range(asked.seed, asked.seed + asked.simulated)
+    names = [*map(str, asked.files), *(f"seed {seed}" for seed in seeds)]
+    began = time.monotonic()
+    behaviours = [Behaviour(file.read_text().splitlines()) for file in asked.files]
+    behaviours += [Behaviour(simulate(seed, traced=True).trace) for seed in seeds]
+    read = time.monotonic() - began
+    verdict = accept(behaviours)
+    for number, where in verdict.refused.items():
+        terminal.print_line(f"{names[number]} is no behaviour of the model: {where}")
+    pieces, actions = (
+        sum(counts) for counts in zip(*((len(one.pieces), one.actions) for one in behaviours), strict=True)
+    )
+    terminal.print_line(
+        f"{len(behaviours):,} traces in {pieces:,} pieces, {actions:,} actions: {len(verdict.refused)} refused; "
+        f"{verdict.states:,} states, TLC took {verdict.took:.0f} s, reading {read:.0f} s"
+    )
+    return 1 if verdict.refused else 0
 
 
 if __name__ == "__main__":

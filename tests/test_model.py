@@ -29,19 +29,38 @@ def test_without_a_guard_some_promise_breaks(instance: Instance) -> None:
     assert check(instance).violated is not None
 
 
-def test_what_the_fleet_does_is_a_behaviour_of_the_model() -> None:
-    behaviours = [Behaviour(simulate(seed, traced=True).trace) for seed in range(20, 29)]
-    outcome, where = accept(behaviours)
-    assert outcome.violated is None, where
-    assert outcome.states > sum(len(one.actions) for one in behaviours)
+@pytest.fixture(scope="module")
+def trace() -> list[str]:
+    return simulate(21, traced=True).trace
 
 
-def test_a_forged_step_is_refused() -> None:
-    trace = simulate(20, traced=True).trace
+def test_what_the_fleet_does_is_a_behaviour_of_the_model(trace: list[str]) -> None:
+    """Whole, and in pieces, each of which begins with what the one before it led to."""
+    whole, cut = Behaviour(trace, piece=10_000), Behaviour(trace, piece=50)
+    assert len(whole.pieces) == 1
+    assert len(cut.pieces) > 5
+    assert whole.actions == cut.actions
+    verdict = accept([whole, cut])
+    assert not verdict.refused
+    # Of each piece the beginning, its actions, and what the next begins with.
+    assert verdict.states == 2 * whole.actions + 2 + 2 * (len(cut.pieces) - 1)
+
+
+def test_a_forged_step_is_refused_in_any_piece(trace: list[str]) -> None:
     events = [msgspec.json.decode(line) for line in trace]
-    at = next(number for number, event in enumerate(events) if event["do"] == "hear" and event["holds"])
-    # A grant that nobody gave.
-    events[at]["holds"][0][1] += 1
-    outcome, where = accept([Behaviour(events)])
-    assert outcome.violated is not None
-    assert "holds" in where
+    heard = [number for number, event in enumerate(events) if event["do"] == "hear" and event["holds"]]
+    forged = []
+    for at in (heard[0], heard[-1]):
+        mine = msgspec.json.decode(msgspec.json.encode(events))
+        # A grant that nobody gave.
+        mine[at]["holds"][0][1] += 1
+        forged.append(Behaviour(mine, piece=50))
+    # What a piece begins with is not what was before.
+    cut = Behaviour(trace, piece=50)
+    cut.pieces[3].actions.pop()
+    verdict = accept([*forged, Behaviour(trace), cut])
+    assert verdict.refused.keys() == {0, 1, 3}
+    assert "piece 1, " in verdict.refused[0]
+    assert f"line {heard[-1] + 1}, piece {len(forged[1].pieces)}, " in verdict.refused[1]
+    assert "holds" in verdict.refused[1]
+    assert "does not lead to" in verdict.refused[3]

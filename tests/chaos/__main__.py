@@ -75,9 +75,11 @@ def run(asked: Any, kinds: list[str], folder: Path) -> dict[str, Any]:
         print(f"chaos: {len(HOSTS)} hosts, logs in {folder}", file=sys.stderr)
         limit = lambda number: number >= asked.count if asked.count else time.monotonic() > until  # noqa: E731
         faults = random_faults(fleet, rng, kinds, limit)
-        violations, told = finish(fleet, faults)
-    if asked.traces is not None:
-        write_traces(folder, asked.traces)
+        try:
+            violations, told = finish(fleet, faults)
+        finally:
+            if asked.traces is not None:
+                write_traces(folder, asked.traces)
     return {
         "seed": asked.seed,
         "seconds": round((now() - start) / SECOND),
