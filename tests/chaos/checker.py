@@ -149,7 +149,7 @@ class Checker:
         for (rc, _), instance in self._instances.items():
             if host_of(rc) == host:
                 for grant in instance.holds:
-                    if event["at"] - max(event["since"], self._began[rc, grant]) > HOLD_LEASE + SECOND // 2:
+                    if event["at"] - max(event["since"], self._began.get((rc, grant), 0)) > HOLD_LEASE + SECOND // 2:
                         self.broken(event["at"], "7 silence ends holds", f"{rc} holds {grant} and heard nobody")
 
     # What leaders tell

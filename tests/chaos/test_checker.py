@@ -138,6 +138,9 @@ def test_an_rc_that_heard_nobody_must_not_hold() -> None:
     found = held_against([*LIFE, *held, mended], fault)
     assert [one.promise for one in found] == ["7 silence ends holds"]
     assert held_against([*LIFE, *held[:2], rc(6.1, "end", [], seq=3), mended], fault) == []
+    # Its client has given it up meanwhile.
+    found = held_against([*LIFE[:-2], client(4, "gave_up"), mended, rc(9, "hear", [])], fault)
+    assert "7 silence ends holds" in [one.promise for one in found]
 
 
 @pytest.mark.parametrize("promise", ["10 nobody alive is dropped", "10 what no fault touches goes on", "13 terms"])
