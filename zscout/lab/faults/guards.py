@@ -173,7 +173,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
         "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),
-        "withdrawn": Guard("what nobody asks for is given back", {(RcmLink, "give_back"): _do_nothing}),
+        "withdrawn": Guard(
+            "what nobody asks for is given back",
+            {(RcmLink, "give_back"): _do_nothing, (Membership, "ask_requests"): _nothing},
+        ),
     }
 )
 
