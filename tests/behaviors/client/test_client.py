@@ -16,7 +16,7 @@ from zscout.config.fleet import default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
+from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryNetwork
 from zscout.lab.faults.virtual_time import START
 from zscout.mesh import ZenohMesh
 from zscout.mesh.supervision import StallWatch
@@ -242,6 +242,22 @@ def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -> None
             assert arc.ending.outcome == "lost"
             fleet.candidate("h1")
             assert await one.granted(arc) is not None
+
+    run(test())
+
+
+def test_a_hold_is_over_when_its_rc_says_so_though_no_notice_does() -> None:
+    async def test() -> None:
+        async with small_fleet("one", "two") as (fleet, (one, two)):
+            arc = await one.request("first", {RC: {}}, min_runtime=600)
+            grant = await one.granted(arc)
+            assert grant is not None
+            fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+            await two.granted(await two.request("operator", {RC: {}}, priority=9))
+            with pytest.raises(CommandRefused, match="is over"):
+                await one.command(RC, grant, ECHO)
+            await until(lambda: arc.grant is None, within=1.5)
+            await until(lambda: arc.state == "queued", within=1.0)
 
     run(test())
 

@@ -34,8 +34,10 @@ CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
 """Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
 NOT_CONFIRMED = CONFIRM_AGAIN | {"ended", "free", "not_holder", "wrong_client"}
 """Refusals after which an ARC is queued again; others concern whoever asked for it."""
-
-
+NOT_HELD = frozenset({"ended", "free", "not_holder"})
+"""What an RC answers to a command under a hold that is over."""
+TOLD_WITHIN = 1.0
+"""Seconds within which a notice says so too; else the RC is believed."""
 RENEW_TOKEN: Final[Ns] = SECOND // 2
 """A client that is dropped again after its token was renewed renews it no sooner."""
 
@@ -51,6 +53,8 @@ class Client(MovableClient):
         self._token: Declaration | None = None
         self._shown: Ns = 0
         """When the present token was declared."""
+        self._denied: set[Grant] = set()
+        """Grants that an RC says are over, and no notice yet."""
 
     @classmethod
     def connect(
@@ -297,8 +301,21 @@ class Client(MovableClient):
         if reply is None:
             raise CommandRefused(rc, Problem("unknown", "no answer; it may have been done or not"))
         if reply.message is None:
-            raise CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
+            refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
+            if refused.code in NOT_HELD and grant not in self._denied:
+                self._denied.add(grant)
+                self._supervisor.call_later(TOLD_WITHIN, self._lose, grant, str(refused))
+            raise refused
         return reply.message
+
+    def _lose(self, grant: Grant, reason: str) -> None:
+        """An RC of this grant does not know it any more, and no notice has said so."""
+        self._denied.discard(grant)
+        arc = next((arc for arc in self._store.open if arc.grant == grant), None)
+        if arc is not None and self._store.resumed.is_set():
+            arc.lose(reason, self.mesh.now())
+            self._store.notify(arc)
+            self._supervisor.spawn(self._ask_again(arc))
 
     def _on_notice(self, _key: str, notice: Notice) -> None:
         if not self._rcm.accept(notice.term):
