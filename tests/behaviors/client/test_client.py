@@ -253,7 +253,7 @@ def test_a_hold_is_over_when_its_rc_says_so_though_no_notice_does() -> None:
             grant = await one.granted(arc)
             assert grant is not None
             fleet.network.disturb({"notice": Disturbance(lost=1.0)})
-            await two.granted(await two.request("operator", {RC: {}}, priority=9))
+            await two.granted(await two.request("operator", {RC: {}}, priority=9, min_runtime=600))
             with pytest.raises(CommandRefused, match="is over"):
                 await one.command(RC, grant, ECHO)
             await until(lambda: arc.grant is None, within=1.5)
