@@ -12,9 +12,9 @@ from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, hol
 from tests.hang import HANG
 from tests.mesh.kit import run, until
 from zscout.drivers.holds import HoldChange
-from zscout.drivers.resource_controller import EARLY_PER_HOST, CommandQuery, ResourceController, WorkQueue
+from zscout.drivers.resource_controller import EARLY_PER_HOST, SAY_AGAIN, CommandQuery, ResourceController, WorkQueue
 from zscout.keyexpr import Role, Sender
-from zscout.lab.faults.memory import MemoryNetwork
+from zscout.lab.faults.memory import Disturbance, MemoryNetwork
 from zscout.mesh import Mesh
 from zscout.messages import Grants, RcmState, RcState
 from zscout.types import SECOND, Grant
@@ -192,6 +192,26 @@ def test_figures_are_published_when_they_change() -> None:
         figures["packets"] = 2.0
         await asyncio.sleep(5)
         assert seen == [2.0]
+        await close(rc, watcher)
+
+    run(story())
+
+
+def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
+    async def story() -> None:
+        network, device = MemoryNetwork(), Device()
+        watcher = network.open("f", Sender("w", "watcher"))
+        seen: list[str] = []
+        rc = await started(network, device)
+        watcher.subscribe(watcher.keys.rc_state_any, RcState, lambda _key, state: seen.append(state.health))
+        rc.fail("no power")
+        await until(lambda: seen == ["no power"])
+        network.disturb({"rc/state": Disturbance(lost=1.0)})
+        rc.recover()
+        await asyncio.sleep(1)
+        network.disturb({})
+        assert seen == ["no power"]
+        await until(lambda: seen[-1] == "ok", within=SAY_AGAIN + 2)
         await close(rc, watcher)
 
     run(story())

@@ -32,10 +32,10 @@ CONFIRM_TIMEOUT = 1.0
 """Seconds within which all RCs of a grant must have confirmed it."""
 CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
 """Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
-NOT_CONFIRMED = CONFIRM_AGAIN | {"ended", "free", "not_holder", "wrong_client"}
-"""Refusals after which an ARC is queued again; others concern whoever asked for it."""
 NOT_HELD = frozenset({"ended", "free", "not_holder"})
 """What an RC answers to a command under a hold that is over."""
+NOT_CONFIRMED = CONFIRM_AGAIN | NOT_HELD | {"wrong_client"}
+"""Refusals after which an ARC is queued again; others concern whoever asked for it."""
 TOLD_WITHIN = 1.0
 """Seconds within which a notice says so too; else the RC is believed."""
 RENEW_TOKEN: Final[Ns] = SECOND // 2
