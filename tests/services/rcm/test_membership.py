@@ -108,11 +108,28 @@ def test_what_its_client_gave_up_with_another_leader_ends_once_the_client_is_hea
     run(story())
 
 
+def test_what_was_queued_by_the_word_of_an_rc_alone_ends_once_its_client_does_not_ask_for_it() -> None:
+    """One RC of the gang had heard that it is over, the other had not: it is queued, and granted anew."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1")
+        robots = [holding(fleet, "robot/a"), fleet.rc("robot/b")]
+        candidate = fleet.candidate("h1")
+        await until(lambda: all(robot.arcs == ["tally"] for robot in robots))
+        assert all(robot.holders[0].grant > HELD.grant for robot in robots)
+        fleet.client("one")
+        await until(lambda: not any(robot.holders for robot in robots))
+        await candidate.stop()
+
+    run(story())
+
+
 def test_without_one_of_its_rcs_a_hold_ends_by_name_and_keeps_its_place() -> None:
     async def story() -> None:
         fleet = FakeFleet()
         fleet.rcm(5)
         client = fleet.client("one")
+        client.open = [OpenRequest("tally", "tally", {rc: {} for rc in HELD.rcs}, 0, Decimal(60), **BELIEVED)]
         await fleet.joined(holding(fleet, "robot/a"))
         await until(lambda: client.notices)
         (revoked,) = fleet.published[-1].revoked
@@ -208,6 +225,28 @@ def test_a_leader_that_is_cut_off_for_longer_than_the_lease_drops_nobody(seconds
         (hold,) = (await fleet.state()).holds
         assert hold.grant == running.grant
         assert not [revoked for grants in fleet.published for revoked in grants.revoked]
+        rcm.stop()
+
+    run(story())
+
+
+def test_the_link_to_one_rc_of_a_host_may_be_the_first_that_a_leader_which_is_cut_off_loses() -> None:
+    """Others of that host are seen still, and do not answer."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm, rc, other, client = fleet.rcm(), fleet.rc("robot/a"), fleet.rc("robot/b"), fleet.client("one")
+        await fleet.joined(rc, other)
+        running = await client.ask("tally", "robot/a", seconds=60)
+        for of, late in ((rc.mesh, 0.0), (other.mesh, 0.15), (client.mesh, 0.0), (fleet.watcher, 0.0)):
+            await asyncio.sleep(late)
+            for ends in ((rcm.mesh, of), (of, rcm.mesh)):
+                fleet.network.cut(*ends)
+        await asyncio.sleep(0.95)
+        fleet.network.heal()
+        await asyncio.sleep(3)
+        (hold,) = (await fleet.state()).holds
+        assert hold.grant == running.grant
         rcm.stop()
 
     run(story())

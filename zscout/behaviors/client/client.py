@@ -302,17 +302,17 @@ class Client(MovableClient):
             raise CommandRefused(rc, Problem("unknown", "no answer; it may have been done or not"))
         if reply.message is None:
             refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
-            if refused.code in NOT_HELD and grant not in self._denied:
-                self._denied.add(grant)
-                self._supervisor.call_later(TOLD_WITHIN, self._lose, grant, str(refused))
+            if refused.code in NOT_HELD:
+                for arc in [arc for arc in self._store.open if arc.grant == grant and grant not in self._denied]:
+                    self._denied.add(grant)
+                    self._supervisor.call_later(TOLD_WITHIN, self._lose, arc, grant, str(refused))
             raise refused
         return reply.message
 
-    def _lose(self, grant: Grant, reason: str) -> None:
+    def _lose(self, arc: OpenArc, grant: Grant, reason: str) -> None:
         """An RC of this grant does not know it any more, and no notice has said so."""
         self._denied.discard(grant)
-        arc = next((arc for arc in self._store.open if arc.grant == grant), None)
-        if arc is not None and self._store.resumed.is_set():
+        if arc.grant == grant and arc.id in self._store.arcs and self._store.resumed.is_set():
             arc.lose(reason, self.mesh.now())
             self._store.notify(arc)
             self._supervisor.spawn(self._ask_again(arc))

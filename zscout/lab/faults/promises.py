@@ -38,6 +38,8 @@ JUST_NOW: Final = 0.1
 LEFT_OVER: Final = 7.0
 """Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
 
+LOSSES: Final = ("lost", "client_lost")
+
 Rank: TypeAlias = tuple[int, Ns, Place]
 
 
@@ -65,6 +67,12 @@ class Promises:
         """By term: ARCs that its RCM has ended for good."""
         self._over: set[str] = set()
         """ARCs that their clients have ended."""
+        self._granted: dict[str, tuple[str, list[str]]] = {}
+        """By ARC: the last grant that its client was told of, and its RCs."""
+        self._had: dict[str, set[str]] = {}
+        """By grant: the RCs that have held it."""
+        self._taken: set[str] = set()
+        """Grants that an RCM has ended, and not for a loss."""
         self._dropped: dict[str, float] = {}
         """ARCs whose clients were taken for gone, and when."""
         self._places: dict[tuple[str, str], Place] = {}
@@ -84,6 +92,7 @@ class Promises:
         """A line of `zscout.trace`: at every event, what an RC may not do whatever it hears."""
         if what["do"] == "publish":
             ended = self._ended_by.setdefault(str(what["term"]), set())
+            self._taken |= {str(grant) for grant, outcome in what["ends"] if outcome not in LOSSES}
             for rc, holders in what["rcs"].items():
                 for grant, arc, *_ in holders:
                     answer = self._answers.get((what["instances"].get(rc), str(what["term"])))
@@ -108,6 +117,8 @@ class Promises:
             self._answers.setdefault((instance, str(what["promised"])), set()).update(map(str, what["holds"]))
             self._promised[instance] = max(what["promised"], promised)
         held, ended = {str(grant) for grant in what["holds"]}, self._ended.setdefault(instance, set())
+        for grant in held - self._held.get(instance, set()):
+            self._had.setdefault(grant, set()).add(rc)
         ended |= self._held.get(instance, set()) - held
         if again := held & ended:
             self._broken(f"{rc} holds {', '.join(sorted(again))} again")
@@ -133,8 +144,9 @@ class Promises:
             self._over.add(full)
         if arc.outcome == "lost" and arc.reason.startswith("the RCM refuses it"):
             self._broken(f"{name} {arc.name} was taken, and then refused: {arc.reason}")
-        # A grant that was not confirmed is no hold that was lost: it never was one.
-        if arc.outcome in ("lost", "client_lost") and arc.unconfirmed is None and not touched:
+        if arc.grant is not None:
+            self._granted[full] = _written(arc.grant), arc.rcs
+        elif arc.outcome in LOSSES and arc.unconfirmed is None and not touched and self._stood(full):
             self._broken(f"{name} {arc.name} {arc.outcome}, though no fault touched it: {arc.reason}")
         if arc.place is not None:
             before = self._places.setdefault((name, arc.id), arc.place)
@@ -144,6 +156,11 @@ class Promises:
             self._dropped[full] = self._now()
         if arc.outcome == "client_lost" and not arc.open:
             self._broken(f"{name} lives, and was dropped")
+
+    def _stood(self, arc: str) -> bool:
+        """Whether the hold that its client lost was one: all of its RCs had it, and no RCM ended it for another."""
+        grant, rcs = self._granted.get(arc, ("", []))
+        return grant not in self._taken and self._had.get(grant, set()).issuperset(rcs)
 
     def look(
         self,

@@ -395,7 +395,8 @@ class Simulation:
 
     def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float) -> bool:
         # Of a leader's links the first was lost as the others came back: nobody can tell that from a host that goes.
-        just_over = 0 <= self.loop.now - START - fault.at - fault.lasts < 2 * AT_ONCE
+        lasts, timing = self.loop.now - START - fault.at, self.fleet.timing
+        just_over = 0 <= lasts - fault.lasts < 2 * AT_ONCE
         match fault.kind:
             case "stall" | "kill" | "fail" | "double":
                 return bool(names & {*fault.whom})
@@ -405,7 +406,9 @@ class Simulation:
                 side = hosts & {*fault.whom}
                 there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
                 parted = bool(side and hosts - side) or not there & {*self.candidates_at}
-                return just_over or parted or since > fault.at
+                # A candidate that is left alone waits longer than the hold lease: it may be cut off itself.
+                alone = len(there) == 1 and lasts > (timing.hold_lease - timing.heartbeat) / SECOND
+                return just_over or parted or alone or since > fault.at
             case _:
                 return True
 

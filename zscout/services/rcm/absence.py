@@ -18,14 +18,14 @@ AWAY: Final = 0.25
 AT_ONCE: Final = 0.05
 """Seconds within which others answer a leader that is not away. A later answer proves nothing: it may be back since."""
 MAX_ASKED: Final = 3
-"""Other hosts that are asked whether this one is away."""
+"""Hosts that are asked whether this one is away."""
 
 Asked: TypeAlias = tuple[str, type[Struct]]
 """A key, and what is answered there."""
 
 
 class Absence:
-    """Of one leader: it stood still, or lost several hosts at once. Of one host that goes it is not known for the
+    """Of one leader: it stood still, or lost several hosts at once. Of one token that goes it is not known for the
     moment that others take to answer; `on_present` is called once they have.
 
     `lease` is the mesh lease in seconds."""
@@ -42,7 +42,7 @@ class Absence:
         return Declaration(self._stall.start().stop)
 
     def token_went(self, host: HostName, *, last: bool, others: Callable[[], Sequence[Asked]]) -> None:
-        """A token of `host` is gone, the `last` one that was seen of it. `others`: whom to ask on other hosts."""
+        """A token of `host` is gone, the `last` one that was seen of it. `others`: whom to ask, on hosts seen."""
         now = self._mesh.now()
         if last:
             self._gone.append((now, host))
@@ -50,8 +50,8 @@ class Absence:
             self._gone.popleft()
         if (self._stall.fresh() and self._stall.length > self._span) or self._lost_several:
             self._until = now + self._lease
-        elif last and not self.lasts and (asked := others()[:MAX_ASKED]):
-            # Of several links that are lost, one is the first.
+        elif not self.lasts and (asked := others()[:MAX_ASKED]):
+            # Of several links that are lost, be it to one host, one is the first.
             self._until = now + self._lease
             for key, kind in asked:
                 self._supervisor.spawn(self._ask(key, kind))

@@ -202,17 +202,17 @@ class Membership:
         """Whether `token` may have gone because this leader was away."""
         if not self._absence.lasts:
             self._doubted.clear()
-        self._absence.token_went(token.host, last=not self._sees(token.host), others=partial(self._others, token.host))
+        self._absence.token_went(token.host, last=not self._sees(token.host), others=self._others)
         return self._absence.lasts
 
-    def _others(self, gone: HostName) -> list[Asked]:
-        """Where RCs and clients answer on hosts other than this one and the one that is `gone`: one of each host."""
-        keys, here = self.mesh.keys, (gone, self.mesh.me.host)
+    def _others(self) -> list[Asked]:
+        """Where RCs and clients that are seen answer on hosts other than this one: one of each host."""
+        keys = self.mesh.keys
         clients = map(client_of, self.clients)
         asked: dict[HostName, Asked] = {one.host: (keys.requests(one), ClientRequests) for one in clients}
         tokens = [token for of_rc in self._rc_tokens.values() for token in of_rc.values()]
         asked |= {one.host: (keys.rc_state(one.name), RcState) for one in tokens}
-        return [asked[host] for host in sorted(asked) if host not in here]
+        return [asked[host] for host in sorted(asked) if host != self.mesh.me.host]
 
     def _is_present(self) -> None:
         """This leader was not away: what went has gone."""

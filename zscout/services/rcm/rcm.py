@@ -52,7 +52,7 @@ from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.services.rcm.registry import RequestRegistry, reason_info, request_id
 from zscout.services.rcm.request_handler import RequestHandler
-from zscout.types import SECOND, ClientId, Ns, RcName, Term
+from zscout.types import SECOND, ArcId, ClientId, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -93,6 +93,8 @@ class Rcm:
         """When that was."""
         self._named: dict[RcName, int] = {}
         """The number of the last publication that named an RC."""
+        self._recovered: dict[ClientId, set[ArcId]] = {}
+        """By client: the ARCs that only RCs have told of."""
         self._vote_timeout = fleet.timing.vote_timeout / SECOND
         self._voted = supervisor.guard(self._on_ballot)
         self._declared: list[Declaration] = []
@@ -113,8 +115,9 @@ class Rcm:
         for request in requests:
             self.registry.enter(request.arc, request.name)
             self.membership.expect(request.client)
-        for client in {hold.request.client for hold in recovered.holds} - recovered.answered:
-            self.membership.ask_requests(client)
+        for request in requests:
+            if request.client not in recovered.answered:
+                self._recover(request)
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*joined, lead], named=recovered.rcs)
@@ -141,8 +144,10 @@ class Rcm:
     def _receive(self, *events: Event) -> None:
         """What has happened; events that come together are one instant."""
         match events:
-            case [ClientLost(client)] if not self.core.arcs_of(client):
-                return
+            case [ClientLost(client)]:
+                self._recovered.pop(client, None)
+                if not self.core.arcs_of(client):
+                    return
         if self.supervisor.active:
             # What was asked before is decided before.
             self.requests.flush()
@@ -160,11 +165,15 @@ class Rcm:
             self._publish([], [rc])
 
     def _on_requests(self, client: ClientId, ids: Collection[str]) -> None:
-        """What a client does not ask for any more of earlier terms it gave up where this RCM could not hear of it."""
-        arcs = filter(None, map(self.core.arc, self.core.arcs_of(client)))
-        earlier = [arc.id for arc in arcs if arc.hold is not None and arc.hold.grant.term < self.term]
-        if given_up := [Released(arc) for arc in earlier if request_id(arc) not in ids]:
+        """What RCs alone told of, and a client does not ask for: it gave that up where no RCM heard of it."""
+        known = self._recovered.pop(client, set()) & {*self.core.arcs_of(client)}
+        if given_up := [Released(arc) for arc in sorted(known) if request_id(arc) not in ids]:
             self._receive(*given_up)
+
+    def _recover(self, request: ArcRequest) -> None:
+        """Has a client say whether it still asks for what RCs hold for it."""
+        self._recovered.setdefault(request.client, set()).add(request.arc)
+        self.membership.ask_requests(request.client)
 
     # Events, and out
 
@@ -182,7 +191,7 @@ class Rcm:
                     self.registry.enter(request.arc, request.name)
                     if client not in seen:
                         self.membership.expect(client)
-                    self.membership.ask_requests(client)
+                    self._recover(request)
         self._publish(effects, named)
         self.registry.report(effects, self.requests.waiting, self.requests.given_up)
         self.requests.answer(effects)
@@ -256,7 +265,10 @@ class Rcm:
                 rc: [(one.grant, f"{one.client}/{one.id}", one.place, one.rcs) for one in held]
                 for rc, held in rcs.items()
             }
-            trace.write(self.mesh.now(), "publish", term=self.term, seq=number, rcs=holders, instances=instances)
+            ends = [(one.grant, one.outcome) for one in revoked]
+            trace.write(
+                self.mesh.now(), "publish", term=self.term, seq=number, rcs=holders, instances=instances, ends=ends
+            )
         self._grants.put(messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances))
         self.seq, self._published = number, self.mesh.now()
 
