@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -408,3 +409,22 @@ def test_connecting_can_be_awaited_entered_and_run_as_a_task(monkeypatch: pytest
                 assert [client.mesh.me.client for client in (awaited, task)] == ["awaited", "task"]
 
     run(test())
+
+
+def test_a_client_that_hears_no_publication_of_an_rcm_that_answers_joins_the_mesh_anew(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            await one.request("absent", {"robot/z": {}}, min_runtime=60)
+            await asyncio.sleep(60)
+            assert not caplog.records
+            before = one.mesh._transport.id()
+            fleet.network.disturb({"grants": Disturbance(lost=1.0)})
+            await until(lambda: one.mesh._transport.id() != before)
+            fleet.network.disturb({})
+
+    with caplog.at_level(logging.WARNING, "zscout.mesh"):
+        run(test())
+    said = {record.message.partition(": this process")[0] for record in caplog.records}
+    assert "an RCM answers that does not publish" in said
