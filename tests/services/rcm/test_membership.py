@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 from decimal import Decimal
 from typing import Any
+from unittest.mock import ANY
 
 import pytest
+from msgspec.structs import replace
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, FakeRc
@@ -16,6 +18,7 @@ from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined,
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rcm.membership import discrepancies
 from zscout.services.rcm.rcm import holders_of
+from zscout.services.rcm.recovery import RecoveredState
 from zscout.types import SECOND, Grant, Place, Term
 
 RC = "robot/x"
@@ -70,13 +73,15 @@ def holding(fleet: FakeFleet, name: str, **how: bool) -> FakeRc:
     return fleet.rc(name, term=HELD.grant.term, holders=[HELD], **how)
 
 
+@pytest.mark.parametrize("alone", [True, False])
 @pytest.mark.parametrize("apart", [0.1, 0.7])
-def test_rcs_that_join_one_after_the_other_keep_what_they_hold_together(apart: float) -> None:
-    """Though nothing shows yet that the second is there: a leader that began alone was cut off itself."""
+def test_rcs_that_join_one_after_the_other_keep_what_they_hold_together(apart: float, alone: bool) -> None:
+    """Though nothing shows yet that the second is there: links to hosts that were cut off come back one by one."""
 
     async def story() -> None:
         fleet = FakeFleet()
-        rcm = fleet.rcm(5)
+        there = [] if alone else [fleet.rc("robot/c").state()]
+        rcm = fleet.rcm(5, RecoveredState({state.rc: state for state in there}))
         client = fleet.client("one")
         client.open = [OpenRequest("tally", "tally", {rc: {} for rc in HELD.rcs}, 0, Decimal(60), **BELIEVED)]
         first = holding(fleet, "robot/a")
@@ -85,9 +90,30 @@ def test_rcs_that_join_one_after_the_other_keep_what_they_hold_together(apart: f
         second = holding(fleet, "robot/b")
         await fleet.joined(first, second)
         assert (await client.ask("tally", *HELD.rcs, **BELIEVED)).grant == HELD.grant
-        assert [one.revoked for one in fleet.published] == [[]]
+        assert not [one.revoked for one in fleet.published if one.revoked]
         assert [holder.grant for holder in (*first.holders, *second.holders)] == [HELD.grant] * 2
         assert rcm.core.waiting == 0
+
+    run(story())
+
+
+def test_a_client_whose_rcs_come_back_one_after_the_other_has_a_lease_from_the_last_to_show_itself() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm(5)
+        other = replace(HELD, id="other", arc="other", grant=HELD.grant._replace(seq=5), rcs=["robot/c"])
+        first = fleet.rc("robot/c", term=HELD.grant.term, holders=[other])
+        await asyncio.sleep(0.7)
+        robots = [holding(fleet, name) for name in HELD.rcs]
+        await asyncio.sleep(0.7)
+        client = fleet.client("one")
+        client.open = [
+            OpenRequest(one.arc, one.arc, {rc: {} for rc in one.rcs}, 0, Decimal(60), one.place, grant=one.grant)
+            for one in (HELD, other)
+        ]
+        await asyncio.sleep(3)
+        assert [rc.holders for rc in (first, *robots)] == [[ANY], [ANY], [ANY]]
+        assert not [revoked for grants in fleet.published for revoked in grants.revoked]
 
     run(story())
 

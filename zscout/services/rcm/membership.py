@@ -42,6 +42,8 @@ class _Pending:
     """An RC that answered, and does not count yet."""
 
     state: RcState
+    patient: bool
+    """Links may be coming back, one after the other: it waits a lease for its gang, seen or not."""
     waited: float = 0.0
     """For how many seconds, as far as that was measured: for an answer, or for a lease."""
 
@@ -80,8 +82,6 @@ class Membership:
         """The RCs that count as there, as they reported themselves last."""
         self._pending: dict[RcName, _Pending] = {}
         """RCs that answered with holds of earlier terms: the other RCs of those gangs may answer too."""
-        self._began_alone = False
-        """No RC of another host answered before the term began: links may be coming back, one after the other."""
         self.on_settled: Callable[[], None] = lambda: None
         """Called when RCs are not pending any more."""
         self.on_requests: Callable[[ClientId, set[str]], None] = lambda *_: None
@@ -104,11 +104,11 @@ class Membership:
         """The RCs that promised to obey before the term began; those that are `pending` join later."""
         self._joined.update(rcs)
         states = (*rcs.values(), *pending)
-        self._began_alone = all(state.host == self.mesh.me.host for state in states)
+        alone = all(state.host == self.mesh.me.host for state in states)
         for state in states:
             self._named[state.rc] = state.instance, state.host
         for state in pending:
-            self._hold_up(state)
+            self._hold_up(state, patient=alone)
         # One that died before its token was watched would never be seen to go.
         self._supervisor.call_later(self._lease, self._drop_unseen)
         return [RcJoined(name, state.sharable) for name, state in rcs.items() if state.health == "ok"]
@@ -373,13 +373,13 @@ class Membership:
         """An RC joins at once, if it holds nothing of an earlier term; else with all RCs of its gangs: a hold that all
         of them have goes on."""
         if any(holder.grant.term != self.term for holder in state.holders):
-            self._hold_up(state)
+            self._hold_up(state, patient=True)
         else:
             self._admit([state])
         self._settle()
 
-    def _hold_up(self, state: RcState) -> None:
-        pending = self._pending[state.rc] = _Pending(state)
+    def _hold_up(self, state: RcState, *, patient: bool) -> None:
+        pending = self._pending[state.rc] = _Pending(state, patient)
         for wait in (self._timeout, self._lease):
             self._supervisor.call_later(wait, self._wait_over, pending, wait)
 
@@ -389,14 +389,14 @@ class Membership:
 
     def _settle(self) -> None:
         """Lets in the pending RCs whose gangs have answered. Others wait for a lease; where nothing shows that one of
-        the gang lives, only as long as for an answer."""
+        the gang lives, and all links of this leader stood as it began, only as long as for an answer."""
         for rc in list(self._pending):
-            if rc not in self._pending:
+            if (pending := self._pending.get(rc)) is None:
                 continue
             gangs = gangs_of(rc, {one: pending.state for one, pending in self._pending.items()})
             missing = gangs - self._joined.keys() - self._pending.keys()
-            seen = self._began_alone or any(one in self._rc_tokens for one in missing)
-            if not missing or self._pending[rc].waited >= (self._lease if seen else self._timeout):
+            patient = pending.patient or any(one in self._rc_tokens for one in missing)
+            if not missing or pending.waited >= (self._lease if patient else self._timeout):
                 self._admit([self._pending.pop(one).state for one in sorted(gangs & self._pending.keys())])
 
     def _admit(self, states: list[RcState]) -> None:

@@ -190,6 +190,8 @@ class Rcm:
                 case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
                     self.registry.enter(request.arc, request.name)
                     if client not in seen:
+                        # As the links to its RCs came back just now, so may its own.
+                        self.membership.heard(client)
                         self.membership.expect(client)
                     self._recover(request)
         self._publish(effects, named)
