@@ -407,7 +407,7 @@ class Simulation:
                 there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
                 parted = bool(side and hosts - side) or not there & {*self.candidates_at}
                 # A candidate that is left alone waits longer than the hold lease: it may be cut off itself.
-                alone = len(there) == 1 and lasts > (timing.hold_lease - timing.heartbeat) / SECOND
+                alone = len(there) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
                 return just_over or parted or alone or since > fault.at
             case _:
                 return True
