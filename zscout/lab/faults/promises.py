@@ -68,7 +68,7 @@ class Promises:
         self._over: set[str] = set()
         """ARCs that their clients have ended."""
         self._granted: dict[str, tuple[str, list[str]]] = {}
-        """By ARC: the last grant that its client was told of, and its RCs."""
+        """By ARC that runs, as its client has it: its grant and RCs."""
         self._had: dict[str, set[str]] = {}
         """By grant: the RCs that have held it."""
         self._taken: set[str] = set()
@@ -144,10 +144,14 @@ class Promises:
             self._over.add(full)
         if arc.outcome == "lost" and arc.reason.startswith("the RCM refuses it"):
             self._broken(f"{name} {arc.name} was taken, and then refused: {arc.reason}")
+        held, granted = self._granted.pop(full, ("", [])), ""
         if arc.grant is not None:
-            self._granted[full] = _written(arc.grant), arc.rcs
-        elif arc.outcome in LOSSES and arc.unconfirmed is None and not touched and self._stood(full):
-            self._broken(f"{name} {arc.name} {arc.outcome}, though no fault touched it: {arc.reason}")
+            granted = _written(arc.grant)
+            self._granted[full] = granted, arc.rcs
+        lost = (arc.outcome in LOSSES or granted not in ("", held[0])) and self._stood(*held)
+        if (lost or arc.outcome == "client_lost") and arc.unconfirmed is None and not touched:
+            how = f"was granted anew {granted}" if granted else arc.outcome
+            self._broken(f"{name} {arc.name} {how}, though no fault touched it: {arc.reason}")
         if arc.place is not None:
             before = self._places.setdefault((name, arc.id), arc.place)
             if arc.place > before:
@@ -157,10 +161,9 @@ class Promises:
         if arc.outcome == "client_lost" and not arc.open:
             self._broken(f"{name} lives, and was dropped")
 
-    def _stood(self, arc: str) -> bool:
-        """Whether the hold that its client lost was one: all of its RCs had it, and no RCM ended it for another."""
-        grant, rcs = self._granted.get(arc, ("", []))
-        return grant not in self._taken and self._had.get(grant, set()).issuperset(rcs)
+    def _stood(self, grant: str, rcs: Sequence[str]) -> bool:
+        """Whether this was a hold, and nobody's turn came: all of its RCs had it, and no RCM ended it but for a loss."""
+        return bool(rcs) and grant not in self._taken and self._had.get(grant, set()).issuperset(rcs)
 
     def look(
         self,
