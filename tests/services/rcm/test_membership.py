@@ -108,7 +108,7 @@ def test_a_client_whose_rcs_come_back_one_after_the_other_has_a_lease_from_the_l
         await asyncio.sleep(0.7)
         client = fleet.client("one")
         client.open = [
-            OpenRequest(one.arc, one.arc, {rc: {} for rc in one.rcs}, 0, Decimal(60), one.place, grant=one.grant)
+            OpenRequest(one.arc, one.arc, {rc: {} for rc in one.rcs}, 0, Decimal(60), place=one.place, grant=one.grant)
             for one in (HELD, other)
         ]
         await asyncio.sleep(3)

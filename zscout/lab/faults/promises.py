@@ -162,7 +162,7 @@ class Promises:
             self._broken(f"{name} lives, and was dropped")
 
     def _stood(self, grant: str, rcs: Sequence[str]) -> bool:
-        """Whether this was a hold, and nobody's turn came: all of its RCs had it, and no RCM ended it but for a loss."""
+        """Whether this was a hold that went on: all of its RCs had it, and no RCM ended it but for a loss."""
         return bool(rcs) and grant not in self._taken and self._had.get(grant, set()).issuperset(rcs)
 
     def look(
