@@ -56,7 +56,7 @@ class Promises:
         self.terms: dict[Term, float] = {}
         """Of every leader that was seen, and when it was seen first."""
         self.unheard = False
-        """Whether no publication of any RCM arrives: there is a new one every few seconds."""
+        """Whether no publication of any RCM arrives, or no token of a new one: there is one every few seconds."""
         self._begun: list[float] = []
         """When terms began, but for those that began unheard."""
         self._told: dict[str, tuple[Term, int]] = {}
