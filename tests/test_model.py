@@ -61,6 +61,7 @@ def test_a_forged_step_is_refused_in_any_piece(trace: list[str]) -> None:
     verdict = accept([*forged, Behaviour(trace), cut])
     assert verdict.refused.keys() == {0, 1, 3}
     assert "piece 1, " in verdict.refused[0]
-    assert f"line {heard[-1] + 1}, piece {len(forged[1].pieces)}, " in verdict.refused[1]
+    assert f"line {heard[-1] + 1}, piece " in verdict.refused[1]
+    assert "piece 1, " not in verdict.refused[1]
     assert "holds" in verdict.refused[1]
     assert "does not lead to" in verdict.refused[3]

@@ -51,8 +51,9 @@ class MjpegServer:
     """Serves numbered pictures to whoever connects, `rate` a second; a context manager.
 
     `mode` may be changed at any time: "run", "stall" (silent, also to who connects), "garble" (every second
-    JPEG has its body overwritten), "half" (half a JPEG, then silence), "torn" (half a JPEG, then closed),
-    "404". `clients` bounds how many are served at once; others are refused with 503.
+    JPEG has its body overwritten), "half" (half a JPEG, then silence for as long as that client stays: what went
+    on from there would pass for the other half), "torn" (half a JPEG, then closed), "404". `clients` bounds how
+    many are served at once; others are refused with 503.
     """
 
     def __init__(self, *, rate: float = 30.0, clients: int = 8, picture: Callable[[int], bytes] | None = None):
@@ -159,7 +160,6 @@ class MjpegServer:
             due = max(due + 1 / self.rate, time.monotonic() - 1)
             closing.wait(max(0.0, due - time.monotonic()))
             mode = self.mode
-            half &= mode == "half"
             if mode == "stall" or half:
                 # A client that has left is noticed all the same.
                 client.setblocking(False)

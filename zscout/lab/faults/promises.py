@@ -201,7 +201,9 @@ class Promises:
         waited = [
             arc
             for arc in status.queued
-            if queued.get(arc.id) == _rank(arc) and self._now() - self._dropped.get(arc.id, 0) > JUST_NOW
+            if queued.get(arc.id) == _rank(arc)
+            and _is_next(arc)
+            and self._now() - self._dropped.get(arc.id, 0) > JUST_NOW
         ]
         for arc, other in product(granted, waited):
             if _rank(other) < _rank(arc) and other.needs.keys() <= arc.needs.keys():
@@ -209,9 +211,7 @@ class Promises:
         self._running[rcm.term] = {arc.hold.grant for arc in status.running if arc.hold is not None}
         sharable = {rc.name for rc in status.rcs if rc.sharable}
         self._queued[rcm.term] = {
-            arc.id: _rank(arc)
-            for arc in status.queued
-            if not arc.needs.keys() & sharable and (arc.reported is None or arc.reported.code is ReasonCode.HELD)
+            arc.id: _rank(arc) for arc in status.queued if not arc.needs.keys() & sharable and _is_next(arc)
         }
 
     def _given_up(self, rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
@@ -246,6 +246,11 @@ def _written(grant: Grant) -> str:
 
 def _rank(arc: ArcStatus) -> Rank:
     return (-arc.request.priority, arc.request.min_runtime, arc.place)
+
+
+def _is_next(arc: ArcStatus) -> bool:
+    """Whether it waits for nothing but what others hold."""
+    return arc.reported is None or arc.reported.code is ReasonCode.HELD
 
 
 def _half_gangs(clients: Mapping[str, Client], rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
