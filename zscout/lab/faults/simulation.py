@@ -28,7 +28,7 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.lab.faults import plan
 from zscout.lab.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent, operate, report_load
-from zscout.lab.faults.device import NO_GRANT, Device, WatchedCapacity, WatchedExclusive
+from zscout.lab.faults.device import Device, WatchedCapacity, WatchedExclusive
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.lab.faults.plan import Fault
 from zscout.lab.faults.programs import Work
@@ -365,15 +365,13 @@ class Simulation:
     async def _client(self, name: str, mesh: MemoryMesh) -> None:
         client = self.programs[name] = Client(mesh, self.fleet).start()
         busy = self.busy[name] = set()
-        began: dict[str, tuple[Grant, float]] = {}
+        began: dict[str, tuple[Grant | None, float]] = {}
         """By ARC: its last grant, and since when it was known here."""
 
         def watch(arc: OpenArc) -> None:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
-            grant, since = began.get(arc.id, (NO_GRANT, 0.0))
-            leader = self._leader_of(grant)
-            touched = self._touched(since, leader, name, *arc.rcs, *arc.needs)
-            self.promises.told(name, arc, client.term, touched=touched)
+            grant, since = began.get(arc.id, (None, 0.0))
+            self.promises.told(name, arc, client.term, touched=self._touched(since, name, *arc.rcs, *arc.needs))
             if arc.grant is not None and arc.grant != grant:
                 began[arc.id] = arc.grant, self.loop.now - START
 
@@ -382,15 +380,9 @@ class Simulation:
 
     # Faults
 
-    def _leader_of(self, grant: Grant) -> str | None:
-        """The host whose leader gave it, if that leads still."""
-        leads = ((host, one.rcm.term) for host, one in self.candidates.items() if one.rcm is not None)
-        return next((host for host, term in leads if term == grant.term), None)
-
-    def _touched(self, since: float, leader: str | None, *whom: str) -> bool:
+    def _touched(self, since: float, *whom: str) -> bool:
         """Whether a fault may be felt by these processes and RCs: one of now, or one that was over lately. What began
-        (`since`) while hosts were apart may be the grant of a leader that does not see all of its RCs yet. `leader`:
-        the host of that which gave it, if that leads still."""
+        (`since`) while hosts were apart may be the grant of a leader that does not see all of its RCs yet."""
         names = {*whom, *(self.where[rc] for rc in whom if rc in self.where)}
         hosts = {name.split("/")[0] for name in names} & {*self.hosts}
         lately = self.loop.now - START - FELT
@@ -399,11 +391,17 @@ class Simulation:
             for fault in self.faults
             if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
-        return any(self._touches(fault, names, hosts, since, leader) for fault in faults)
+        return any(self._touches(fault, names, hosts, since) for fault in faults)
 
-    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float, leader: str | None) -> bool:
+    def _led_since(self, at: float) -> set[str]:
+        """Hosts whose leaders lead, and did then."""
+        led = ((host, one.rcm.term) for host, one in self.candidates.items() if one.rcm is not None)
+        return {host for host, term in led if self.promises.terms.get(term, self.loop.now) < at + START}
+
+    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float) -> bool:
         # Of a leader's links the first was lost as the others came back: nobody can tell that from a host that goes.
-        just_over = 0 <= self.loop.now - START - fault.at - fault.lasts < 2 * AT_ONCE
+        lasts, timing = self.loop.now - START - fault.at, self.fleet.timing
+        just_over = 0 <= lasts - fault.lasts < 2 * AT_ONCE
         match fault.kind:
             case "stall" | "kill" | "fail" | "double":
                 return bool(names & {*fault.whom})
@@ -413,9 +411,11 @@ class Simulation:
                 side = hosts & {*fault.whom}
                 there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
                 parted = bool(side and hosts - side) or not there & {*self.candidates_at}
-                # A leader that goes on has given to others what it did not see for a lease.
-                left = leader not in (None, *there) and fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE)
-                return just_over or parted or left or since > fault.at
+                # A leader on the other side that goes on has given to others what it did not see for a lease.
+                left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and self._led_since(fault.at) - there
+                # A candidate that is left alone waits for as long as a hold lasts: it may be cut off itself.
+                alone = len(there) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
+                return just_over or parted or bool(left) or alone or since > fault.at
             case _:
                 return True
 
