@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from tests.services.recorder.paper_run import SCOUT33, events, lanes
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
-from zscout.messages import Grants, Holder, Notice, RcmState, StateAsk
+from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, StateAsk
 from zscout.services.recorder.recorder import Recorder, RecorderFailed
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import Grant, Place, Term
@@ -24,12 +25,18 @@ GRANT = Grant(TERM, 1)
 PLACE = Place(TERM, 1)
 
 
-def leader(network: MemoryNetwork) -> MemoryMesh:
-    """An RCM that has nothing yet."""
+def leader(network: MemoryNetwork, state: Callable[[], RcmState] = lambda: RcmState(TERM, 0, "anvil")) -> MemoryMesh:
+    """An RCM; without `state` one that has nothing yet."""
     mesh = network.open("lab", Sender("anvil", "rcm"))
-    mesh.serve(mesh.keys.rcm_state, StateAsk, lambda query: query.answer(RcmState(TERM, 0, "anvil")))
+    mesh.serve(mesh.keys.rcm_state, StateAsk, lambda query: query.answer(state()))
     mesh.alive(Token("anvil", Role.RCM, "rcm", "i1"))
     return mesh
+
+
+async def rcm_sees(rcm: MemoryMesh, role: str) -> None:
+    seen: list[Token] = []
+    rcm.watch(rcm.keys.alive_any(role), lambda token, _: seen.append(token))
+    await until(lambda: seen)
 
 
 def grants(seq: int, *holders: Holder) -> Grants:
@@ -42,11 +49,9 @@ def test_it_reads_the_state_and_follows_what_is_published(tmp_path: Path) -> Non
     async def play() -> None:
         network, stop = MemoryNetwork(), asyncio.Event()
         rcm, here = leader(network), network.open("lab", Sender("basil", "recorder"))
-        ready: list[Token] = []
-        rcm.watch(rcm.keys.alive_any(Role.RECORDER), lambda token, alive: ready.append(token))
         with Timeline("lab", path=path) as timeline:
             recording = asyncio.create_task(Recorder(here, default_fleet(), timeline).run(stop))
-            await until(lambda: ready)
+            await rcm_sees(rcm, Role.RECORDER)
             me = Sender("cart", "net")
             notice = Notice("a1", "hide", str(me), "queued", TERM, 1, reason="robot/scout33 is held by drive")
             rcm.put(rcm.keys.notice(me), notice)
@@ -64,6 +69,26 @@ def test_it_reads_the_state_and_follows_what_is_published(tmp_path: Path) -> Non
     doing = [state[0] for _, state in lanes(path, "/arc/**")["/arc/hide"]]
     assert doing == ["waiting · robot/scout33 is held by drive", "running · priority 1 · min 5 s"]
     assert "hide runs on robot/scout33" in events(path)
+
+
+def test_at_its_end_it_reads_what_was_published_and_missed(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    async def play() -> None:
+        network, stop = MemoryNetwork(), asyncio.Event()
+        view = HoldView("a1", "hide", "cart/net", 1, GRANT, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, 5.0)
+        holds: list[HoldView] = []
+        rcm = leader(network, lambda: RcmState(TERM, len(holds), "anvil", holds))
+        with Timeline("lab", path=path) as timeline:
+            recorder = Recorder(network.open("lab", Sender("basil", "recorder")), default_fleet(), timeline)
+            recording = asyncio.create_task(recorder.run(stop))
+            await rcm_sees(rcm, Role.RECORDER)
+            holds.append(view)
+            stop.set()
+            await recording
+
+    run(play())
+    assert [state for _, state in lanes(path, "/rc/**")[f"/rc/{SCOUT33}"]] == [["hide"]]
 
 
 def test_a_part_that_raises_is_logged_and_ends_it(

@@ -32,8 +32,6 @@ AGAIN: Final = 2.0
 """Seconds until a placer that did not answer is asked again."""
 TRIES: Final = 5
 """Past it, it is asked when an RCM comes or something was missed."""
-DRAIN: Final = 2.0
-"""Seconds for what was published before the end and is still on its way."""
 CHECK_EVERY: Final = 1.0
 """Seconds between two checks whether anything was dropped here."""
 DEPTH: Final = 8_192
@@ -109,9 +107,9 @@ class Recorder:
             await stop.wait()
             if self._supervisor.error is not None:
                 raise RecorderFailed from self._supervisor.error
-            # `stop` may be quicker than what was published before. An answer of the RCM comes behind all that
-            # it has published, on the same link; where nobody leads there is nothing to wait for.
-            await self.mesh.ask_one(keys.rcm_state, messages.StateAsk(), messages.RcmState, timeout=DRAIN)
+            # `stop` may be quicker than what was published before, some of which may have been missed. An answer of
+            # the RCM comes behind all that it has published; where nobody leads there is nothing to wait for.
+            await self._read()
         finally:
             await self._supervisor.close()
             for declared in [*robots, *reversed(self._declared)]:
