@@ -145,7 +145,8 @@ class DemoRunner(ABC):
 
         def seen(token: Token, alive: bool) -> None:
             if alive:
-                missing.difference_update((token.role, token.name, token.host if token.role == Role.NODE else ""))
+                # By role: the session of a recorder that has read nothing yet is named like one.
+                missing.difference_update((token.role, {Role.NODE: token.host, Role.RC: token.name}.get(token.role)))
             if not missing:
                 complete.set()
 
