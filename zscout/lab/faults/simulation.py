@@ -391,14 +391,17 @@ class Simulation:
             for fault in self.faults
             if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
-        return any(self._touches(fault, names, hosts, since) for fault in faults)
+        failing = {one for fault in faults if fault.kind in ("freeze", "stall", "kill") for one in fault.whom}
+        able = {host for host in self.candidates_at if f"{host}/node" not in failing}
+        return any(self._touches(fault, names, hosts, since, able) for fault in faults)
 
     def _led_since(self, at: float) -> set[str]:
         """Hosts whose leaders lead, and did then."""
         led = ((host, one.rcm.term) for host, one in self.candidates.items() if one.rcm is not None)
         return {host for host, term in led if self.promises.terms.get(term, self.loop.now) < at + START}
 
-    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float) -> bool:
+    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float, able: set[str]) -> bool:
+        """`able`: hosts whose candidates are touched by no fault of their own."""
         # Of a leader's links the first was lost as the others came back: nobody can tell that from a host that goes.
         lasts, timing = self.loop.now - START - fault.at, self.fleet.timing
         just_over = 0 <= lasts - fault.lasts < 2 * AT_ONCE
@@ -410,7 +413,7 @@ class Simulation:
             case "isolate" | "part":
                 side = hosts & {*fault.whom}
                 there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
-                parted = bool(side and hosts - side) or not there & {*self.candidates_at}
+                parted = bool(side and hosts - side) or not there & able
                 # A leader on the other side that goes on has given to others what it did not see for a lease.
                 left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and self._led_since(fault.at) - there
                 # A candidate that is left alone waits for as long as a hold lasts: it may be cut off itself.
