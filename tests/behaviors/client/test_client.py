@@ -13,6 +13,8 @@ from tests.mesh.kit import run, until
 from zscout.behaviors.client.arc import Revoked, hold, holds
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.request import OpenArc
+from zscout.behaviors.components.component import ComponentContext, SafePointGate
+from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
@@ -428,3 +430,21 @@ def test_a_client_that_hears_no_publication_of_an_rcm_that_answers_joins_the_mes
         run(test())
     said = {record.message.partition(": this process")[0] for record in caplog.records}
     assert "an RCM answers that does not publish" in said
+
+
+def test_a_counter_keeps_its_hold_where_a_command_is_not_answered() -> None:
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            counter = Counter({"rc": RC})
+            counting = asyncio.create_task(counter.run(ComponentContext(one, "count", 1, SafePointGate())))
+            await until(lambda: counter.count == 3)
+            before = [arc.grant for arc in one._store.open]
+            fleet.network.disturb({"command": Disturbance(lost=1.0)})
+            await asyncio.sleep(5)
+            fleet.network.disturb({})
+            assert counter.count == 3
+            await until(lambda: counter.count == 6)
+            assert [arc.grant for arc in one._store.open] == before
+            counting.cancel()
+
+    run(test())
