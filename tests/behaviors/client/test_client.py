@@ -432,15 +432,26 @@ def test_a_client_that_hears_no_publication_of_an_rcm_that_answers_joins_the_mes
     assert "an RCM answers that does not publish" in said
 
 
-def test_a_counter_keeps_its_hold_where_a_command_is_not_answered() -> None:
+@pytest.mark.parametrize("at_once", [False, True])
+def test_a_counter_keeps_its_hold_where_a_command_is_not_answered(
+    monkeypatch: pytest.MonkeyPatch, at_once: bool
+) -> None:
+    """Be it that no answer comes for two seconds, or none at once, as where there is no link."""
+
+    async def nobody(*_: object, **__: object) -> None: ...
+
     async def test() -> None:
         async with small_fleet("one") as (fleet, (one,)):
             counter = Counter({"rc": RC})
             counting = asyncio.create_task(counter.run(ComponentContext(one, "count", 1, SafePointGate())))
             await until(lambda: counter.count == 3)
             before = [arc.grant for arc in one._store.open]
-            fleet.network.disturb({"command": Disturbance(lost=1.0)})
-            await asyncio.sleep(5)
+            with monkeypatch.context() as patch:
+                if at_once:
+                    patch.setattr(one.mesh, "ask_one", nobody)
+                else:
+                    fleet.network.disturb({"command": Disturbance(lost=1.0)})
+                await asyncio.sleep(0.5 if at_once else 5)
             fleet.network.disturb({})
             assert counter.count == 3
             await until(lambda: counter.count == 6)

@@ -302,10 +302,10 @@ class Client(MovableClient):
             raise CommandRefused(rc, Problem("unknown", "no answer; it may have been done or not"))
         if reply.message is None:
             refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
-            if refused.code in NOT_HELD:
-                for arc in [arc for arc in self._store.open if arc.grant == grant and grant not in self._denied]:
-                    self._denied.add(grant)
-                    self._supervisor.call_later(TOLD_WITHIN, self._lose, arc, grant, str(refused))
+            arc = next((arc for arc in self._store.open if arc.grant == grant), None)
+            if refused.code in NOT_HELD and arc is not None and grant not in self._denied:
+                self._denied.add(grant)
+                self._supervisor.call_later(TOLD_WITHIN, self._lose, arc, grant, str(refused))
             raise refused
         return reply.message
 

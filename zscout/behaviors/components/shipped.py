@@ -86,6 +86,8 @@ async def _echo(held: Held, rc: str, number: int) -> None:
         except CommandRefused as refused:
             if refused.code != "unknown":
                 raise
+            # Without a link there is no answer at once.
+            await asyncio.sleep(PAUSE)
         else:
             return
 

@@ -115,7 +115,6 @@ class Rcm:
         for request in requests:
             self.registry.enter(request.arc, request.name)
             self.membership.expect(request.client)
-        for request in requests:
             if request.client not in recovered.answered:
                 self._recover(request)
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))
