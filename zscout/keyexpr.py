@@ -19,7 +19,7 @@ NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
 _CHUNK = rf"(?:\*|(?![^/#]*\$\*\$)(?!\$\*(?:[/#]|\Z))(?:[A-Za-z0-9_.-]|\$\*){{1,{MAX_NAME}}})"
 _PATTERN = re.compile(rf"{_CHUNK}/{_CHUNK}(?:#[1-9][0-9]?)?")
 ROOT = "zscout"
-MAX_DIGITS = 15
+MAX_DIGITS = 19
 """Of an incarnation."""
 REMEMBERED = 4_096
 """Valid names that are not checked again."""

@@ -87,6 +87,11 @@ def of_the_last(term: Term, known: Term) -> bool:
     return max(LAST_TERMS, known.counter + 1) < term.counter <= MAX_COUNTER
 
 
+def disbelieved(term: Term, known: Term) -> bool:
+    """Whether who refused `term` for a lower one, `known`, hears an RCM that it obeys, and goes on to do so."""
+    return absurd(term, known) and not of_the_last(term, known)
+
+
 def encode(message: msgspec.Struct) -> bytes:
     return _ENCODER.encode(message)
 

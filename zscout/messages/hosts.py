@@ -23,7 +23,7 @@ class ComponentUse(Message, frozen=True):
 
     component: ShortText
     kind: ShortText
-    incarnation: Annotated[int, msgspec.Meta(ge=0, le=MAX_COUNTER)]
+    incarnation: Annotated[int, msgspec.Meta(ge=0, le=MAX_COUNTER * 1000)]
     cpu: Figure
     memory: Bytes
     processes: Annotated[int, msgspec.Meta(ge=0, le=MAX_COUNTER)] = 1

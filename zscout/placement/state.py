@@ -13,7 +13,7 @@ from typing import Final, Literal, TypeAlias
 
 from zscout import messages
 from zscout.config.fleet import PlacementPolicy
-from zscout.messages import ComponentSpec, ComponentState, HowEnded, Incarnation, Placement, RankedHost
+from zscout.messages import LAST_TERMS, ComponentSpec, ComponentState, HowEnded, Incarnation, Placement, RankedHost
 from zscout.placement.balancer import LOAD_TIME, Balancer, RankingCache
 from zscout.placement.events import ComponentChanged, HostCommand, PlacementRefused, PlacerEffect
 from zscout.placement.model import NO_REPORT, RankQuery
@@ -22,7 +22,8 @@ from zscout.types import SECOND, ComponentId, HostName, Kind, Ns
 PER_TERM: Final = 1_000
 """Incarnations of a component begin, in each term, at its counter times this."""
 FAR_AHEAD: Final = 1_000_000
-"""An incarnation this far above what the term gives is not believed: it would leave no room above it."""
+"""An incarnation this far above what the term gives is believed unless it is of one of the last terms (`LAST_TERMS`):
+its host refuses lower ones for good, so the next has to be above it, and of the last there may be no room above."""
 PROBE_TIMEOUT: Final[Ns] = 2 * SECOND
 START_SLACK: Final[Ns] = 2 * PROBE_TIMEOUT
 """Beyond the time that a start may take: then it is commanded again."""
@@ -236,7 +237,7 @@ class PlacementState:
         """What left a host: when, and how many cores of it the load average showed then."""
         self.timers = Timers()
         self._lowest: Incarnation = counter * PER_TERM
-        self._highest = self._lowest + FAR_AHEAD
+        self._highest = max(LAST_TERMS * PER_TERM, self._lowest + FAR_AHEAD)
         self._incarnations: dict[ComponentId, Incarnation] = {}
         """The highest of each component."""
         self._ended: dict[ComponentId, None] = {}

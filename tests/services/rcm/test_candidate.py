@@ -19,7 +19,7 @@ from zscout.keyexpr import Role
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import LAST_TERMS, Grants, Notice, OpenRequest, RcAsk, RcState, Release
 from zscout.services.rcm.candidate import BACKOFF, MAX_BACKOFF, Candidate
-from zscout.types import SECOND, Term
+from zscout.types import NO_TERM, SECOND, Term
 
 
 def open_request(notice: Notice) -> OpenRequest:
@@ -205,17 +205,21 @@ def test_a_term_that_is_over_asks_nothing_more() -> None:
     run(story())
 
 
+async def a_robot(fleet: FakeFleet) -> ResourceController:
+    """As it is, on a host of its own."""
+    mesh, lease = fleet.mesh("h2"), fleet.fleet.timing.hold_lease / SECOND
+    robot = ResourceController(mesh, "robot/a", ExclusiveDriver(), hold_lease=lease, stall=StallWatch(mesh.now).start())
+    await robot.start()
+    return robot
+
+
 @pytest.mark.parametrize("has_token", [True, False])
 def test_the_fleet_goes_above_the_term_that_an_rc_obeys_however_high(has_token: bool) -> None:
     """But not at the word of who has no token."""
 
     async def story() -> None:
         fleet = FakeFleet("h1")
-        mesh = fleet.mesh("h2")
-        lease = fleet.fleet.timing.hold_lease / SECOND
-        stall = StallWatch(mesh.now).start()
-        robot = ResourceController(mesh, "robot/a", ExclusiveDriver(), hold_lease=lease, stall=stall)
-        await robot.start()
+        robot = await a_robot(fleet)
         candidate = fleet.candidate("h1")
         await until(lambda: candidate.rcm and candidate.rcm.core.status().rcs)
         far = Term(10**9, "mad")
@@ -257,6 +261,42 @@ def test_a_leader_goes_above_what_somebody_whom_it_sees_obeys(who: str) -> None:
     run(story())
 
 
+def test_a_candidate_that_alone_believes_a_forged_term_leads_once_rcs_believe_it_too() -> None:
+    """While they hear the RCM of another term, it would lead nobody."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1", "h3")
+        robot, first, misled = await a_robot(fleet), fleet.candidate("h1"), fleet.candidate("h3")
+        await until(lambda: robot.holds.term != NO_TERM)
+        misled.known = Term(10**9, "mad")
+        await first.stop()
+        await until(lambda: misled.rcm)
+        assert misled.rcm is not None
+        assert [one.name for one in misled.rcm.core.status().rcs if one.present] == ["robot/a"]
+        assert robot.holds.term == misled.rcm.term
+        await misled.stop()
+
+    run(story())
+
+
+def test_a_leader_without_rcs_steps_down_where_those_it_sees_do_not_believe_its_term() -> None:
+    async def story() -> None:
+        fleet = FakeFleet("h1", "h3")
+        robot, first, misled = await a_robot(fleet), fleet.candidate("h1"), fleet.candidate("h3")
+        await until(lambda: robot.holds.term != NO_TERM)
+        fleet.network.isolate(misled.mesh)
+        misled.known = Term(10**9, "mad")
+        await until(lambda: misled.rcm)
+        fleet.network.heal()
+        await until(lambda: misled.rcm is None)
+        await asyncio.sleep(5)
+        assert (misled.rcm, first.rcm is not None, robot.holds.term.counter) == (None, True, 1)
+        await misled.stop()
+        await first.stop()
+
+    run(story())
+
+
 def test_the_last_terms_come_one_by_one_and_who_does_not_know_them_asks() -> None:
     """Nobody uses up at once those that are left; a fleet that has come so far goes on."""
 
@@ -264,12 +304,7 @@ def test_the_last_terms_come_one_by_one_and_who_does_not_know_them_asks() -> Non
         fleet = FakeFleet("h1")
         far = Term(LAST_TERMS + 500, "old")
         fleet.rc("robot/b", term=far)
-        mesh = fleet.mesh("h2")
-        lease = fleet.fleet.timing.hold_lease / SECOND
-        robot = ResourceController(
-            mesh, "robot/a", ExclusiveDriver(), hold_lease=lease, stall=StallWatch(mesh.now).start()
-        )
-        await robot.start()
+        robot = await a_robot(fleet)
         candidate = fleet.candidate("h1")
         await until(lambda: candidate.rcm and len(candidate.rcm.core.status().rcs) == 2)
         assert candidate.rcm is not None

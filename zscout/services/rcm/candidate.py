@@ -17,14 +17,14 @@ from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_
 from zscout.mesh import Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.mesh.terms import LastTerms
-from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd
+from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd, disbelieved
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import take_over
-from zscout.types import NO_TERM, SECOND, Ns, Term
+from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -144,11 +144,19 @@ class Candidate:
             self._goes_above = True
         self._learn(term)
         if self.rcm is not None and term > self.rcm.term:
-            log.warning("stepping down: term %d of another RCM is above %d", term.counter, self.rcm.term.counter)
-            self.election.deposed(self.mesh.now(), RANDOM.get().uniform(0.7, 1.3))
-            self._stop_leading()
-            self._changed.set()
+            self._step_down(f"term {term.counter} of another RCM is above {self.rcm.term.counter}")
         return True
+
+    def _disbelieved(self, rc: RcName, term: Term) -> None:
+        """The own RCM has no RC, and one that obeys another takes its term for a forgery."""
+        if self.rcm is not None:
+            self._step_down(f"{rc} hears an RCM of term {term.counter}, and does not believe {self.rcm.term.counter}")
+
+    def _step_down(self, why: str) -> None:
+        log.warning("stepping down: %s", why)
+        self.election.deposed(self.mesh.now(), RANDOM.get().uniform(0.7, 1.3))
+        self._stop_leading()
+        self._changed.set()
 
     def _learn(self, term: Term) -> None:
         self.known = max(self.known, term)
@@ -204,8 +212,12 @@ class Candidate:
                     await self._refused(key, problem.term)
             if self.known > term:
                 continue
-            open_requests = self._credible(clients, lambda answer: keys.requests(client_of(answer.client)))
-            self._lead(term, self._credible(rcs, lambda state: keys.rc_state(state.rc)), open_requests)
+            states = self._credible(rcs, lambda state: keys.rc_state(state.rc))
+            refused = (reply.problem.term for reply in rcs if reply.problem is not None)
+            if not states and any(other is not None and disbelieved(term, other) for other in refused):
+                log.info("no RC believes term %d while they hear an RCM of another: waiting", term.counter)
+                return False
+            self._lead(term, states, self._credible(clients, lambda one: keys.requests(client_of(one.client))))
             return True
         return False
 
@@ -235,6 +247,7 @@ class Candidate:
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
         rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed)
+        rcm.membership.on_disbelieved = self._disbelieved
         self._leading.callback(rcm.stop)
         rcm.start(recovered)
         balancer = LoadBalancer(self.mesh, self._failed)

@@ -18,7 +18,7 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import ClientRequests, RcAsk, RcState
+from zscout.messages import ClientRequests, RcAsk, RcState, disbelieved
 from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.services.rcm.absence import Absence, Asked
 from zscout.services.rcm.recovery import gangs_of, recover
@@ -87,6 +87,8 @@ class Membership:
         self.on_requests: Callable[[ClientId, set[str]], None] = lambda *_: None
         """Called with what a client that was asked says that it asks for: ids."""
         self._asked: set[ClientId] = set()
+        self.on_disbelieved: Callable[[RcName, Term], object] = lambda *_: None
+        """Called when no RC has joined, and one obeys an RCM of so low a term that this one is none to it."""
         self.on_named: Callable[[RcName], None] = lambda _: None
         """Called when the instances of an RC are to hear which one is meant."""
         self._named: dict[RcName, tuple[str, HostName]] = {}
@@ -362,6 +364,8 @@ class Membership:
             for reply in await self.mesh.ask(key, RcAsk(promise=self.term), RcState, timeout=self._timeout):
                 if reply.problem is not None and reply.problem.term is not None:
                     self.see(reply.problem.term, obeyed_by=token.name)
+                    if not (self._joined or self._pending) and disbelieved(self.term, reply.problem.term):
+                        self.on_disbelieved(token.name, reply.problem.term)
                 state = reply.message
                 if state is not None and state.instance == token.instance and self._is_wanted(token):
                     self._answered(state)
