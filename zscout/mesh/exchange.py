@@ -39,6 +39,7 @@ class Reply(Generic[R]):
     key: str
     message: R | None
     problem: Problem | None = None
+    arrived: Ns = 0
 
 
 @dataclass(slots=True, eq=False)

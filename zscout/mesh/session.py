@@ -187,7 +187,7 @@ class Mesh:
         replies: list[Reply[R]] = []
 
         def on_reply(key: str, payload: bytes, ok: bool) -> bool:
-            reply = _read_reply(key, payload, ok, kind, limit)
+            reply = _read_reply(key, payload, ok, kind, limit, self.now())
             if reply is None:
                 return False
             replies.append(reply)
@@ -209,7 +209,7 @@ class Mesh:
 
         def on_reply(key: str, payload: bytes, ok: bool) -> bool:
             nonlocal first
-            first = _read_reply(key, payload, ok, kind, messages.MAX_STATE)
+            first = _read_reply(key, payload, ok, kind, messages.MAX_STATE, self.now())
             return first is not None
 
         self._get(key, message, timeout, _Collector(self._inbox, on_reply, lambda: then(first)))
@@ -443,13 +443,13 @@ class _Collector(Collector):
             self._over()
 
 
-def _read_reply(key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -> Reply[R] | None:
+def _read_reply(key: str, payload: bytes, ok: bool, kind: type[R], limit: int, now: Ns) -> Reply[R] | None:
     try:
         if ok:
-            return Reply(key, messages.decode(payload, kind, limit))
+            return Reply(key, messages.decode(payload, kind, limit), arrived=now)
         if payload == b"Timeout":
             return None
-        return Reply("", None, messages.decode(payload, Problem))
+        return Reply("", None, messages.decode(payload, Problem), now)
     except Malformed as error:
         log.warning("a reply was malformed: %s", error)
         return None

@@ -57,6 +57,7 @@ class FakeRc:
     rules: int = 0
     deaf: bool = False
     """Whether it answers no question of its state."""
+    ignored: list[IncomingQuery[RcAsk]] = field(default_factory=list)
     unanswered: list[IncomingQuery[Proposal]] = field(default_factory=list)
 
     def start(self) -> None:
@@ -96,6 +97,7 @@ class FakeRc:
     def _on_asked(self, query: IncomingQuery[RcAsk]) -> None:
         self.asked.append(query.message)
         if self.deaf:
+            self.ignored.append(query)  # who asks waits for as long as it can wait
             return
         promise = query.message.promise
         if promise is not None and promise < self.term:

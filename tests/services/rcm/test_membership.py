@@ -195,6 +195,32 @@ def test_an_rc_that_answers_a_new_leader_late_keeps_the_hold_of_its_gang(hears_a
     run(story())
 
 
+@pytest.mark.parametrize("late", ["robot/a", "robot/c"])
+def test_a_hold_ends_when_its_rcs_end_it_however_long_a_new_leader_waited_for_others(late: str) -> None:
+    """For one of its gang, or for one that it has nothing to do with."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1")
+        client = fleet.client("one")
+        client.open = [OpenRequest("tally", "tally", {rc: {} for rc in HELD.rcs}, 0, Decimal(60), **BELIEVED)]
+        robots = {name: holding(fleet, name, deaf=name == late) for name in HELD.rcs}
+        other = fleet.rc("robot/c", deaf=late == "robot/c")
+        candidate = fleet.candidate("h1")
+        await until(lambda: any(one.promise for one in robots["robot/b"].asked))
+        ends = fleet.watcher.now() / SECOND + HELD.remaining
+        await until(lambda: candidate.rcm)
+        assert candidate.rcm is not None
+        robots["robot/a"].deaf = other.deaf = False
+        robots["robot/a"].holders = [replace(HELD, remaining=ends - fleet.watcher.now() / SECOND)]
+        await fleet.joined(*robots.values())
+        (arc,) = candidate.rcm.core.holders("robot/a")
+        assert arc.hold is not None
+        assert arc.hold.end / SECOND == pytest.approx(ends, abs=0.02)
+        await candidate.stop()
+
+    run(story())
+
+
 def test_what_its_client_gave_up_is_not_carried_on_when_its_rcs_answer_late() -> None:
     async def story() -> None:
         fleet = FakeFleet("h1")

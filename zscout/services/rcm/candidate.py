@@ -23,7 +23,7 @@ from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.recovery import take_over
+from zscout.services.rcm.recovery import aged, take_over
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -178,11 +178,11 @@ class Candidate:
         """Whether RCs still see a leader: then it is this candidate that is cut off."""
         replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
         states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
-        for state in states:
+        for state, _ in states:
             self._see(state.term)
         host = self.mesh.me.host
-        others = [bool(state.leader) for state in states if state.host != host]
-        own = [bool(state.leader) for state in states if state.host == host]
+        others = [bool(state.leader) for state, _ in states if state.host != host]
+        own = [bool(state.leader) for state, _ in states if state.host == host]
         if self.election.must_wait(others, own, self.mesh.now(), self._leader):
             log.info("%d of %d RCs of other hosts still see a leader: waiting", sum(others), len(others))
             if sum(others) * 2 > len(others):
@@ -212,12 +212,15 @@ class Candidate:
                     await self._refused(key, problem.term)
             if self.known > term:
                 continue
-            states = self._credible(rcs, lambda state: keys.rc_state(state.rc))
+            answers = self._credible(rcs, lambda state: keys.rc_state(state.rc))
             refused = (reply.problem.term for reply in rcs if reply.problem is not None)
-            if not states and any(other is not None and disbelieved(term, other) for other in refused):
+            if not answers and any(other is not None and disbelieved(term, other) for other in refused):
                 log.info("no RC believes term %d while they hear an RCM of another: waiting", term.counter)
                 return False
-            self._lead(term, states, self._credible(clients, lambda one: keys.requests(client_of(one.client))))
+            now = self.mesh.now()
+            states = [aged(state, now - arrived) for state, arrived in answers]
+            open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
+            self._lead(term, states, [one for one, _ in open_requests])
             return True
         return False
 
@@ -230,13 +233,14 @@ class Candidate:
             names |= {keys.requests(Sender(one.host, one.name)) for one in seen if one.role == Role.CLIENT}
         self._see(term, obeyed_by=key if key in names else None)
 
-    def _credible(self, replies: list[Reply[R]], key_of: Callable[[R], str]) -> list[R]:
-        """The messages of `replies` that name in themselves whom their key names; others prove nothing."""
+    def _credible(self, replies: list[Reply[R]], key_of: Callable[[R], str]) -> list[tuple[R, Ns]]:
+        """The messages of `replies` that name in themselves whom their key names, and when they came; others prove
+        nothing."""
         messages = []
         for reply in replies:
             try:
                 if reply.message is not None and reply.key == key_of(reply.message):
-                    messages.append(reply.message)
+                    messages.append((reply.message, reply.arrived))
             except BadName as error:
                 log.warning("ignored an answer on %.200r: %s", reply.key, error)
         return messages

@@ -21,7 +21,7 @@ from zscout.mesh.supervision import Supervisor
 from zscout.messages import ClientRequests, RcAsk, RcState, disbelieved
 from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.services.rcm.absence import Absence, Asked
-from zscout.services.rcm.recovery import gangs_of, recover
+from zscout.services.rcm.recovery import aged, gangs_of, recover
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -42,6 +42,8 @@ class _Pending:
     """An RC that answered, and does not count yet."""
 
     state: RcState
+    since: Ns
+    """When it said so."""
     patient: bool
     """Links may be coming back, one after the other: it waits a lease for its gang, seen or not."""
     waited: float = 0.0
@@ -383,7 +385,7 @@ class Membership:
         self._settle()
 
     def _hold_up(self, state: RcState, *, patient: bool) -> None:
-        pending = self._pending[state.rc] = _Pending(state, patient)
+        pending = self._pending[state.rc] = _Pending(state, self.mesh.now(), patient)
         for wait in (self._timeout, self._lease):
             self._supervisor.call_later(wait, self._wait_over, pending, wait)
 
@@ -401,7 +403,8 @@ class Membership:
             missing = gangs - self._joined.keys() - self._pending.keys()
             patient = pending.patient or any(one in self._rc_tokens for one in missing)
             if not missing or pending.waited >= (self._lease if patient else self._timeout):
-                self._admit([self._pending.pop(one).state for one in sorted(gangs & self._pending.keys())])
+                let_in, now = [self._pending.pop(one) for one in sorted(gangs & self._pending.keys())], self.mesh.now()
+                self._admit([aged(one.state, now - one.since) for one in let_in])
 
     def _admit(self, states: list[RcState]) -> None:
         self._joined.update({state.rc: state for state in states})
@@ -437,7 +440,7 @@ class Membership:
         name = self.mesh.keys.rc_of(key)
         self.see(state.term, obeyed_by=name if state.instance in self._rc_tokens.get(name, {}) else None)
         if name in self._pending and self._pending[name].state.instance == state.instance:
-            self._pending[name].state = state
+            self._pending[name].state, self._pending[name].since = state, self.mesh.now()
         known, gone = self._joined.get(name), self._departed.get(name)
         if gone is not None and gone.instance == state.instance and state.leaving:
             self._free(gone)

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from operator import attrgetter
 
+from msgspec.structs import replace
+
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
 from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
@@ -35,6 +37,11 @@ class RecoveredState:
     waiting: list[Requested] = field(default_factory=list)
     answered: set[ClientId] = field(default_factory=set)
     """The clients that have said what they ask for."""
+
+
+def aged(state: RcState, by: Ns) -> RcState:
+    """What an RC answered that long ago, as it would answer now."""
+    return replace(state, holders=[replace(one, remaining=one.remaining - by / SECOND) for one in state.holders])
 
 
 def take_over(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:
