@@ -276,6 +276,7 @@ class Rc:
             self.promised = NO_TERM
         self.led = leaders
         self.peer.suspect("an RCM is seen and not heard", so=bool(self.peer.leaders) and not heard)
+        self.peer.suspect("an RCM is heard and not seen", so=heard and not self.peer.leaders)
         self.peer.suspect(f"{self.name} is not asked", so=heard and self.promised != self.term)
 
     def trace(self, do: str, **what: Any) -> None:

@@ -72,10 +72,8 @@ class Rcm:
         self.hangs = False
         self.asked: list[IncomingQuery[StateAsk]] = []
         self.holds: list[HoldView] = []
-        self._declared = [
-            self.mesh.serve(self.mesh.keys.rcm_state, StateAsk, self._on_asked),
-            self.mesh.alive(Token("rcm", Role.RCM, "node", TERM.rcm)),
-        ]
+        self._served = self.mesh.serve(self.mesh.keys.rcm_state, StateAsk, self._on_asked)
+        self.token = self.mesh.alive(Token("rcm", Role.RCM, "node", TERM.rcm))
         self._publisher = self.mesh.publisher(self.mesh.keys.grants, Grants)
 
     def _on_asked(self, query: IncomingQuery[StateAsk]) -> None:

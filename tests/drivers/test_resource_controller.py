@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable
 from typing import Any, cast
 
@@ -14,9 +15,9 @@ from tests.mesh.kit import run, until
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.resource_controller import EARLY_PER_HOST, SAY_AGAIN, CommandQuery, ResourceController, WorkQueue
 from zscout.keyexpr import Role, Sender
-from zscout.lab.faults.memory import Disturbance, MemoryNetwork
+from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryNetwork
 from zscout.mesh import Mesh
-from zscout.messages import Grants, RcmState, RcState
+from zscout.messages import Grants, RcAsk, RcmState, RcState
 from zscout.types import SECOND, Grant
 
 Story = Callable[[Rcm, ResourceController, Device, Mesh], Awaitable[None]]
@@ -228,6 +229,41 @@ def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
         assert await answer(client, grant(1), dict(ECHO)) == "done"
 
     play(story)
+
+
+@pytest.mark.parametrize(
+    "sign",
+    [
+        None,
+        "an RCM is seen that does not publish",
+        "the RCM publishes and is not seen",
+        "the RCM publishes and has not asked for its promise",
+    ],
+)
+def test_an_rc_that_an_rcm_and_the_mesh_contradict_joins_the_mesh_anew(
+    sign: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What the RCM answers is no sign that it is heard."""
+
+    async def story(rcm: Rcm, rc: ResourceController, _device: Device, client: Mesh) -> None:
+        if sign is not None and "not seen" in sign:
+            rcm.token.close()
+        if sign is None or "not asked" not in sign:
+            await rcm.mesh.ask(rcm.mesh.keys.rc_state(rc.name), RcAsk(promise=TERM), RcState, timeout=1)
+        mesh = cast("MemoryMesh", rc.mesh)
+        before = mesh._transport.id()
+        for _ in range(12):
+            if sign is None or "not publish" not in sign:
+                rcm.publish(holder(1))
+            # It reads what it may have missed.
+            await answer(client, grant(99), ttl=0.1)
+            await asyncio.sleep(0.5)
+        assert (mesh._transport.id() != before) == (sign is not None)
+
+    with caplog.at_level(logging.WARNING, "zscout.mesh"):
+        play(story)
+    said = [record.message for record in caplog.records if "joins the mesh anew" in record.message]
+    assert said == ([f"robot/x: {sign}: this process joins the mesh anew"] if sign is not None else [])
 
 
 # The queue alone

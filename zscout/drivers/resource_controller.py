@@ -128,6 +128,8 @@ class ResourceController:
             mesh, name, self.instance, self.supervisor, self._on_instance_state, hold_lease=hold_lease
         )
         self._leaders: set[Token] = set()
+        self._heard: Ns | None = None
+        """When the RCM that it obeys published last, as far as that was heard. What it answers is no sign of it."""
         self._is_open = False
         """Whether its driver is."""
         self._served: list[Declaration] = []
@@ -235,6 +237,8 @@ class ResourceController:
         self._last_terms.shown(grants.term, self.holds.term)
         before = self.holds.term, self.holds.seq
         change = self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable)
+        if grants.term == self.holds.term:
+            self._heard = self.mesh.now()
         if change or before != (self.holds.term, self.holds.seq):
             self._trace("hear")
         self._apply(change)
@@ -483,10 +487,11 @@ class ResourceController:
             await self._look_for_contradictions()
 
     async def _look_for_contradictions(self) -> None:
-        """A leader that is seen and not heard, or heard and never asks: what is declared here, or there, is not known
-        to the other. Where candidates are seen, one leads before long."""
+        """A leader that is seen and not heard, or heard and not seen, or heard and asks nothing: what is declared here,
+        or there, is not known to the other. Where candidates are seen, one leads before long."""
         signs = {
             f"{self.name}: an RCM is seen that does not publish": bool(self._leaders) and not self._hears,
+            f"{self.name}: the RCM publishes and is not seen": self._hears and not self._leaders,
             f"{self.name}: the RCM publishes and has not asked for its promise": self._hears
             and self.instances.state is not InstanceState.STANDS_BY
             and self.holds.promised != self.holds.term,
@@ -502,4 +507,4 @@ class ResourceController:
     @property
     def _hears(self) -> bool:
         # Half a hold lease is longer than a heartbeat, and leaves a successor time before holds end.
-        return self.mesh.now() - self.holds.last_contact < self.holds.hold_lease // 2
+        return self._heard is not None and self.mesh.now() - self._heard < self.holds.hold_lease // 2
