@@ -34,6 +34,7 @@ _LATE: Final = "on a busy machine cells come late, which is no other order: the 
 _INCARNATIONS: Final = (
     "ActivateComponent.v1 > fields > incarnation",
     "Checkpoint.v1 > fields > incarnation",
+    "ComponentUse.v1 > fields > incarnation",
     "ComponentView.v1 > fields > incarnation",
     "MoveComponent.v1 > fields > incarnation",
     "MoveComponent.v1 > fields > to_incarnation",
@@ -116,7 +117,6 @@ CHANGED: Final[dict[str, tuple[object, str]]] = {
         "it can be awaited, as before, and entered",
     ),
     **{f"messages > zscout.{field} > maximum": (4503599627370495000, _ABOVE) for field in _INCARNATIONS},
-    "messages > zscout.ComponentUse.v1 > fields > incarnation > maximum": (2**52 - 1, _ABOVE),
     "messages > zscout.ComponentUse.v1 > fields > processes > maximum": (2**52 - 1, _ABOVE),
 }
 """The value now, and the reason."""
