@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 from collections.abc import Callable
 from decimal import Decimal
@@ -18,6 +19,7 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import LAST_TERMS, Grants, Notice, OpenRequest, RcAsk, RcState, Release
+from zscout.services.rcm import candidate as candidate_module
 from zscout.services.rcm.candidate import BACKOFF, MAX_BACKOFF, Candidate
 from zscout.types import NO_TERM, SECOND, Term
 
@@ -257,6 +259,30 @@ def test_a_leader_goes_above_what_somebody_whom_it_sees_obeys(who: str) -> None:
                 await fleet.client("one").ask("tally", "robot/a", term=far)
         await until(lambda: candidate.rcm and candidate.rcm.term > far)
         await candidate.stop()
+
+    run(story())
+
+
+def test_of_two_that_stand_at_once_one_leads_and_the_other_leaves_it_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would depose the first with a term above, and the RCs would be led by who may fail next."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1", "h2")
+        fleet.rc("robot/a")
+        late = fleet.rc("robot/b", deaf=True)
+        names = itertools.chain(["1", "2", "x"], map(str, itertools.count(3)))
+        monkeypatch.setattr(candidate_module, "new_instance", names.__next__)
+        first = fleet.candidate("h2")
+        await asyncio.sleep(0.48)
+        second = fleet.candidate("h1")
+        await until(lambda: any(one.promise for one in late.asked))
+        # The first waits for this promise; the second waits for nobody.
+        late.deaf = False
+        await until(lambda: first.rcm)
+        await asyncio.sleep(5)
+        assert (first.rcm is not None and first.rcm.term, second.rcm) == (Term(1, "x"), None)
+        await first.stop()
+        await second.stop()
 
     run(story())
 

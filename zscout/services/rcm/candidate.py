@@ -32,8 +32,6 @@ R = TypeVar("R")
 
 WAITS = 4.0
 """Seconds for which a candidate waits for a leader that only others see: longer than RCs believe in one that went."""
-MAX_ATTEMPTS = 3
-"""Terms tried in one go when RCs turn out to have promised higher ones."""
 BACKOFF, MAX_BACKOFF = 1.0, 30.0
 """Seconds until a candidate that failed becomes one again: doubled each time, at most."""
 BACKOFF_RESET_AFTER: Ns = 60 * SECOND
@@ -175,11 +173,16 @@ class Candidate:
             await done_within(None if at is None else (at - now) / SECOND, self._changed.wait())
 
     async def _leader_elsewhere(self) -> bool:
-        """Whether RCs still see a leader: then it is this candidate that is cut off."""
+        """Whether RCs still see a leader: then it is this candidate that is cut off; or have promised a term to a
+        candidate that may be about to lead."""
         replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
         states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
+        before = self.known
         for state, _ in states:
             self._see(state.term)
+        if self.known > before:
+            self.election.rivalled(self.mesh.now())
+            return True
         host = self.mesh.me.host
         others = [bool(state.leader) for state, _ in states if state.host != host]
         own = [bool(state.leader) for state, _ in states if state.host == host]
@@ -193,36 +196,37 @@ class Candidate:
         return False
 
     async def _take_over(self) -> bool:
+        """One attempt. Where it finds a higher term promised, another candidate may be about to lead in it: the next
+        attempt goes above, if none does."""
         keys = self.mesh.keys
-        for _ in range(MAX_ATTEMPTS):
-            if self.election.sees_leader(self.mesh.now()):
-                return False
-            if self.known.counter == MAX_COUNTER:
-                log.error("no term is left: end all nodes and clients of the fleet, and start them again")
-                return False
-            term = Term(self.known.counter + 1, new_instance())
-            promise_query = RcAsk(promise=term, above=self.mesh.me.host if self._goes_above else None)
-            rcs, clients = await asyncio.gather(
-                self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=self._timeout),
-                self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=self._timeout),
-            )
-            problems = [(reply.key, reply.problem) for reply in rcs] + [(reply.key, reply.problem) for reply in clients]
-            for key, problem in problems:
-                if problem is not None and problem.term is not None:
-                    await self._refused(key, problem.term)
-            if self.known > term:
-                continue
-            answers = self._credible(rcs, lambda state: keys.rc_state(state.rc))
-            refused = (reply.problem.term for reply in rcs if reply.problem is not None)
-            if not answers and any(other is not None and disbelieved(term, other) for other in refused):
-                log.info("no RC believes term %d while they hear an RCM of another: waiting", term.counter)
-                return False
-            now = self.mesh.now()
-            states = [aged(state, now - arrived) for state, arrived in answers]
-            open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
-            self._lead(term, states, [one for one, _ in open_requests])
-            return True
-        return False
+        if self.election.sees_leader(self.mesh.now()):
+            return False
+        if self.known.counter == MAX_COUNTER:
+            log.error("no term is left: end all nodes and clients of the fleet, and start them again")
+            return False
+        term = Term(self.known.counter + 1, new_instance())
+        promise_query = RcAsk(promise=term, above=self.mesh.me.host if self._goes_above else None)
+        rcs, clients = await asyncio.gather(
+            self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=self._timeout),
+            self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=self._timeout),
+        )
+        problems = [(reply.key, reply.problem) for reply in rcs] + [(reply.key, reply.problem) for reply in clients]
+        for key, problem in problems:
+            if problem is not None and problem.term is not None:
+                await self._refused(key, problem.term)
+        if self.known > term:
+            self.election.rivalled(self.mesh.now())
+            return False
+        answers = self._credible(rcs, lambda state: keys.rc_state(state.rc))
+        refused = (reply.problem.term for reply in rcs if reply.problem is not None)
+        if not answers and any(other is not None and disbelieved(term, other) for other in refused):
+            log.info("no RC believes term %d while they hear an RCM of another: waiting", term.counter)
+            return False
+        now = self.mesh.now()
+        states = [aged(state, now - arrived) for state, arrived in answers]
+        open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
+        self._lead(term, states, [one for one, _ in open_requests])
+        return True
 
     async def _refused(self, key: str, term: Term) -> None:
         """An RC or a client obeys a higher term. What has no token may be anybody's word."""

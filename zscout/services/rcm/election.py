@@ -75,7 +75,11 @@ class Election:
 
     def failed(self, now: Ns) -> None:
         """An attempt did not lead to the lead."""
-        self._not_before = now + RETRY
+        self._not_before = max(self._not_before, now + RETRY)
+
+    def rivalled(self, now: Ns) -> None:
+        """A higher term than was known is promised: another candidate leads in it within a turn, or has failed."""
+        self._not_before = now + TURN
 
     def deposed(self, now: Ns, jitter: float) -> None:
         """A higher term ended the own one. `jitter` is about 1."""
