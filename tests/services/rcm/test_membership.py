@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from decimal import Decimal
-from typing import Any, cast
+from typing import Any
 from unittest.mock import ANY
 
 import pytest
@@ -12,8 +12,6 @@ from msgspec.structs import replace
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, FakeRc
-from zscout.drivers.resource_controller import SAY_AGAIN
-from zscout.lab.faults.memory import MemoryMesh
 from zscout.messages import Holder, OpenRequest, RcState
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined, Requested
@@ -307,28 +305,6 @@ def test_the_link_to_one_rc_of_a_host_may_be_the_first_that_a_leader_which_is_cu
         (hold,) = (await fleet.state()).holds
         assert hold.grant == running.grant
         rcm.stop()
-
-    run(story())
-
-
-@pytest.mark.parametrize("is_seen", [True, False])
-def test_a_leader_that_hears_an_rc_whose_token_is_missing_joins_the_mesh_anew(is_seen: bool) -> None:
-    """Though another instance of it is seen, and has joined."""
-
-    async def story() -> None:
-        fleet = FakeFleet()
-        rcm = fleet.rcm()
-        await fleet.joined(fleet.rc("robot/a"))
-        other = FakeRc(fleet.mesh("elsewhere"), "robot/a", "i2")
-        other.start()
-        if not is_seen:
-            other.token.close()
-        session = cast("MemoryMesh", rcm.mesh)._transport.id
-        before = session()
-        for _ in range(4):
-            other.publish()
-            await asyncio.sleep(SAY_AGAIN)
-        assert (session() == before) == is_seen
 
     run(story())
 

@@ -438,11 +438,7 @@ class Membership:
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
         name = self.mesh.keys.rc_of(key)
-        is_seen = state.instance in self._rc_tokens.get(name, {})
-        self.mesh.suspicions.suspect(
-            f"{name} at {state.host} publishes, and its token is missing", so=not (is_seen or state.leaving)
-        )
-        self.see(state.term, obeyed_by=name if is_seen else None)
+        self.see(state.term, obeyed_by=name if state.instance in self._rc_tokens.get(name, {}) else None)
         if name in self._pending and self._pending[name].state.instance == state.instance:
             self._pending[name].state, self._pending[name].since = state, self.mesh.now()
         known, gone = self._joined.get(name), self._departed.get(name)
