@@ -460,7 +460,8 @@ class Rc:
                     raise Refused("old_term", "a higher term is obeyed", self.term)
                 if term != self.term:
                     self.term, self.seq = term, 0
-                self.promised = term
+                if payload_of(query).get("instance", self.instance) == self.instance:
+                    self.promised = term
                 self.trace("promise", promised=term)
             return self.state()
 

@@ -100,6 +100,7 @@ ADDED: Final[dict[str, str]] = {
     "messages > zscout.RcState.v1 > fields > duplicate_of": _INSTANCE,
     "messages > zscout.RcState.v1 > fields > leaving": _INSTANCE,
     "messages > zscout.RcAsk.v1 > fields > above": _ABOVE,
+    "messages > zscout.RcAsk.v1 > fields > instance": _INSTANCE,
     "python > zscout.Held > methods > now": "the clock by which the hold ends, for bodies that keep a pace",
 }
 

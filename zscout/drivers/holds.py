@@ -78,8 +78,6 @@ class HoldTable:
         self.hold_lease = hold_lease
         self.term: Term = NO_TERM
         """The newest term received or promised."""
-        self.promised: Term = NO_TERM
-        """The last term that this RC was asked to promise, and did."""
         self.seq = 0
         self.last_contact: Ns = 0
         """When an RCM that is obeyed last published, as received here."""
@@ -179,7 +177,6 @@ class HoldTable:
             return False
         if term != self.term:
             self.term, self.seq = term, 0
-        self.promised = term
         return True
 
     # Time

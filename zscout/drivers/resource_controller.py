@@ -21,7 +21,7 @@ from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.terms import LastTerms
-from zscout.types import NO_TERM, SECOND, Ns
+from zscout.types import NO_TERM, SECOND, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -128,6 +128,8 @@ class ResourceController:
             mesh, name, self.instance, self.supervisor, self._on_instance_state, hold_lease=hold_lease
         )
         self._leaders: set[Token] = set()
+        self._asked: Term = NO_TERM
+        """The term that it has promised to who asked it, not another instance."""
         self._heard: Ns | None = None
         """When the RCM that it obeys published last, as far as that was heard. What it answers is no sign of it."""
         self._is_open = False
@@ -229,9 +231,9 @@ class ResourceController:
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
-        if not alive and self.holds.promised.rcm == token.instance:
+        if not alive and self._asked.rcm == token.instance:
             # A leader from which this RC was cut off asks it again.
-            self.holds.promised = NO_TERM
+            self._asked = NO_TERM
 
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
         self._last_terms.shown(grants.term, self.holds.term)
@@ -265,6 +267,8 @@ class ResourceController:
         if promise is not None and not self.holds.promise(promise, self.mesh.now(), above=above):
             raise Refused("old_term", f"{self.name} obeys term {self.holds.term.counter}", self.holds.term)
         if promise is not None:
+            if query.message.instance in (None, self.instance):
+                self._asked = promise
             self._trace("promise", promised=promise)
         query.answer(self._rc_state([]))
 
@@ -494,7 +498,7 @@ class ResourceController:
             f"{self.name}: the RCM publishes and is not seen": self._hears and not self._leaders,
             f"{self.name}: the RCM publishes and has not asked for its promise": self._hears
             and self.instances.state is not InstanceState.STANDS_BY
-            and self.holds.promised != self.holds.term,
+            and self._asked != self.holds.term,
         }
         for sign, seen in signs.items():
             self.mesh.suspicions.suspect(sign, so=seen)

@@ -28,8 +28,9 @@ class Device:
     log: Callable[[str], None]
     holders: dict[Grant, tuple[Process, Holder]] = field(default_factory=dict)
     """Who drives it, and in which process the driver is that let them."""
-    newest: Grant = NO_GRANT
-    """Of all commands that it has carried out."""
+    newest: tuple[Process, Grant] | None = None
+    """Of all commands that it has carried out; and the process that its driver was in. One that starts anew knows of
+    none, and obeys the RCM that it finds."""
 
     def begin(self, process: Process, holder: Holder) -> None:
         self.log(f"{self.name} begins for {holder.client} {holder.arc} {number(holder.grant)}")
@@ -56,15 +57,19 @@ class Device:
 
     def command(self, process: Process, holder: Holder) -> None:
         self._forget_dead()
-        if self.capacity is None and holder.grant < self.newest:
-            self.broken(f"{self.name} obeyed {number(holder.grant)} after {number(self.newest)}")
+        newest = self.newest[1] if self.newest is not None else NO_GRANT
+        if self.capacity is None and holder.grant < newest:
+            self.broken(f"{self.name} obeyed {number(holder.grant)} after {number(newest)}")
         if holder.grant not in self.holders:
             self.broken(f"{self.name} obeyed {holder.client}, who does not hold it")
-        self.newest = max(self.newest, holder.grant)
+        if holder.grant >= newest:
+            self.newest = process, holder.grant
 
     def _forget_dead(self) -> None:
         # What a driver let in that was killed drives nothing any more: commands went through it.
         self.holders = {grant: held for grant, held in self.holders.items() if not held[0].dead}
+        if self.newest is not None and self.newest[0].dead:
+            self.newest = None
 
 
 def number(grant: Grant) -> str:

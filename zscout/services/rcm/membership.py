@@ -288,7 +288,7 @@ class Membership:
             elif current is not None and current.instance == token.instance:
                 if token.instance in self._blinked:
                     self._blinked.discard(token.instance)
-                    self._supervisor.spawn(self._greet(token.name))
+                    self._supervisor.spawn(self._greet(token))
             elif current is not None:
                 log.warning("%s is offered twice; the one at %s is used", token.name, current.host)
                 self.on_named(token.name)
@@ -313,10 +313,10 @@ class Membership:
         else:
             self._drop(token.name)
 
-    async def _greet(self, name: RcName) -> None:
+    async def _greet(self, token: Token) -> None:
         """Asks an RC whose token has come back, so that it knows to be seen."""
-        key = self.mesh.keys.rc_state(name)
-        for reply in await self.mesh.ask(key, RcAsk(promise=self.term), RcState, timeout=self._timeout):
+        key, ask = self.mesh.keys.rc_state(token.name), RcAsk(promise=self.term, instance=token.instance)
+        for reply in await self.mesh.ask(key, ask, RcState, timeout=self._timeout):
             if reply.message is not None:
                 self._on_rc_state(key, reply.message)
 
@@ -361,9 +361,9 @@ class Membership:
 
     async def _join(self, token: Token) -> None:
         """Asks a new RC for its promise to obey this term, until it has joined or is gone."""
-        key = self.mesh.keys.rc_state(token.name)
+        key, ask = self.mesh.keys.rc_state(token.name), RcAsk(promise=self.term, instance=token.instance)
         while self._is_wanted(token):
-            for reply in await self.mesh.ask(key, RcAsk(promise=self.term), RcState, timeout=self._timeout):
+            for reply in await self.mesh.ask(key, ask, RcState, timeout=self._timeout):
                 if reply.problem is not None and reply.problem.term is not None:
                     self.see(reply.problem.term, obeyed_by=token.name)
                     if not (self._joined or self._pending) and disbelieved(self.term, reply.problem.term):
