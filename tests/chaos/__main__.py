@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import random
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -38,8 +37,7 @@ def main(words: list[str] | None = None) -> int:
     except net.NoNamespaces as error:
         print(f"chaos: {error}", file=sys.stderr)
         return 2
-    for number in (signal.SIGINT, signal.SIGTERM):  # a shell in the background has its programs ignore the first
-        signal.signal(number, signal.default_int_handler)
+    net.end_on_signals()
     if asked.logs is not None:
         asked.logs.mkdir(parents=True, exist_ok=True)
     folder = asked.logs or Path(tempfile.mkdtemp(prefix="zscout-chaos-"))

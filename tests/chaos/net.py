@@ -42,6 +42,13 @@ def check() -> None:
             subprocess.run(["ip", *undo], capture_output=True, check=False, timeout=COMMAND_TIMEOUT)
 
 
+def end_on_signals() -> None:
+    """SIGINT and SIGTERM raise KeyboardInterrupt, so that no namespace stays. A shell has programs in the background
+    ignore the first, and the second would end this one at once."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+
+
 def ip(*words: str) -> str:
     done = subprocess.run(["ip", *words], capture_output=True, text=True, check=True, timeout=COMMAND_TIMEOUT)
     return done.stdout

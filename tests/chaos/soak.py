@@ -140,9 +140,13 @@ def main() -> int:
         except net.NoNamespaces as error:
             print(f"soak: {error}", file=sys.stderr)
             return 2
+        net.end_on_signals()
         folder = Path(tempfile.mkdtemp(prefix="zscout-soak-"))
         try:
             looks, wrong = live(hours["live"], folder)
+        except KeyboardInterrupt:
+            print("soak: interrupted", file=sys.stderr)
+            return 130
         finally:
             shutil.rmtree(folder, ignore_errors=True)
         found["live"] = thirds(looks) if looks else {}
