@@ -60,6 +60,29 @@ def test_what_is_declared_goes_on_and_nobody_notices(play: Play) -> None:
     play(story)
 
 
+def test_what_is_polled_seldom_goes_on_as_well(play: Play) -> None:
+    """The session that was polled last may be closed by then."""
+
+    async def story(world: World) -> None:
+        a, b = await world.open("a", "b")
+        polled, publisher = a.poll_latest(f"{NEWS}/*", Ping), b.publisher(f"{NEWS}/b", Ping)
+        await world.declared()
+        a._transport.renew()
+        await until(lambda: a._transport._renewing is None)
+        assert list(polled.each()) == []
+        publisher.put(Ping(7))
+        taken: list[tuple[str, Ping]] = []
+
+        def take() -> bool:
+            taken.extend(polled.each())
+            return bool(taken)
+
+        await until(take)
+        assert [ping.number for _, ping in taken] == [7]
+
+    play(story)
+
+
 def test_a_link_that_comes_back_without_its_token_is_noticed_and_left(caplog: pytest.LogCaptureFixture) -> None:
     async def story() -> None:
         network = MemoryNetwork()

@@ -179,7 +179,10 @@ class ZenohTransport(Transport):
         subscriber = self._session.declare_subscriber(key, RingChannel(depth))
 
         def take() -> tuple[str, bytes] | None:
-            sample = subscriber.try_recv()
+            try:
+                sample = subscriber.try_recv()
+            except zenoh.ZError:  # its session is closed
+                return None
             return None if sample is None else (str(sample.key_expr), sample.payload.to_bytes())
 
         return take, _undeclare(subscriber)
