@@ -110,6 +110,28 @@ def test_a_link_that_comes_back_without_its_token_is_noticed_and_left(caplog: py
     assert [record.message.partition(":")[2] for record in caplog.records] == [" this process joins the mesh anew"] * 2
 
 
+@pytest.mark.parametrize("shows_another", [True, False])
+def test_a_session_that_its_program_has_left_is_not_missed(shows_another: bool) -> None:
+    """Zenoh may not close it: then it stays linked, without a token."""
+
+    async def story() -> None:
+        network = MemoryNetwork()
+        watcher, left = (network.open("test", Sender(name, "test")) for name in ("w", "a"))
+        for mesh in (watcher, left):
+            mesh.watch_links()
+        if shows_another:
+            network.open("test", Sender("a", "test")).watch_links()
+        before = watcher._transport.id()
+        await asyncio.sleep(1)
+        withdraw = left._kept[0]
+        assert callable(withdraw)
+        withdraw()
+        await asyncio.sleep(2 * PATIENCE)
+        assert (watcher._transport.id() == before) == shows_another
+
+    run(story())
+
+
 def test_a_contradiction_must_last_and_one_that_stays_is_acted_on_ever_more_seldom() -> None:
     renewed: list[float] = []
     seconds = 0.0

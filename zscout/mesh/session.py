@@ -386,14 +386,15 @@ class Mesh:
 
     def watch_links(self) -> None:
         """Shows this session by a token that names it, until the mesh is left, and suspects links over which the token
-        of the other's session, seen before, has not come back. For programs that stay."""
+        of the other's session, seen before, has not come back; unless its program shows another session: it has left
+        that one, which Zenoh may not close. For programs that stay."""
         name = functools.partial(Token, self.me.host, Role.SESSION, self.me.client)
         own = self._transport.own_token(lambda session: self.keys.alive(name(session)))
-        shown: dict[str, bool] = {}
+        shown: dict[str, tuple[Sender, bool]] = {}
 
         def on_token(token: Token, alive: bool) -> None:
             shown.pop(token.instance, None)
-            shown[token.instance] = alive
+            shown[token.instance] = Sender(token.host, token.name), alive
             if len(shown) > MAX_SESSIONS:
                 del shown[next(iter(shown))]
 
@@ -402,7 +403,9 @@ class Mesh:
                 return
             self._inbox.loop.call_later(LINK_PERIOD, look)
             about = "the token is missing of the linked session "
-            missing = [about + peer for peer in self._transport.peers() if shown.get(peer) is False]
+            gone = {peer: shown[peer][0] for peer in self._transport.peers() if peer in shown and not shown[peer][1]}
+            there = {program for program, alive in shown.values() if alive} if gone else ()
+            missing = [about + peer for peer, program in gone.items() if program not in there]
             self.suspicions.keep(missing, about)
             for what in missing:
                 self.suspicions.suspect(what)
