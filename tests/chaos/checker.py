@@ -178,6 +178,13 @@ class Checker:
         self._open[host, event["id"]] = _Open(event)
         self._needs[f"{host}/{CLIENT}/{event['id']}"] = event["needs"]
 
+    def on_anew(self, host: str, event: Json) -> None:
+        """What had its time unheard is asked for under a new id."""
+        request = self._open.pop((host, event["id"]), None)
+        if request is not None:
+            self._open[host, event["new"]] = request
+            self._needs[f"{host}/{CLIENT}/{event['new']}"] = request.asked["needs"]
+
     def on_running(self, host: str, event: Json) -> None:
         request = self._open.get((host, event["id"]))
         if request is None:
@@ -237,13 +244,12 @@ class Checker:
             return
         self._given_up[f"{host}/{CLIENT}/{event['id']}"] = event["at"]
         self._disbelieve(host, event["at"], request)
-        # One that may be kept, and had its time, ends with an RC. Who was cut off may have missed all of a hold.
-        had = request.granted or self.touched([host], event["at"])
+        # One that may be kept, and had its time, ends with an RC.
         kept = (
             request.outcome == "lost"
             and event["at"] - (request.held or event["at"]) >= request.asked["min_runtime"] * SECOND
         )
-        if event["ended"] and not (had and (request.outcome == "completed" or kept)):
+        if event["ended"] and not (request.granted and (request.outcome == "completed" or kept)):
             text = f"{host} {event['id']} ended as {request.outcome}, granted: {request.granted}"
             self.broken(event["at"], "9 nothing is thrown away", text)
 

@@ -597,7 +597,17 @@ class Client(Peer):
             say(request.state, id=notice["id"], before=before, **{name: notice.get(name) for name in known})
             if request.state == "ended" and notice.get("outcome") == "client_lost":
                 request.state, request.due = "asking", now()
+            if request.state == "ended" and notice.get("outcome") == "completed" and before is None:
+                self.ask_anew(request)
             self.news.notify_all()
+
+    def ask_anew(self, request: Request) -> None:
+        """It had its time, and this client never heard of it."""
+        old, new = request.asked["id"], secrets.token_hex(8)
+        say("anew", id=old, new=new)
+        request.asked["id"], request.last = new, (NO_TERM, 0)
+        request.state, request.due = "asking", now()
+        self.requests[new] = self.requests.pop(old)
 
     def on_grants(self, sample: zenoh.Sample) -> None:
         term = term_of(json.loads(sample.payload.to_bytes())["term"])

@@ -25,9 +25,14 @@ class Worker:
         self.client, self.rng = client, random.Random(seed)  # noqa: S311
         self.quiet = asyncio.Event()
         self._believed: dict[str, Grant | None] = {}
+        self._ids: dict[str, str] = {}
+        """By ARC: the id under which it was told of last."""
         client.watch(self._told)
 
     def _told(self, arc: OpenArc) -> None:
+        if (known_as := self._ids.setdefault(arc.name, arc.id)) != arc.id:
+            say("anew", id=known_as, new=arc.id)
+            self._ids[arc.name] = arc.id
         before, self._believed[arc.id] = self._believed.get(arc.id), arc.grant
         state = "lost" if arc.state == "asking" else arc.state
         known = {"place": arc.place, "grant": arc.grant, "rcs": arc.rcs, "outcome": arc.outcome, "reason": arc.reason}
@@ -51,6 +56,7 @@ class Worker:
         asking = asyncio.create_task(client.request(asked["arc"], asked["needs"], **how))
         await asyncio.sleep(0)
         mark = next(arc.id for arc in client._store.open if arc.name == asked["arc"])
+        self._ids[asked["arc"]] = mark
         say("asked", id=mark, **asked)
         arc = await asking
         while arc.open:

@@ -330,6 +330,24 @@ def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
     run(test())
 
 
+def test_what_had_its_time_before_its_client_heard_of_it_is_asked_for_anew_at_its_place() -> None:
+    async def test() -> None:
+        async with small_fleet("one", "two") as (fleet, (one, two)):
+            first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
+            waits = await two.request("second", {RC: {}}, min_runtime=0.5)
+            known_as, place = waits.id, waits.place
+            fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+            await one.end(first)
+            assert await fleet.holders() == ["second"]
+            await asyncio.sleep(1)
+            fleet.network.disturb({})
+            assert waits.state == "queued"
+            assert await two.granted(waits) is not None
+            assert (waits.id != known_as, waits.place) == (True, place)
+
+    run(test())
+
+
 def test_a_request_that_is_cancelled_before_its_answer_is_withdrawn() -> None:
     async def test() -> None:
         async with small_fleet("one") as (fleet, (one,)):

@@ -99,7 +99,7 @@ class Client(MovableClient):
 
     def _on_dropped(self, arc: OpenArc) -> None:
         # All that was dropped together is asked for with one token.
-        if self.mesh.now() - self._shown > RENEW_TOKEN:
+        if arc.outcome == "client_lost" and self.mesh.now() - self._shown > RENEW_TOKEN:
             self._renew_token()
         self._supervisor.spawn(self._ask_again(arc))
 

@@ -79,6 +79,8 @@ class OpenArc:
     """When `state` began."""
     waits_since: Ns | None = None
     """When it was last queued: its present wait began then, whichever RCM leads."""
+    unheard: bool = False
+    """Whether it had its time, and this client was never told that it was granted."""
     unconfirmed: tuple[Grant, list[str]] | None = None
     """The grant that some of its RCs did not confirm, and which, until the RCM has answered that."""
     ending: HoldEnd | None = None
@@ -113,6 +115,7 @@ class OpenArc:
         self.last, self.unconfirmed = (notice.term, notice.step), None
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
+        self.unheard = self.grant is None and notice.outcome == "completed"
         if notice.state != "running":
             self._close(HoldEnd(notice.outcome or "lost", notice.reason, notice.by), now)
         elif notice.grant != self.grant:
@@ -303,11 +306,20 @@ class RequestStore:
             if not arc.open and arc.outcome == "client_lost":
                 arc.reopen(self._now())
                 self.ask_again(arc)
+            elif arc.unheard:
+                self._ask_anew(arc)
             elif arc.shows_place(notice):
                 self.ask_again(arc)
             self.notify(arc)
             if not arc.open:
                 self.forget(arc)
+
+    def _ask_anew(self, arc: OpenArc) -> None:
+        """Nobody made use of its time: it is asked for under a new id, at its place."""
+        del self.arcs[arc.id]
+        arc.take_back(new_instance(), "it had its time before this client heard of it", self._now())
+        self.arcs[arc.id] = arc
+        self.ask_again(arc)
 
     def open_requests(self) -> list[OpenRequest]:
         """All, as it is reported to an RCM that takes the lead. What is expected has no place: it is this

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from zscout.behaviors.client import rcm_link
 from zscout.behaviors.client.rcm_link import RcmLink
-from zscout.behaviors.client.request import OpenArc
+from zscout.behaviors.client.request import OpenArc, RequestStore
 from zscout.drivers import holds
 from zscout.drivers.holds import HoldChange, HoldEntry, HoldTable
 from zscout.drivers.instances import Instances
@@ -165,6 +165,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "away": Guard("a leader that was away itself drops nobody for it", {(Membership, "_is_away"): _no}),
         "reopen": Guard("who was dropped and lives goes on at its place", {(RequestRegistry, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
+        "unheard": Guard("what had its time unheard is asked for anew", {(RequestStore, "_ask_anew"): _nothing}),
         "notices": Guard("of two notices the newer counts", {(OpenArc, "take"): _take_any}),
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
         "absurd": Guard(

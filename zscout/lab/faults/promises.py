@@ -138,6 +138,7 @@ class Promises:
         if arc.last != known and arc.last < max(known, (term, 0)):
             self._broken(f"{name} {arc.name} believes {arc.last} after {max(known, (term, 0))}")
         self._told[full] = max(arc.last, known)
+        was_over = full in self._over
         if arc.open:
             self._over.discard(full)
         else:
@@ -145,6 +146,8 @@ class Promises:
         if arc.outcome == "lost" and arc.reason.startswith("the RCM refuses it"):
             self._broken(f"{name} {arc.name} was taken, and then refused: {arc.reason}")
         held, granted = self._granted.pop(full, ("", [])), ""
+        if arc.outcome == "completed" and not held[0] and not was_over:
+            self._broken(f"{name} {arc.name} had its time, and was never told of it")
         if arc.grant is not None:
             granted = _written(arc.grant)
             self._granted[full] = granted, arc.rcs
