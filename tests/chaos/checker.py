@@ -53,6 +53,8 @@ class _Open:
     outcome: str | None = None
     believed: tuple[Grant, int, list[str]] | None = None
     """The hold that its client believes in, since when, and the RCs of it."""
+    entered: Grant | None = None
+    """The last one that all of its RCs have confirmed to its client."""
 
 
 class Checker:
@@ -196,6 +198,10 @@ class Checker:
             request.held = event["at"]
         request.granted, request.worse_since = True, None
 
+    def on_entered(self, host: str, event: Json) -> None:
+        if (request := self._open.get((host, event["id"]))) is not None:
+            request.entered = _grant(event["grant"])
+
     def on_queued(self, host: str, event: Json) -> None:
         request = self._open.get((host, event["id"]))
         if request is None:
@@ -224,7 +230,7 @@ class Checker:
             self.broken(at, "10 nobody alive is dropped", f"{host} {event['id']}: {event['reason']}")
         elif held is not None and (outcome == "lost" or event["do"] == "lost"):
             gang = [host_of(rc) for rc in held[2]]
-            if not self.touched([host, *gang], at):
+            if held[0] == request.entered and not self.touched([host, *gang], at):
                 text = f"{host} {event['id']} lost {held[0]} of {', '.join(held[2])}: {event['reason']}"
                 self.broken(at, "10 what no fault touches goes on", text)
         self._disbelieve(host, at, request)

@@ -44,7 +44,8 @@ def commanded(at: float, grant: Any, sent: float) -> tuple[str, Json]:
 
 Q = f"c1/{CLIENT}/q"
 LIFE = [
-    asked(1),
+    asked(1, "p"),
+    client(1.1, "anew", "p", new="q"),
     client(1.1, "queued"),
     publish(1.2, [OLD], [Q]),
     rc(1.2, "hear", [OLD], seq=1),
@@ -87,6 +88,7 @@ BROKEN: dict[str, list[tuple[str, Json]]] = {
     "10 what no fault touches goes on": [
         asked(3, "q1"),
         client(3.1, "running", "q1", grant=NEW),
+        client(3.1, "entered", "q1", grant=NEW),
         client(3.2, "queued", "q1", outcome="lost"),
         client(4, "gave_up", "q1"),
     ],
