@@ -297,7 +297,7 @@ class Rc:
             "instance": self.instance,
             "sharable": self.capacity is not None,
             "term": self.term,
-            "seq": self.seq,
+            "seq": 0 if self.behind else self.seq,
             "holders": holders,
             "ended": ended or [],
             "leader": bool(self.peer.leaders) and at - self.peer.heard < HOLD_LEASE // 2,
@@ -345,9 +345,9 @@ class Rc:
                 self._begin(grant, holder)
         if before != (self.term, self.seq) or known != self.held.keys():
             self.trace("hear")
+        self.behind |= missed
         if announce:
             self.publish()
-        self.behind |= missed
         return missed
 
     def _begin(self, grant: Grant, holder: Json) -> None:

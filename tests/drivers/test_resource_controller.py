@@ -179,6 +179,29 @@ def test_a_command_under_a_grant_that_was_missed_waits_until_that_was_read() -> 
     play(story)
 
 
+def test_an_rc_that_has_missed_something_does_not_say_that_it_knows_all() -> None:
+    """Its RCM would take a hold for lost of which it has yet to read."""
+
+    async def story(rcm: Rcm, rc: ResourceController, _device: Device, client: Mesh) -> None:
+        states: list[RcState] = []
+        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+        rcm.hangs = True
+        rcm.seq += 1
+        rcm.publish(rc="robot/y")
+        await until(lambda: rc.holds.seq == rcm.seq)
+        rc.publish()
+        await until(lambda: bool(states))
+        assert states[-1].seq == 0
+        rcm.hangs = False
+        await asyncio.sleep(2)  # what it asked in vain is over
+        rcm.publish(rc="robot/y")
+        await until(lambda: not rc._missed)
+        rc.publish()
+        await until(lambda: states[-1].seq == rcm.seq)
+
+    play(story)
+
+
 def test_figures_are_published_when_they_change() -> None:
     async def story() -> None:
         network, device = MemoryNetwork(), Device()

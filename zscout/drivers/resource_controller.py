@@ -280,7 +280,8 @@ class ResourceController:
             instance=self.instance,
             sharable=self.driver.sharable,
             term=self.holds.term,
-            seq=self.holds.seq,
+            # An RCM takes what one that knows all does not name for lost.
+            seq=0 if self._missed else self.holds.seq,
             holders=self.holds.holders(self.mesh.now()),
             ended=ended,
             health=self.health,
@@ -410,9 +411,9 @@ class ResourceController:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
             self.queue.put_change(change)
             self.queue.resume(lambda query: query.message.grant in self.holds.held)
+        self._missed |= change.reread
         if change.announce or change.expired_locally:
             self.publish(change.expired_locally)
-        self._missed |= change.reread
         self._set_timer()
 
     def _read_state(self) -> asyncio.Task[None]:
@@ -433,12 +434,12 @@ class ResourceController:
             newest = max(states, key=lambda state: (state.term, state.seq))
             overtaken = (newest.term, newest.seq) < (self.holds.term, self.holds.seq)
             change = self.holds.apply_snapshot(newest, self.mesh.now(), self._carries)
-            if not overtaken:
-                self._trace("read")
-            self._apply(change)
             # What was published while the answer was on its way may have hidden the very gap it was for.
             if not overtaken:
+                self._trace("read")
                 self._missed = False
+            self._apply(change)
+            if not overtaken:
                 break
         self.queue.resume(lambda query: not self._is_early(query))
         for query in self.queue.drop_early():
