@@ -59,6 +59,7 @@ def main(words: list[str] | None = None) -> int:
         print(report.dump(found))
     else:
         print(report.table(found["figures"]))
+        print(f"longest of ours: {'; '.join(found['late'])}")
         print(f"\n{found['faults']} faults in {found['seconds']:.0f} s, seed {asked.seed}; told: {found['told']}")
         print(f"{len(found['violations'])} violations" + (f"; logs are in {folder}" if keep else ""))
         for line in found["violations"][:50]:
@@ -83,6 +84,7 @@ def run(asked: Any, kinds: list[str], folder: Path) -> dict[str, Any]:
         "seconds": round((now() - start) / SECOND),
         "faults": len(faults),
         "figures": report.figures(faults),
+        "late": report.late(faults, start),
         "told": {name: told[name] for name in ("asked", "entered", "commanded", "command", "publish", "lost")},
         "violations": [report.around(one, faults, start) for one in violations],
         "logs": str(folder),

@@ -48,8 +48,8 @@ class _Open:
     place: Grant | None = None
     worse_since: int | None = None
     granted: bool = False
-    held: int = 0
-    """When its last hold began."""
+    held: tuple[Grant, int] | None = None
+    """Its last hold, and when it began: a new leader may give back what is still held."""
     outcome: str | None = None
     believed: tuple[Grant, int, list[str]] | None = None
     """The hold that its client believes in, since when, and the RCs of it."""
@@ -195,7 +195,8 @@ class Checker:
         if request.believed is None or request.believed[0] != grant:
             self._disbelieve(host, event["at"], request)
             request.believed = grant, event["at"], event["rcs"]
-            request.held = event["at"]
+            if request.held is None or request.held[0] != grant:
+                request.held = grant, event["at"]
         request.granted, request.worse_since = True, None
 
     def on_entered(self, host: str, event: Json) -> None:
@@ -253,7 +254,8 @@ class Checker:
         # One that may be kept, and had its time, ends with an RC.
         kept = (
             request.outcome == "lost"
-            and event["at"] - (request.held or event["at"]) >= request.asked["min_runtime"] * SECOND
+            and request.held is not None
+            and event["at"] - request.held[1] >= request.asked["min_runtime"] * SECOND
         )
         if event["ended"] and not (request.granted and (request.outcome == "completed" or kept)):
             text = f"{host} {event['id']} ended as {request.outcome}, granted: {request.granted}"

@@ -49,16 +49,25 @@ def figures(faults: Sequence[Fault]) -> dict[str, Figures]:
     return found
 
 
+def late(faults: Sequence[Fault], start: int) -> list[str]:
+    """Those after which it took us longest, of those that came alone."""
+    alone = sorted((fault for fault in faults if fault.alone and fault.served), key=lambda one: one.linked - one.served)
+    return [f"{(fault.served - fault.linked) / SECOND:.2f} s after {told(fault, start)}" for fault in alone[:5]]
+
+
+def told(fault: Fault, start: int) -> str:
+    return (
+        f"{fault.kind} ({fault.how}) of {', '.join(fault.hosts or fault.touched)}"
+        f" from {(fault.at - start) / SECOND:.2f} s for {(fault.mended - fault.at) / SECOND:.2f} s"
+    )
+
+
 def around(violation: Violation, faults: Sequence[Fault], start: int) -> str:
     """The violation, with the last faults before it."""
     last = [fault for fault in faults if fault.at <= violation.at][-2:]
-    told = "; ".join(
-        f"{fault.kind} ({fault.how}) of {', '.join(fault.hosts or fault.touched)}"
-        f" from {(fault.at - start) / SECOND:.2f} s for {(fault.mended - fault.at) / SECOND:.2f} s"
-        for fault in last
-    )
+    before = "; ".join(told(fault, start) for fault in last)
     return (
-        f"{(violation.at - start) / SECOND:9.3f} s  [{violation.promise}] {violation.text}  (after: {told or 'none'})"
+        f"{(violation.at - start) / SECOND:9.3f} s  [{violation.promise}] {violation.text}  (after: {before or 'none'})"
     )
 
 

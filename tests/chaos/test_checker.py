@@ -9,7 +9,7 @@ import pytest
 
 from tests.chaos.checker import Checker, Violation, check
 from tests.chaos.faults import SECOND, Fault, isolated
-from tests.chaos.report import figures, spread, table
+from tests.chaos.report import figures, late, spread, table
 from tests.chaos.work import CAPACITY, CLIENT, HOSTS, Json, host_of, rcs_of
 
 TERM = [3, "aa"]
@@ -152,6 +152,15 @@ def test_who_was_struck_may_lose(promise: str) -> None:
     assert held_against([*LIFE, *BROKEN[promise]], *struck) == []
 
 
+def test_a_hold_that_a_new_leader_gives_back_is_the_same() -> None:
+    """It had its time, and its RC was lost: it may be over."""
+    before = [asked(3, "q1"), client(3.1, "running", "q1", grant=NEW), client(3.9, "queued", "q1")]
+    lost = [client(4.5, "ended", "q1", outcome="lost"), client(4.5, "gave_up", "q1", ended=True)]
+    assert held_against([*LIFE, *before, client(4, "running", "q1", grant=NEW), *lost]) == []
+    found = held_against([*LIFE, *before, client(4, "running", "q1", grant=[TERM, 9]), *lost])
+    assert [one.promise for one in found] == ["9 nothing is thrown away"]
+
+
 def test_a_killed_client_asks_for_nothing_any_more() -> None:
     killed = ("c1", {"at": 5 * SECOND, "do": "killed"})
     assert held_against([*LIFE, *BROKEN["16 all is served"], killed]) == []
@@ -183,3 +192,4 @@ def test_figures() -> None:
     row = figures([fault])["leader killed"]
     assert {name: one["worst"] for name, one in row.items()} == {"next_grant": 1, "healed": 3, "zenoh": 1, "ours": 2}
     assert "leader killed" in table(figures([fault]))
+    assert late([fault], 0) == ["2.00 s after leader killed (kill) of n1 from 1.00 s for 2.00 s"]

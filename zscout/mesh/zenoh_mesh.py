@@ -8,7 +8,7 @@ import json
 import logging
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, Self, TypeVar
 
@@ -20,6 +20,7 @@ from zscout import messages
 from zscout.config.fleet import MeshConfig
 from zscout.keyexpr import Keys, Sender
 from zscout.mesh.exchange import MeshError
+from zscout.mesh.relinking import Relinking
 from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.session import Mesh
 from zscout.mesh.supervision import clock
@@ -89,7 +90,7 @@ class ZenohMesh(Mesh):
 async def _open(config: MeshConfig) -> Transport:
     opening = _in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config)))
     try:
-        return ZenohTransport(await asyncio.wrap_future(opening))
+        session = await asyncio.wrap_future(opening)
     except asyncio.CancelledError:
         # In a thread of its own: this may be the event loop's.
         opening.add_done_callback(
@@ -98,6 +99,17 @@ async def _open(config: MeshConfig) -> Transport:
         raise
     except zenoh.ZError as error:
         raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
+    return ZenohTransport(session, _relinking(session, config) if config.multicast else None)
+
+
+def _relinking(session: zenoh.Session, config: MeshConfig) -> Relinking:
+    def meeting(addresses: Sequence[str]) -> zenoh.Config:
+        settings = zenoh_config(replace(config, multicast=False, connect=tuple(addresses)))
+        settings.insert_json5("listen/endpoints", "[]")
+        settings.insert_json5("scouting/gossip/autoconnect", '{"peer": []}')
+        return settings
+
+    return Relinking(session, zenoh_config(config), meeting)
 
 
 def _in_thread(name: str, call: Callable[[], T]) -> Future[T]:
@@ -119,8 +131,8 @@ class ZenohTransport(Transport):
     # Every callback is direct: it runs on a thread of Zenoh's, where a plain function would get a thread of
     # its own per declaration and per query.
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
+    def __init__(self, session: zenoh.Session, relinking: Relinking | None = None) -> None:
+        self._session, self._relinking = session, relinking
 
     def id(self) -> str:
         return str(self._session.info.zid())
@@ -132,7 +144,12 @@ class ZenohTransport(Transport):
         return len(self._session.info.links())
 
     async def close(self) -> None:
-        closing = _in_thread("closes the mesh", self._session.close)
+        def close() -> None:
+            if self._relinking is not None:
+                self._relinking.close()
+            self._session.close()  # type: ignore[no-untyped-call]
+
+        closing = _in_thread("closes the mesh", close)
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.wrap_future(closing)

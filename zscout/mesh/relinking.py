@@ -1,0 +1,178 @@
+"""Links that were lost, made again at once.
+
+Zenoh looks for peers by multicast, once it has run for a while every 8 s: for so long two processes that live may be
+without a link after a fault of a moment. But peers that are both linked to a third are told of one another by it
+(gossip), and link. So the one that had made the link sees whether the other listens still, asks by multicast for both
+addresses, and opens a session that links to these two until they have found each other (docs/zenoh.md)."""
+
+from __future__ import annotations
+
+import logging
+import re
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Final
+
+import zenoh
+from zenoh.handlers import Callback
+
+log = logging.getLogger(__name__)
+
+PAUSES: Final = (0.05, 0.2, 0.5, *(1.0,) * 30)
+"""Seconds before each look for a peer. After the last one it is left to Zenoh."""
+TOGETHER: Final = 0.25
+"""Seconds within which two losses mean that this process was away, and may be missed by those who made the link."""
+TOGETHER_LOOKS: Final = 6
+"""So often it looks for them then: many may do so at one time."""
+PROBE_TIMEOUT: Final = 0.25
+PROBES_TIMEOUT: Final = 1.0
+"""For all of one look: where many are lost, each has its turn."""
+SCOUT_TIMEOUT: Final = 0.5
+MEET_TIMEOUT: Final = 1.0
+POLL: Final = 0.002
+MEETING: Final = "6d656574"
+"""So begins the id of a session that is opened for a moment: nobody misses it."""
+_ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
+
+
+@dataclass(slots=True)
+class _Lost:
+    at: float
+    addresses: list[str] = field(default_factory=list)
+    """Of the other ends of its links: where it listens, if they were made from here."""
+    looks: int = 0
+    together: bool = False
+
+
+class Relinking:
+    """Of one session, in a thread that lives while something is lost.
+
+    `scouting` says how peers are asked who is there; `meeting` gives the settings of a session that links to the
+    addresses it is given, and to nobody else. It is one of a moment: its id, by which others know that, is set here."""
+
+    def __init__(
+        self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]
+    ) -> None:
+        self._session, self._scouting, self._meeting = session, scouting, meeting
+        self._own = str(session.zid())
+        self._lock = threading.Lock()
+        self._lost: dict[str, _Lost] = {}
+        self._thread: threading.Thread | None = None
+        self._closed = threading.Event()
+        callback: Callback[zenoh.LinkEvent] = Callback(self._on_link, lambda: None, indirect=False)
+        self._listener = session.info.declare_link_events_listener(callback)
+
+    def close(self) -> None:
+        """Before the session is closed. Returns when the thread has ended, in a second or two: one that is inside Zenoh
+        when its process ends makes that a crash."""
+        self._closed.set()
+        with suppress(zenoh.ZError):
+            self._listener.undeclare()  # type: ignore[no-untyped-call]
+        if (thread := self._thread) is not None:
+            thread.join()
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        now, peer = time.monotonic(), str(event.link.zid)
+        with self._lock:
+            if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(MEETING):
+                self._lost.pop(peer, None)
+                return
+            self._lost.setdefault(peer, _Lost(now)).addresses.append(event.link.dst)
+            lately = [one for one in self._lost.values() if now - one.at < TOGETHER]
+            for one in lately:
+                one.together |= len(lately) > 1
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="links again", daemon=True)
+                self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            while (pause := self._next()) is not None:
+                self._closed.wait(pause)
+                try:
+                    self._look()
+                except zenoh.ZError as error:  # the next look may do better
+                    log.debug("looking for lost links failed: %s", error)
+        except Exception:
+            log.exception("lost links are left to Zenoh: looking for them failed")
+            with self._lock:
+                self._lost, self._thread = {}, None
+
+    def _next(self) -> float | None:
+        """Seconds until the next look; None: there is nobody to look for."""
+        with self._lock:
+            still = {peer: one for peer, one in self._lost.items() if one.looks < len(PAUSES)}
+            self._lost = {} if self._closed.is_set() else still
+            if self._lost:
+                return min(PAUSES[one.looks] for one in self._lost.values())
+            self._thread = None
+            return None
+
+    def _look(self) -> None:
+        linked = self._linked()
+        with self._lock:
+            self._lost = {peer: one for peer, one in self._lost.items() if peer not in linked}
+            lost = dict(self._lost)
+        wanted, until = set(), time.monotonic() + PROBES_TIMEOUT
+        for peer, one in sorted(lost.items(), key=lambda known: known[1].looks):
+            if time.monotonic() > until or self._closed.is_set():
+                break
+            one.looks += 1
+            listens = _listens(one.addresses)
+            if listens or (one.together and one.looks <= TOGETHER_LOOKS):
+                wanted.add(peer)
+            elif listens is False:
+                # Its process has gone, or it was it that made the link.
+                one.looks = len(PAUSES)
+        if wanted and not self._closed.is_set() and (there := self._scout(wanted)):
+            self._introduce(there)
+
+    def _linked(self) -> set[str]:
+        return {str(peer) for peer in self._session.info.peers_zid()}
+
+    def _scout(self, wanted: set[str]) -> dict[str, list[str]]:
+        """The addresses of those who are there, and of this process; nothing where either is missing."""
+        found: dict[str, list[str]] = {}
+        until = time.monotonic() + SCOUT_TIMEOUT
+        with zenoh.scout(what="peer", config=self._scouting) as scout:
+            while time.monotonic() < until and not wanted | {self._own} <= found.keys():
+                if (hello := scout.try_recv()) is None:
+                    if self._closed.wait(POLL):
+                        return {}
+                elif str(hello.zid) in wanted | {self._own}:
+                    # An address that holds on one link of a network only is none without the name of that link.
+                    found[str(hello.zid)] = [one for one in hello.locators if "[fe80:" not in one]
+        return found if self._own in found and len(found) > 1 else {}
+
+    def _introduce(self, there: dict[str, list[str]]) -> None:
+        addresses = [address for known in there.values() for address in known]
+        peers, settings = there.keys() - {self._own}, self._meeting(addresses)
+        settings.insert_json5("id", f'"{MEETING}{secrets.token_hex(10)}"')
+        with zenoh.open(settings):
+            until = time.monotonic() + MEET_TIMEOUT
+            while time.monotonic() < until and not self._closed.wait(POLL):
+                if peers <= self._linked():
+                    log.info("linked again: %s", ", ".join(sorted(peers)))
+                    return
+
+
+def _listens(addresses: Sequence[str]) -> bool | None:
+    """Whether anybody does at one of these; None: it can't be told now."""
+    listens: bool | None = False
+    for address in addresses:
+        if (found := _ADDRESS.match(address)) is None:
+            continue
+        try:
+            socket.create_connection((found[1].strip("[]"), int(found[2])), PROBE_TIMEOUT).close()
+        except ConnectionRefusedError:
+            continue
+        except OSError:
+            listens = None
+        else:
+            return True
+    return listens
