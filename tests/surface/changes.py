@@ -81,7 +81,6 @@ ADDED: Final[dict[str, str]] = {
     "messages > zscout.Ask.v1 > fields > unconfirmed": _UNCONFIRMED,
     "messages > zscout.Ask.v1 > fields > term": _TERM,
     "python > what Client.request gives > attributes > unconfirmed": _UNCONFIRMED,
-    "python > what Client.request gives > attributes > unheard": "what had its time unheard is asked for anew",
     "python > what Client.request gives > attributes > shown": _PLACE,
     "python > zscout.CommandRefused > attributes > rc": "which RC refused",
     _TABLE1 + "not all came in the order of Table 2; cells that are only late, on a busy machine, are named.": _LATE,

@@ -24,6 +24,8 @@ MAX_NEEDS = 64
 MAX_PARAMS = 16
 MAX_COUNTER = 2**52 - 1
 """A term whose counter is above this is rejected."""
+MAX_INCARNATION = MAX_COUNTER * 1000
+"""Of a component: the placer of a term counts from a thousand times its counter on."""
 MAX_JUMP = 1_000_000
 """A term whose counter is this far above all that were received is an error, not an election."""
 LAST_TERMS = MAX_COUNTER - 2**20

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 
-from zscout.messages.base import MAX_COUNTER, Bytes, Elapsed, Figure, Message, ShortText
+from zscout.messages.base import MAX_INCARNATION, Bytes, Elapsed, Figure, Message, ShortText
 from zscout.messages.hosts import MAX_LABELS, MAX_RANKED
 from zscout.messages.scheduling import OpenRequest
 from zscout.types import NO_TERM, Metric, Policy, Term
@@ -26,7 +26,7 @@ MAX_TAIL = 2_000
 MAX_PLACED = 10_000
 """Components of one fleet."""
 
-Incarnation: TypeAlias = Annotated[int, msgspec.Meta(ge=1, le=MAX_COUNTER * 1000)]
+Incarnation: TypeAlias = Annotated[int, msgspec.Meta(ge=1, le=MAX_INCARNATION)]
 """Which start of a component this is: of two the higher counts. Grows over changes of RCM as well."""
 ComponentName: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_COMPONENT_NAME)]
 Restart: TypeAlias = Literal["never", "on_failure", "always"]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from zscout.messages.base import MAX_COUNTER, Bytes, Figure, Message, ShortText
+from zscout.messages.base import MAX_COUNTER, MAX_INCARNATION, Bytes, Figure, Message, ShortText
 from zscout.types import Metric, Policy
 
 MAX_RANKED = 256
@@ -23,7 +23,7 @@ class ComponentUse(Message, frozen=True):
 
     component: ShortText
     kind: ShortText
-    incarnation: Annotated[int, msgspec.Meta(ge=0, le=MAX_COUNTER * 1000)]
+    incarnation: Annotated[int, msgspec.Meta(ge=0, le=MAX_INCARNATION)]
     cpu: Figure
     memory: Bytes
     processes: Annotated[int, msgspec.Meta(ge=0, le=MAX_COUNTER)] = 1

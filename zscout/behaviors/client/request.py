@@ -79,8 +79,6 @@ class OpenArc:
     """When `state` began."""
     waits_since: Ns | None = None
     """When it was last queued: its present wait began then, whichever RCM leads."""
-    unheard: bool = False
-    """Whether it had its time, and this client was never told that it was granted."""
     unconfirmed: tuple[Grant, list[str]] | None = None
     """The grant that some of its RCs did not confirm, and which, until the RCM has answered that."""
     ending: HoldEnd | None = None
@@ -115,7 +113,6 @@ class OpenArc:
         self.last, self.unconfirmed = (notice.term, notice.step), None
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
-        self.unheard = self.grant is None and notice.outcome == "completed"
         if notice.state != "running":
             self._close(HoldEnd(notice.outcome or "lost", notice.reason, notice.by), now)
         elif notice.grant != self.grant:
@@ -295,6 +292,7 @@ class RequestStore:
         if notice.id != arc.id:
             # An answer that was on its way when the ARC was taken back under another id.
             return
+        granted = arc.grant is not None
         if notice.outcome == "handed_over" and not self.resumed.is_set():
             # Not before the hand-over is answered: an RCM that dies first may not have notified the other.
             return
@@ -306,7 +304,7 @@ class RequestStore:
             if not arc.open and arc.outcome == "client_lost":
                 arc.reopen(self._now())
                 self.ask_again(arc)
-            elif arc.unheard:
+            elif not granted and arc.outcome == "completed":
                 self._ask_anew(arc)
             elif arc.shows_place(notice):
                 self.ask_again(arc)

@@ -101,11 +101,11 @@ class ComponentLifecycle:
             case messages.ActivateComponent():
                 self._activated.set()
             case messages.CheckpointComponent():
-                self._supervisor.spawn(self._or_decline(order.number, self._take_checkpoint(order.number)))
+                self._supervisor.spawn(self._or_decline(order.number, self._take_checkpoint))
             case MoveComponent() as move:
-                self._supervisor.spawn(self._or_decline(order.number, self._move_away(order.number, move)))
+                self._supervisor.spawn(self._or_decline(order.number, self._move_away, move))
             case RestoreComponent() as restore:
-                self._supervisor.spawn(self._or_decline(order.number, self._take_in(order.number, restore)))
+                self._supervisor.spawn(self._or_decline(order.number, self._take_in, restore))
 
     def end(self, ends: EndReport) -> None:
         """Has it end; of several ends the first is reported. A move that has begun is called off; if it is
@@ -188,9 +188,9 @@ class ComponentLifecycle:
 
     # Orders that are answered
 
-    async def _or_decline(self, number: int, carried_out: Awaitable[None]) -> None:
+    async def _or_decline(self, number: int, carry_out: Callable[..., Awaitable[None]], *what: Any) -> None:
         try:
-            await carried_out
+            await carry_out(number, *what)
         except NotMoved as refused:
             await self._report(OrderAnswer(number, problem=Problem(refused.code, str(refused))))
 
