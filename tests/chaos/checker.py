@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
-from tests.chaos.faults import Fault
+from tests.chaos.faults import LEASE, Fault
 from tests.chaos.work import CAPACITY, CLIENT, HOSTS, NODES, Json, host_of
 
 SECOND: Final = 1_000_000_000
@@ -26,6 +26,15 @@ KEPT: Final = 4096
 
 Term: TypeAlias = tuple[int, str]
 Grant: TypeAlias = tuple[Term, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """Two hosts that lived and had no link that stands."""
+
+    pair: frozenset[str]
+    since: int
+    until: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +69,8 @@ class _Open:
 class Checker:
     """Takes what happened, one event after the other, and then `finish`."""
 
-    def __init__(self, faults: Sequence[Fault] = ()) -> None:
-        self.faults = faults
+    def __init__(self, faults: Sequence[Fault] = (), apart: Sequence[Apart] = ()) -> None:
+        self.faults, self.apart = faults, apart
         self.found: list[Violation] = []
         self._instances: defaultdict[tuple[str, str], _Instance] = defaultdict(_Instance)
         self._obeyed: dict[str, Grant] = {}
@@ -75,6 +84,8 @@ class Checker:
         self._given_up: dict[str, int] = {}
         self._too_much: set[tuple[str, frozenset[Grant]]] = set()
         self._terms: dict[Term, int] = {}
+        self._led: dict[str, int] = {}
+        """When each node published last."""
         self._recent: deque[int] = deque()
         self.counts: defaultdict[str, int] = defaultdict(int)
 
@@ -87,6 +98,15 @@ class Checker:
         return any(
             fault.began <= at and at - since <= fault.over(AFTER) and named & set(fault.touched)
             for fault in self.faults
+        )
+
+    def unlinked(self, hosts: Iterable[str], at: int) -> bool:
+        """Whether one of these hosts and one that led had no link for longer than the lease, until lately."""
+        return any(
+            one.until - one.since > LEASE * SECOND
+            and one.since <= at <= one.until + CALM
+            and any(one.pair == {host, node} and led >= one.since for host in hosts for node, led in self._led.items())
+            for one in self.apart
         )
 
     def take(self, host: str, event: Json) -> None:
@@ -158,6 +178,7 @@ class Checker:
 
     def on_publish(self, host: str, event: Json) -> None:
         term = _term(event["term"])
+        self._led[host] = event["at"]
         for holders in event["rcs"].values():
             for grant, owner, *_ in holders:
                 self._owner[_grant(grant)] = owner
@@ -227,11 +248,11 @@ class Checker:
         if request is None:
             return
         outcome, held = event.get("outcome"), request.believed
-        if outcome == "client_lost" and not self.touched([host], at):
+        if outcome == "client_lost" and not (self.touched([host], at) or self.unlinked([host], at)):
             self.broken(at, "10 nobody alive is dropped", f"{host} {event['id']}: {event['reason']}")
         elif held is not None and (outcome == "lost" or event["do"] == "lost"):
-            gang = [host_of(rc) for rc in held[2]]
-            if held[0] == request.entered and not self.touched([host, *gang], at):
+            where = {host, *map(host_of, held[2])}
+            if held[0] == request.entered and not (self.touched(where, at) or self.unlinked(where, at)):
                 text = f"{host} {event['id']} lost {held[0]} of {', '.join(held[2])}: {event['reason']}"
                 self.broken(at, "10 what no fault touches goes on", text)
         self._disbelieve(host, at, request)
@@ -273,7 +294,7 @@ class Checker:
             if "freeze" in fault.how and host in fault.hosts
         )
         for rc in rcs:
-            began, over = self._began.pop((rc, grant), at), self._over.pop((rc, grant), at)
+            began, over = self._began.get((rc, grant), at), self._over.get((rc, grant), at)
             missing = max(began - since, at - over) - still
             if missing > BELIEF:
                 text = f"{host} believed in {grant}, and {rc} did not hold it for {missing / SECOND:.1f} s"
@@ -325,9 +346,11 @@ def events(file: Path) -> Iterator[Json]:
                 yield {"at": at, "do": "error", "text": line.strip()}
 
 
-def check(folder: Path, faults: Sequence[Fault], marks: Iterable[tuple[str, Json]], end: int) -> Checker:
+def check(
+    folder: Path, faults: Sequence[Fault], marks: Iterable[tuple[str, Json]], end: int, apart: Sequence[Apart] = ()
+) -> Checker:
     """Holds a whole run against the promises: the logs in `folder`, and what the run itself did to its hosts."""
-    checker = Checker(faults)
+    checker = Checker(faults, apart)
     streams = [[(event["at"], host, event) for host, event in marks]]
     told = [_of(host, folder / f"{host}.log") for host in HOSTS if (folder / f"{host}.log").exists()]
     for at, host, event in heapq.merge(*streams, *told, key=lambda one: one[0]):

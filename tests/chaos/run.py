@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from tests.chaos.checker import Violation, check
+from tests.chaos.checker import Apart, Violation, check
 from tests.chaos.faults import SECOND, Fault, Way, draw
 from tests.chaos.net import Links, Net, Processes
 from tests.chaos.work import (
@@ -34,10 +34,13 @@ from tests.chaos.work import (
 
 LOOK: Final = 0.02
 """Seconds from one look at logs and links to the next."""
+LOOK_AT_LINKS: Final = 0.1
 BEGIN_WITHIN: Final = 60.0
 RECOVER_WITHIN: Final = 30.0
 SERVED_WITHIN: Final = 60.0
 FORGOTTEN_WITHIN: Final = 7.0
+PAIRS: Final = {frozenset(pair) for pair in itertools.combinations(HOSTS, 2) if not set(pair) <= set(CLIENTS)}
+"""Whose links matter: between clients there is nothing to say."""
 PUBLISH: Final = re.compile(rb'"do":"publish","term":\[(\d+),"(\w+)"\]')
 TOLD: Final = (b'"entered"', b'"running"', b'"asked"', b'"token"', b'"up"', b'"quiet"')
 
@@ -136,7 +139,10 @@ class Fleet:
         self._down: set[str] = set()
         """Hosts whose process is killed or frozen."""
         self._standing: dict[frozenset[str], frozenset[int]] = {}
-        self._linked = 0
+        self._linked = self._looked = 0
+        self._missing: dict[frozenset[str], int] = {}
+        """Since when pairs that lived had no link."""
+        self.apart: list[Apart] = []
         self.found: list[Violation] = []
 
     def __enter__(self) -> Self:
@@ -189,6 +195,8 @@ class Fleet:
         self.watch.look()
         if gone := [host for host in HOSTS if host not in self.processes.pids() and host not in self._down]:
             raise NotServed(f"{', '.join(gone)} ended by itself")
+        if now() - self._looked > LOOK_AT_LINKS * SECOND:
+            self._look_at_links()
 
     def until(self, done: Callable[[], bool], within: float, what: str) -> None:
         """Looks until it is so. Raises NotServed."""
@@ -208,16 +216,18 @@ class Fleet:
             also()
 
     def _look_at_links(self) -> None:
-        """Those that matter: between clients there is nothing to say."""
         standing = self.links.standing(self.processes.pids())
-        standing = {pair: ports for pair, ports in standing.items() if not pair <= set(CLIENTS)}
+        standing = {pair: ports for pair, ports in standing.items() if pair in PAIRS}
         if any(not ports <= self._standing.get(pair, frozenset()) for pair, ports in standing.items()):
             self._linked = now()
-        self._standing = standing
+        before, self._looked, self._standing = self._looked, now(), standing
+        for pair in standing.keys() & self._missing.keys():
+            self.apart.append(Apart(pair, self._missing.pop(pair), self._looked))
+        for pair in PAIRS - standing.keys():
+            self._missing.setdefault(pair, before)
 
     def _without_link(self) -> str:
-        pairs = (frozenset(pair) for pair in itertools.combinations(HOSTS, 2) if not set(pair) <= set(CLIENTS))
-        return ", ".join("-".join(sorted(pair)) for pair in pairs if pair not in self._standing)
+        return ", ".join("-".join(sorted(pair)) for pair in PAIRS - self._standing.keys())
 
     # Faults
 
@@ -330,5 +340,5 @@ def finish(fleet: Fleet, faults: list[Fault]) -> tuple[list[Violation], Counter[
         found.append(Violation(now(), "16 all is served", str(error)))
     end = now()
     fleet.processes.close()
-    checker = check(fleet.folder, faults, fleet.marks, end)
+    checker = check(fleet.folder, faults, fleet.marks, end, fleet.apart)
     return [*found, *checker.found], Counter(checker.counts)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.chaos.checker import Checker, Violation, check
+from tests.chaos.checker import Apart, Checker, Violation, check
 from tests.chaos.faults import SECOND, Fault, isolated
 from tests.chaos.report import figures, late, spread, table
 from tests.chaos.work import CAPACITY, CLIENT, HOSTS, Json, host_of, rcs_of
@@ -106,8 +107,8 @@ BROKEN: dict[str, list[tuple[str, Json]]] = {
 }
 
 
-def held_against(story: list[tuple[str, Json]], *faults: Fault) -> list[Violation]:
-    checker = Checker(faults)
+def held_against(story: list[tuple[str, Json]], *faults: Fault, apart: Sequence[Apart] = ()) -> list[Violation]:
+    checker = Checker(faults, apart)
     for host, event in sorted(story, key=lambda one: one[1]["at"]):
         checker.take(host, event)
     checker.finish(20 * SECOND)
@@ -155,10 +156,24 @@ def test_who_was_struck_may_lose(promise: str) -> None:
 def test_a_hold_that_a_new_leader_gives_back_is_the_same() -> None:
     """It had its time, and its RC was lost: it may be over."""
     before = [asked(3, "q1"), client(3.1, "running", "q1", grant=NEW), client(3.9, "queued", "q1")]
+    held = [publish(3.1, [NEW], [f"c1/{CLIENT}/q1"]), rc(3.1, "hear", [NEW], seq=3), rc(9.5, "hear", [], seq=4)]
+    again = client(4, "running", "q1", grant=NEW)
+    assert held_against([*LIFE, *before, *held, again, client(9.5, "gave_up", "q1")]) == []
     lost = [client(4.5, "ended", "q1", outcome="lost"), client(4.5, "gave_up", "q1", ended=True)]
     assert held_against([*LIFE, *before, client(4, "running", "q1", grant=NEW), *lost]) == []
     found = held_against([*LIFE, *before, client(4, "running", "q1", grant=[TERM, 9]), *lost])
     assert [one.promise for one in found] == ["9 nothing is thrown away"]
+
+
+@pytest.mark.parametrize("promise", ["10 nobody alive is dropped", "10 what no fault touches goes on"])
+def test_who_had_no_link_with_the_leader_may_lose(promise: str) -> None:
+    def found(node: str, until: float) -> list[Violation]:
+        apart = Apart(frozenset((node, "c1")), round(1.1 * SECOND), round(until * SECOND))
+        return held_against([*LIFE, *BROKEN[promise]], apart=[apart])
+
+    assert found("n1", 2.2) == []
+    # For less than a lease, and with another than the leader.
+    assert found("n1", 2) != [] != found("n2", 2.2)
 
 
 def test_a_killed_client_asks_for_nothing_any_more() -> None:

@@ -3,7 +3,10 @@
 Zenoh looks for peers by multicast, once it has run for a while every 8 s: for so long two processes that live may be
 without a link after a fault of a moment. But peers that are both linked to a third are told of one another by it
 (gossip), and link. So the one that had made the link sees whether the other listens still, asks by multicast for both
-addresses, and opens a session that links to these two until they have found each other (docs/zenoh.md)."""
+addresses, and opens a session that links to these two until they have found each other.
+
+Only the one that had made it does so at once: by the other, a link would be taken for one more of those that stand, as
+long as the first has not noticed, and what it declared stays unknown (docs/zenoh.md)."""
 
 from __future__ import annotations
 
@@ -27,7 +30,9 @@ PAUSES: Final = (0.05, 0.2, 0.5, *(1.0,) * 30)
 """Seconds before each look for a peer. After the last one it is left to Zenoh."""
 TOGETHER: Final = 0.25
 """Seconds within which two losses mean that this process was away, and may be missed by those who made the link."""
-TOGETHER_LOOKS: Final = 6
+NOTICED: Final = 2.0
+"""Leases after which both ends of a lost link have noticed."""
+TOGETHER_LOOKS: Final = 4
 """So often it looks for them then: many may do so at one time."""
 PROBE_TIMEOUT: Final = 0.25
 PROBES_TIMEOUT: Final = 1.0
@@ -47,18 +52,26 @@ class _Lost:
     """Of the other ends of its links: where it listens, if they were made from here."""
     looks: int = 0
     together: bool = False
+    asked: int = 0
+    """How often it was looked for though it had made the link."""
 
 
 class Relinking:
     """Of one session, in a thread that lives while something is lost.
 
     `scouting` says how peers are asked who is there; `meeting` gives the settings of a session that links to the
-    addresses it is given, and to nobody else. It is one of a moment: its id, by which others know that, is set here."""
+    addresses it is given, and to nobody else. It is one of a moment: its id, by which others know that, is set here.
+    `lease` is the links', in seconds."""
 
     def __init__(
-        self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]
+        self,
+        session: zenoh.Session,
+        scouting: zenoh.Config,
+        meeting: Callable[[Sequence[str]], zenoh.Config],
+        lease: float,
     ) -> None:
         self._session, self._scouting, self._meeting = session, scouting, meeting
+        self._noticed = NOTICED * lease
         self._own = str(session.zid())
         self._lock = threading.Lock()
         self._lost: dict[str, _Lost] = {}
@@ -124,11 +137,14 @@ class Relinking:
                 break
             one.looks += 1
             listens = _listens(one.addresses)
-            if listens or (one.together and one.looks <= TOGETHER_LOOKS):
+            if listens:
                 wanted.add(peer)
-            elif listens is False:
+            elif listens is False and not (one.together and one.asked < TOGETHER_LOOKS):
                 # Its process has gone, or it was it that made the link.
                 one.looks = len(PAUSES)
+            elif one.together and time.monotonic() - one.at > self._noticed:
+                one.asked += 1
+                wanted.add(peer)
         if wanted and not self._closed.is_set() and (there := self._scout(wanted)):
             self._introduce(there)
 

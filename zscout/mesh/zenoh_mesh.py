@@ -109,7 +109,7 @@ def _relinking(session: zenoh.Session, config: MeshConfig) -> Relinking:
         settings.insert_json5("scouting/gossip/autoconnect", '{"peer": []}')
         return settings
 
-    return Relinking(session, zenoh_config(config), meeting)
+    return Relinking(session, zenoh_config(config), meeting, config.lease)
 
 
 def _in_thread(name: str, call: Callable[[], T]) -> Future[T]:
