@@ -52,8 +52,10 @@ class _World:
         self._peers: list[ZenohTransport] = []
         self._connect: list[str] = []
 
-    async def peer(self, *, relinks: bool) -> ZenohTransport:
+    async def peer(self, *, relinks: bool = False, makes_links: bool = False) -> ZenohTransport:
         settings = zenoh_config(self._config)
+        # Of two that are told of one another the one with the greater id makes the link.
+        settings.insert_json5("id", f'"{"f" if makes_links else "1"}{len(self._peers)}"')
         settings.insert_json5("scouting/multicast/autoconnect", '{"peer": []}')
         if self._connect:
             settings.insert_json5("connect/endpoints", str(self._connect))
@@ -78,9 +80,9 @@ def test_a_link_that_is_lost_is_made_again(others: int, monkeypatch: pytest.Monk
     async def story() -> None:
         async with AsyncExitStack() as stack:
             world = _World(stack)
-            await world.peer(relinks=False)
-            here = await world.peer(relinks=True)
-            there = [await world.peer(relinks=False) for _ in range(others)]
+            await world.peer()
+            here = await world.peer(relinks=True, makes_links=True)
+            there = [await world.peer() for _ in range(others)]
             _cut(here, [one.id() for one in there])
             await until(lambda: not {one.id() for one in there} <= set(here.peers()))
             await until(lambda: {one.id() for one in there} <= set(here.peers()))

@@ -150,3 +150,18 @@ def test_a_contradiction_must_last_and_one_that_stays_is_acted_on_ever_more_seld
     pauses = [after - before for before, after in itertools.pairwise(renewed)]
     assert pauses[:3] == [SHORTEST, 2 * SHORTEST, 4 * SHORTEST]
     assert max(pauses) == pauses[-1] == LONGEST
+
+
+def test_what_was_set_right_and_is_wrong_again_does_not_wait_longer() -> None:
+    """Links are lost again and again, and each time joining anew helps."""
+    renewed: list[float] = []
+    seconds = 0.0
+    suspicions = Suspicions(lambda: round(seconds * SECOND), lambda: renewed.append(seconds))
+    while seconds < 200:
+        seconds += 0.5
+        wrong = not renewed or seconds - renewed[-1] > 2
+        suspicions.suspect("a", so=wrong)
+        suspicions.keep(["b x"] if wrong else [], "b ")
+        if wrong:
+            suspicions.suspect("b x")
+    assert {after - before for before, after in itertools.pairwise(renewed)} == {SHORTEST}

@@ -86,7 +86,9 @@ class Relinking:
         self._closed.set()
         with suppress(zenoh.ZError):
             self._listener.undeclare()  # type: ignore[no-untyped-call]
-        if (thread := self._thread) is not None:
+        with self._lock:
+            thread = self._thread
+        if thread is not None:
             thread.join()
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:

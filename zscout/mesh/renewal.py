@@ -30,7 +30,8 @@ LINKED: Final = 2.0
 """Seconds within which the new session is linked to whom the old one is linked to, or they are gone."""
 LOOK_EVERY: Final = 0.02
 SHORTEST, LONGEST = 10.0, 320.0
-"""Seconds from one renewal to the next, doubled each time; the shortest again after ten times as long without one."""
+"""Seconds from one renewal to the next. Doubled where what it was for has not been set right by it; the shortest again
+after ten times as long without one."""
 
 OnToken: TypeAlias = Callable[[str, bool], None]
 Opening: TypeAlias = Callable[[], Awaitable[Transport]]
@@ -45,12 +46,15 @@ class Suspicions:
         """When each was suspected first and last."""
         self._last: Ns | None = None
         self._pause = SHORTEST
+        self._acted: dict[str, Ns] = {}
+        """What this process has joined anew for, and when; until it is right."""
 
     def suspect(self, what: str, *, so: bool = True, patience: float = PATIENCE) -> None:
         """What is seen contradicts itself, or no longer does (`so`); to be said again while it lasts. `patience` is in
         seconds."""
         if not so:
             self._since.pop(what, None)
+            self._acted.pop(what, None)
             return
         now = self._now()
         self._since = {one: (first, last) for one, (first, last) in self._since.items() if now - last < LASTS * SECOND}
@@ -58,20 +62,23 @@ class Suspicions:
         self._since[what] = first, now
         if now - first < patience * SECOND:
             return
+        self._acted = {one: at for one, at in self._acted.items() if now - at < 10 * LONGEST * SECOND}
         if self._last is not None:
-            if now - self._last < self._pause * SECOND:
+            helped = what not in self._acted
+            if now - self._last < (SHORTEST if helped else self._pause) * SECOND:
                 return
             calm = now - self._last > 10 * self._pause * SECOND
-            self._pause = SHORTEST if calm else min(LONGEST, 2 * self._pause)
-        self._last = now
+            self._pause = SHORTEST if helped or calm else min(LONGEST, 2 * self._pause)
+        self._last = self._acted[what] = now
         self._since.clear()
         log.warning("%s: this process joins the mesh anew", what)
         self._renew()
 
     def keep(self, those: Collection[str], prefix: str) -> None:
         """Of all that begins with `prefix` only `those` still last."""
-        for what in [what for what in self._since if what.startswith(prefix) and what not in those]:
-            del self._since[what]
+        for known in (self._since, self._acted):
+            for what in [what for what in known if what.startswith(prefix) and what not in those]:
+                del known[what]
 
 
 class RenewableTransport(Transport):

@@ -52,6 +52,8 @@ def zenoh_config(config: MeshConfig) -> zenoh.Config:
         "scouting/multicast/address": config.multicast_address,
         "scouting/multicast/interface": config.interface,
         "scouting/delay": SCOUTING_DELAY_MS,
+        # Two that are told of one another at the same moment have one link, not two: an end may lose them one by one.
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "transport/link/tx/lease": round(config.lease * 1000),
         # A peer is given up no sooner for not reading than for being silent: on a host that stalls, or is short of
         # processor time, Zenoh's own sending threads stand still as well, and any burst would cost a sound link.

@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 R = TypeVar("R")
 
+UNSEEN = "RCs of other hosts see an RCM, and this candidate does not"
 WAITS = 4.0
 """Seconds for which a candidate waits for a leader that only others see: longer than RCs believe in one that went."""
 BACKOFF, MAX_BACKOFF = 1.0, 30.0
@@ -122,6 +123,7 @@ class Candidate:
             log.info("%s %s", token.host, "leads" if alive else "does not lead any more")
         if alive:
             self._leader = token.host
+            self.mesh.suspicions.suspect(UNSEEN, so=False)
         self.election.leader(token.instance, alive=alive, now=self.mesh.now())
         self._changed.set()
 
@@ -189,9 +191,7 @@ class Candidate:
         if self.election.must_wait(others, own, self.mesh.now(), self._leader):
             log.info("%d of %d RCs of other hosts still see a leader: waiting", sum(others), len(others))
             if sum(others) * 2 > len(others):
-                self.mesh.suspicions.suspect(
-                    "RCs of other hosts see an RCM, and this candidate does not", patience=WAITS
-                )
+                self.mesh.suspicions.suspect(UNSEEN, patience=WAITS)
             return True
         return False
 
