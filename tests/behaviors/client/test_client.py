@@ -18,7 +18,7 @@ from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
-from zscout.keyexpr import Sender
+from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryNetwork
 from zscout.lab.faults.virtual_time import START
 from zscout.mesh import ZenohMesh
@@ -326,6 +326,24 @@ def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
             link.loss = 0.0
             assert await fleet.holders() == ["first"]
             await until(lambda: waits.state == "running", within=7)
+
+    run(test())
+
+
+def test_when_one_of_two_rcms_goes_the_other_is_asked_at_once() -> None:
+    """Its answer may have come second, and nobody read it."""
+
+    async def test() -> None:
+        async with small_fleet("one", "two") as (fleet, (one, two)):
+            token = fleet.mesh("old", "node").alive(Token("old", Role.RCM, "node", "old"))
+            first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
+            waits = await two.request("second", {RC: {}}, min_runtime=600)
+            await asyncio.sleep(0.1)
+            fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+            await one.end(first)
+            assert (await fleet.holders(), waits.state) == (["second"], "queued")
+            token.close()
+            await until(lambda: waits.state == "running", within=0.1)
 
     run(test())
 

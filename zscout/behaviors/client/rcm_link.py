@@ -115,11 +115,10 @@ class RcmLink:
         request.answer(ClientRequests(client=str(self.mesh.me), requests=self.store.open_requests(), term=self.term))
 
     def _on_leader(self, token: Token, alive: bool) -> None:
-        if alive:
-            self._leaders.add(token)
+        (self._leaders.add if alive else self._leaders.discard)(token)
+        if self._leaders:
+            # Also where one of two has gone: the answer of the other may have come second, and was not read.
             self.leader_came.set()
-        else:
-            self._leaders.discard(token)
 
     async def watch_lease(self) -> NoReturn:
         """Ends holds when no RCM published for the hold lease: their RCs have ended them as well."""
