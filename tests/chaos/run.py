@@ -35,6 +35,8 @@ from tests.chaos.work import (
 LOOK: Final = 0.02
 """Seconds from one look at logs and links to the next."""
 LOOK_AT_LINKS: Final = 0.1
+STANDS: Final = 0.5
+"""Seconds after which a link stands again: those by which two are told of one another do not last as long."""
 BEGIN_WITHIN: Final = 60.0
 RECOVER_WITHIN: Final = 30.0
 SERVED_WITHIN: Final = 60.0
@@ -142,6 +144,8 @@ class Fleet:
         self._linked = self._looked = 0
         self._missing: dict[frozenset[str], int] = {}
         """Since when pairs that lived had no link."""
+        self._back: dict[frozenset[str], int] = {}
+        """Since when they have one again."""
         self.apart: list[Apart] = []
         self.found: list[Violation] = []
 
@@ -221,10 +225,15 @@ class Fleet:
         if any(not ports <= self._standing.get(pair, frozenset()) for pair, ports in standing.items()):
             self._linked = now()
         before, self._looked, self._standing = self._looked, now(), standing
-        for pair in standing.keys() & self._missing.keys():
-            self.apart.append(Apart(pair, self._missing.pop(pair), self._looked))
         for pair in PAIRS - standing.keys():
             self._missing.setdefault(pair, before)
+            self._back.pop(pair, None)
+        for pair in standing.keys() & self._missing.keys():
+            if self._looked - self._back.setdefault(pair, self._looked) > STANDS * SECOND:
+                self.apart.append(Apart(pair, self._missing.pop(pair), self._back.pop(pair)))
+
+    def still_apart(self, at: int) -> list[Apart]:
+        return [Apart(pair, since, at) for pair, since in self._missing.items()]
 
     def _without_link(self) -> str:
         return ", ".join("-".join(sorted(pair)) for pair in PAIRS - self._standing.keys())
@@ -340,5 +349,5 @@ def finish(fleet: Fleet, faults: list[Fault]) -> tuple[list[Violation], Counter[
         found.append(Violation(now(), "16 all is served", str(error)))
     end = now()
     fleet.processes.close()
-    checker = check(fleet.folder, faults, fleet.marks, end, fleet.apart)
+    checker = check(fleet.folder, faults, fleet.marks, end, [*fleet.apart, *fleet.still_apart(end)])
     return [*found, *checker.found], Counter(checker.counts)

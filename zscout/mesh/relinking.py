@@ -26,7 +26,7 @@ from zenoh.handlers import Callback
 
 log = logging.getLogger(__name__)
 
-PAUSES: Final = (0.05, 0.2, 0.5, *(1.0,) * 30)
+PAUSES: Final = (0.05, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)
 """Seconds before each look for a peer. After the last one it is left to Zenoh."""
 TOGETHER: Final = 0.25
 """Seconds within which two losses mean that this process was away, and may be missed by those who made the link."""
@@ -38,7 +38,8 @@ PROBE_TIMEOUT: Final = 0.25
 PROBES_TIMEOUT: Final = 1.0
 """For all of one look: where many are lost, each has its turn."""
 SCOUT_TIMEOUT: Final = 0.5
-MEET_TIMEOUT: Final = 1.0
+MEET_TIMEOUT: Final = 0.25
+"""They are told of one another at once. An end that has not lost the link yet refuses another one."""
 POLL: Final = 0.002
 MEETING: Final = "6d656574"
 """So begins the id of a session that is opened for a moment: nobody misses it."""
