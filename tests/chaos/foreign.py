@@ -367,7 +367,7 @@ class Rc:
             said = max(believed, key=lambda one: (term_of(one["term"]), one["seq"]), default=None)
             if said is None or not self._accepts(said):
                 return
-            self.peer.heard, self.behind = now(), False
+            self.behind = False
             views = {grant_of(view["grant"]): view for view in said.get("holds", []) if self.name in view["needs"]}
             named = said.get("instances", {}).get(self.name, [self.instance])[0]
             for grant, view in views.items() if named == self.instance else ():
@@ -814,6 +814,7 @@ def main() -> None:
         "mode": "peer",
         "scouting/multicast/interface": "eth0",
         "scouting/delay": 200,
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "transport/link/tx/lease": LEASE_MS,
         block: LEASE_MS * 1000,
         "transport/link/tx/queue/size/interactive_high": 8,

@@ -337,6 +337,7 @@ def settings(multicast: str, lease: float) -> zenoh.Config:
         "scouting/multicast/address": multicast,
         "scouting/multicast/interface": "lo",
         "scouting/delay": 200,
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "transport/link/tx/lease": round(lease * 1000),
         "transport/shared_memory/enabled": False,
     }.items():
