@@ -5,9 +5,9 @@ without a link after a fault of a moment. But peers that are both linked to a th
 (gossip), and link. So the one that had made the link sees whether the other listens still, asks by multicast for both
 addresses, and opens a session that links to these two until they have found each other.
 
-Only the end that had made the link does so at once. A link that the other end makes is taken for one more of a transport
-that stands, as long as the first has not noticed its loss; and then what is declared there stays unknown
-(docs/zenoh.md)."""
+Only the end that had made the link does so at once. A link that the other end makes is taken for one more of those
+that stand, as long as the first has not noticed its loss; and then what is declared there stays unknown (docs/zenoh.md).
+"""
 
 from __future__ import annotations
 
