@@ -6,7 +6,7 @@ without a link after a fault of a moment. But peers that are both linked to a th
 addresses, and opens a session that links to these two until they have found each other.
 
 Only the end that had made the link does so at once. A link that the other end makes is taken for one more of those
-that stand, as long as the first has not noticed its loss; and then what is declared there stays unknown (docs/zenoh.md).
+that stand, as long as the first has not noticed its loss, and what is declared there stays unknown (docs/zenoh.md).
 """
 
 from __future__ import annotations
