@@ -14,6 +14,7 @@ import secrets
 import signal
 import sys
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -39,6 +40,7 @@ NOT_MINE = ("ended", "free", "not_holder", "wrong_client")
 MAX_COUNTER, MAX_JUMP = 2**52, 1_000_000
 REMEMBERED = 256
 PATIENCE, REJOIN = 2 * SECOND, 10 * SECOND
+GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 
 Term = tuple[int, str]
 Grant = tuple[Term, int]
@@ -814,7 +816,8 @@ def main() -> None:
         "mode": "peer",
         "scouting/multicast/interface": "eth0",
         "scouting/delay": 200,
-        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
+        "scouting/multicast/autoconnect_strategy": GREATER_CONNECTS,
+        "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": LEASE_MS,
         block: LEASE_MS * 1000,
         "transport/link/tx/queue/size/interactive_high": 8,
@@ -823,7 +826,13 @@ def main() -> None:
     }.items():
         config.insert_json5(key, json.dumps(value))
     program = "program" if what == "client" else "rcs"
-    peer = (Client if what == "client" else Peer)(lambda: zenoh.open(config), program, fleet, host, seed)
+
+    def join() -> zenoh.Session:
+        """ "Joining": its id is greater than those of sessions that began before."""
+        config.insert_json5("id", f'"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, "little").hex()[4:]}"')
+        return zenoh.open(config)
+
+    peer = (Client if what == "client" else Peer)(join, program, fleet, host, seed)
     say("imported", modules=sorted(name for name in sys.modules if name.split(".")[0] == "zscout"))
     if isinstance(peer, Client):
         run_client(peer, quiet, over)

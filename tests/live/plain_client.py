@@ -35,6 +35,7 @@ ASK_AGAIN = 5.0
 QUERY_TIMEOUT = 1.0
 TRY_AGAIN = ("busy", "not_leading", "internal", "queue_full")
 GRACE = 0.25
+GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 """How late a look at the clock may come before it means that this program stood still."""
 
 Json = dict[str, Any]
@@ -333,11 +334,14 @@ def settings(multicast: str, lease: float) -> zenoh.Config:
     config = zenoh.Config()
     for key, value in {
         "mode": "peer",
+        # "Joining": greater than those of sessions that began before.
+        "id": f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}",
         "scouting/multicast/enabled": True,
         "scouting/multicast/address": multicast,
         "scouting/multicast/interface": "lo",
         "scouting/delay": 200,
-        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
+        "scouting/multicast/autoconnect_strategy": GREATER_CONNECTS,
+        "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": round(lease * 1000),
         "transport/shared_memory/enabled": False,
     }.items():

@@ -16,7 +16,7 @@ import zenoh
 from tests.mesh.kit import until
 from zscout.config.fleet import MeshConfig
 from zscout.mesh import relinking
-from zscout.mesh.zenoh_mesh import ZenohTransport, _relinking, zenoh_config
+from zscout.mesh.zenoh_mesh import ZenohTransport, _relinking, increasing_id, zenoh_config
 
 _PORT = re.compile(r":(\d+)(?:[?#].*)?$")
 
@@ -52,12 +52,12 @@ class _World:
         self._peers: list[ZenohTransport] = []
         self._connect: list[str] = []
 
-    async def peer(self, *, relinks: bool = False, makes_links: bool = False) -> ZenohTransport:
+    async def peer(self, *, relinks: bool = False, makes_links: bool = False, known: bool = True) -> ZenohTransport:
         settings = zenoh_config(self._config)
         # Of two that are told of one another the one with the greater id makes the link.
         settings.insert_json5("id", f'"{"f" if makes_links else "1"}{len(self._peers)}"')
         settings.insert_json5("scouting/multicast/autoconnect", '{"peer": []}')
-        if self._connect:
+        if self._connect and known:
             settings.insert_json5("connect/endpoints", str(self._connect))
         session = zenoh.open(settings)
         if not self._connect:
@@ -88,6 +88,26 @@ def test_a_link_that_is_lost_is_made_again(others: int, monkeypatch: pytest.Monk
             await until(lambda: {one.id() for one in there} <= set(here.peers()))
 
     asyncio.run(story())
+
+
+def test_who_joins_with_a_lesser_id_is_linked_as_well() -> None:
+    """Its clock is behind: the others make the links, and have to be told of it."""
+
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            world = _World(stack)
+            for _ in range(2):
+                await world.peer(makes_links=True)
+            late = await world.peer(relinks=True, known=False)
+            assert len(late.peers()) == 2
+
+    asyncio.run(story())
+
+
+def test_ids_increase_as_zenoh_compares_them() -> None:
+    ids = [increasing_id() for _ in range(20)]
+    assert [len(one) for one in ids] == [32] * 20
+    assert (by_last := [bytes.fromhex(one)[:9:-1] for one in ids]) == sorted(by_last)
 
 
 def test_whoever_ends_is_not_looked_for() -> None:

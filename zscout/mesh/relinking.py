@@ -1,13 +1,10 @@
-"""Links that were lost, made again at once.
+"""Links that were lost, or could not be made, are made at once.
 
-Zenoh looks for peers by multicast, once it has run for a while every 8 s: for so long two processes that live may be
-without a link after a fault of a moment. But peers that are both linked to a third are told of one another by it
-(gossip), and link. So the one that had made the link sees whether the other listens still, asks by multicast for both
-addresses, and opens a session that links to these two until they have found each other.
-
-Only the end that had made the link does so at once. A link that the other end makes is taken for one more of those
-that stand, as long as the first has not noticed its loss, and what is declared there stays unknown (docs/zenoh.md).
-"""
+Of two peers the one with the greater id makes their link: that is who joins, as ids increase, but for clocks that
+differ. Zenoh looks for peers by multicast, once it has run for a while every 8 s: for so long two processes that live
+may be without a link after a fault of a moment. But peers that are linked to a third are told of one another by it
+(gossip), and link. So who had made a link sees whether the other listens still, asks by multicast for both addresses,
+and opens a session that links to these two until they have found each other (docs/zenoh.md)."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
@@ -27,20 +24,19 @@ from zenoh.handlers import Callback
 
 log = logging.getLogger(__name__)
 
-PAUSES: Final = (0.05, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)
+PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)
 """Seconds before each look for a peer. After the last one it is left to Zenoh."""
 TOGETHER: Final = 0.25
-"""Seconds within which two losses mean that this process was away, and may be missed by those who made the link."""
-NOTICED: Final = 2.0
-"""Leases after which both ends of a lost link have noticed."""
-TOGETHER_LOOKS: Final = 4
-"""So often it looks for them then: many may do so at one time."""
+"""Seconds within which two losses mean that this process was away: it looks for those, too, that make the link."""
+LOOKS_FOR_GREATER: Final = 4
+"""So often: many may do so at one time."""
 PROBE_TIMEOUT: Final = 0.25
 PROBES_TIMEOUT: Final = 1.0
 """For all of one look: where many are lost, each has its turn."""
 SCOUT_TIMEOUT: Final = 0.5
+GREET_TIMEOUT: Final = 0.1
 MEET_TIMEOUT: Final = 0.25
-"""They are told of one another at once. An end that has not lost the link yet refuses another one."""
+"""They are told of one another at once. An end that has not lost the link yet makes or takes no other."""
 POLL: Final = 0.002
 MEETING: Final = "6d656574"
 """So begins the id of a session that is opened for a moment: nobody misses it."""
@@ -54,33 +50,29 @@ class _Lost:
     """Of the other ends of its links: where it listens, if they were made from here."""
     looks: int = 0
     together: bool = False
-    asked: int = 0
-    """How often it was looked for though it had made the link."""
+    """Whether it is looked for though it is it that makes the link."""
 
 
 class Relinking:
     """Of one session, in a thread that lives while something is lost.
 
     `scouting` says how peers are asked who is there; `meeting` gives the settings of a session that links to the
-    addresses it is given, and to nobody else. It is one of a moment: its id, by which others know that, is set here.
-    `lease` is the links', in seconds."""
+    addresses it is given, and to nobody else. It is one of a moment: its id, by which others know that, is set here."""
 
     def __init__(
-        self,
-        session: zenoh.Session,
-        scouting: zenoh.Config,
-        meeting: Callable[[Sequence[str]], zenoh.Config],
-        lease: float,
+        self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]
     ) -> None:
         self._session, self._scouting, self._meeting = session, scouting, meeting
-        self._noticed = NOTICED * lease
         self._own = str(session.zid())
         self._lock = threading.Lock()
         self._lost: dict[str, _Lost] = {}
-        self._thread: threading.Thread | None = None
         self._closed = threading.Event()
         callback: Callback[zenoh.LinkEvent] = Callback(self._on_link, lambda: None, indirect=False)
         self._listener = session.info.declare_link_events_listener(callback)
+        self._thread: threading.Thread | None = None
+        if not self._linked():
+            with self._lock:
+                self._begin(greet=True)
 
     def close(self) -> None:
         """Before the session is closed. Returns when the thread has ended, in a second or two: one that is inside Zenoh
@@ -104,11 +96,23 @@ class Relinking:
             for one in lately:
                 one.together |= len(lately) > 1
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="links again", daemon=True)
-                self._thread.start()
+                self._begin(greet=False)
 
-    def _run(self) -> None:
+    def _begin(self, *, greet: bool) -> None:
+        self._thread = threading.Thread(target=self._run, args=(greet,), name="links again", daemon=True)
+        self._thread.start()
+
+    def _greet(self) -> None:
+        """Nobody was there who is to wait for a link from here; those who make it may not know of this process."""
+        found = self._scout(GREET_TIMEOUT)
+        with self._lock:
+            for peer in found.keys() - {self._own}:
+                self._lost.setdefault(peer, _Lost(time.monotonic(), together=True))
+
+    def _run(self, greet: bool) -> None:
         try:
+            if greet:
+                self._greet()
             while (pause := self._next()) is not None:
                 self._closed.wait(pause)
                 try:
@@ -141,33 +145,32 @@ class Relinking:
                 break
             one.looks += 1
             listens = _listens(one.addresses)
-            if listens:
+            if listens or (one.together and one.looks <= LOOKS_FOR_GREATER):
                 wanted.add(peer)
-            elif listens is False and not (one.together and one.asked < TOGETHER_LOOKS):
-                # Its process has gone, or it was it that made the link.
+            elif listens is False:
+                # Its process has gone, or it is it that makes the link.
                 one.looks = len(PAUSES)
-            elif one.together and time.monotonic() - one.at > self._noticed:
-                one.asked += 1
-                wanted.add(peer)
-        if wanted and not self._closed.is_set() and (there := self._scout(wanted)):
-            self._introduce(there)
+        if wanted and not self._closed.is_set():
+            there = self._scout(SCOUT_TIMEOUT, wanted)
+            if self._own in there and len(there) > 1:
+                self._introduce(there)
 
     def _linked(self) -> set[str]:
         return {str(peer) for peer in self._session.info.peers_zid()}
 
-    def _scout(self, wanted: set[str]) -> dict[str, list[str]]:
-        """The addresses of those who are there, and of this process; nothing where either is missing."""
+    def _scout(self, seconds: float, wanted: Collection[str] = ()) -> dict[str, list[str]]:
+        """The addresses of all who are there; of those who are wanted, and of this one, as soon as they are known."""
         found: dict[str, list[str]] = {}
-        until = time.monotonic() + SCOUT_TIMEOUT
+        until = time.monotonic() + seconds
         with zenoh.scout(what="peer", config=self._scouting) as scout:
-            while time.monotonic() < until and not wanted | {self._own} <= found.keys():
+            while time.monotonic() < until and not (wanted and {*wanted, self._own} <= found.keys()):
                 if (hello := scout.try_recv()) is None:
                     if self._closed.wait(POLL):
-                        return {}
-                elif str(hello.zid) in wanted | {self._own}:
+                        break
+                elif not wanted or str(hello.zid) in {*wanted, self._own}:
                     # An address that holds on one link of a network only is none without the name of that link.
                     found[str(hello.zid)] = [one for one in hello.locators if "[fe80:" not in one]
-        return found if self._own in found and len(found) > 1 else {}
+        return found
 
     def _introduce(self, there: dict[str, list[str]]) -> None:
         addresses = [address for known in there.values() for address in known]

@@ -7,7 +7,9 @@ import functools
 import json
 import logging
 import re
+import secrets
 import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, Self, TypeVar
@@ -20,7 +22,7 @@ from zscout import messages
 from zscout.config.fleet import MeshConfig
 from zscout.keyexpr import Keys, Sender
 from zscout.mesh.exchange import MeshError
-from zscout.mesh.relinking import Relinking
+from zscout.mesh.relinking import MEETING, Relinking
 from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.session import Mesh
 from zscout.mesh.supervision import clock
@@ -31,6 +33,7 @@ log = logging.getLogger(__name__)
 CONTROL_BATCHES = 8
 """Control messages under way to one peer: with fewer, an answer waits until the message before it is out."""
 SCOUTING_DELAY_MS = 200
+GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 CLOSE_TIMEOUT = 3.0
 """Seconds that closing a session may take."""
 BLOCK, DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
@@ -52,8 +55,9 @@ def zenoh_config(config: MeshConfig) -> zenoh.Config:
         "scouting/multicast/address": config.multicast_address,
         "scouting/multicast/interface": config.interface,
         "scouting/delay": SCOUTING_DELAY_MS,
-        # Two that are told of one another at the same moment have one link, not two: an end may lose them one by one.
-        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
+        # Of two peers always the same one makes their link, and there is one, not two (docs/zenoh.md).
+        "scouting/multicast/autoconnect_strategy": GREATER_CONNECTS,
+        "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": round(config.lease * 1000),
         # A peer is given up no sooner for not reading than for being silent: on a host that stalls, or is short of
         # processor time, Zenoh's own sending threads stand still as well, and any burst would cost a sound link.
@@ -89,8 +93,17 @@ class ZenohMesh(Mesh):
         return cls(RenewableTransport(await _open(config), openings), Keys(fleet), me, clock.now)
 
 
+def increasing_id() -> str:
+    """The id of a session, greater than those of sessions that began before, so that whoever joins makes the links.
+
+    Zenoh compares ids from the last byte on, and prints them as a number."""
+    return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
+
+
 async def _open(config: MeshConfig) -> Transport:
-    opening = _in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config)))
+    settings = zenoh_config(config)
+    settings.insert_json5("id", f'"{increasing_id()}"')
+    opening = _in_thread("joins the mesh", lambda: zenoh.open(settings))
     try:
         session = await asyncio.wrap_future(opening)
     except asyncio.CancelledError:
@@ -111,7 +124,7 @@ def _relinking(session: zenoh.Session, config: MeshConfig) -> Relinking:
         settings.insert_json5("scouting/gossip/autoconnect", '{"peer": []}')
         return settings
 
-    return Relinking(session, zenoh_config(config), meeting, config.lease)
+    return Relinking(session, zenoh_config(config), meeting)
 
 
 def _in_thread(name: str, call: Callable[[], T]) -> Future[T]:
@@ -140,7 +153,7 @@ class ZenohTransport(Transport):
         return str(self._session.info.zid())
 
     def peers(self) -> list[str]:
-        return [str(peer) for peer in self._session.info.peers_zid()]
+        return [one for peer in self._session.info.peers_zid() if not (one := str(peer)).startswith(MEETING)]
 
     def links(self) -> int:
         return len(self._session.info.links())
