@@ -21,12 +21,12 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryNetwork
 from zscout.lab.faults.virtual_time import START
-from zscout.mesh import ZenohMesh
+from zscout.mesh import Declaration, IncomingQuery, ZenohMesh
 from zscout.mesh.supervision import StallWatch
-from zscout.messages import Grants
+from zscout.messages import Ask, Grants, Notice
 from zscout.services.rcm import request_handler
 from zscout.services.rcm.candidate import Candidate
-from zscout.types import SECOND, Term
+from zscout.types import SECOND, Place, Term
 
 RC, OTHER = "robot/x", "robot/y"
 ECHO = {"name": "echo", "value": 7}
@@ -330,20 +330,63 @@ def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
     run(test())
 
 
+@asynccontextmanager
+async def granted_unheard() -> AsyncIterator[tuple[SmallFleet, Client, OpenArc, list[Declaration]]]:
+    """A client that is told of its grant only when it asks, and another RCM, of an older term, whose token it sees."""
+    async with small_fleet("one", "two") as (fleet, (one, two)):
+        mesh, old = fleet.mesh("old", "node"), Term(0, "old")
+
+        def answer(asked: IncomingQuery[Ask]) -> None:
+            asked.answer(Notice(asked.message.id, "second", "h/two", "queued", term=old, step=1, place=Place(old, 1)))
+
+        declared = [mesh.serve(mesh.keys.schedule_any, Ask, answer), mesh.alive(Token("old", Role.RCM, "node", "old"))]
+        first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
+        waits = await two.request("second", {RC: {}}, min_runtime=600)
+        await asyncio.sleep(0.5)
+        fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+        await one.end(first)
+        assert (await fleet.holders(), waits.state) == (["second"], "queued")
+        yield fleet, two, waits, declared
+
+
 def test_when_one_of_two_rcms_goes_the_other_is_asked_at_once() -> None:
     """Its answer may have come second, and nobody read it."""
 
     async def test() -> None:
+        async with granted_unheard() as (_, _, waits, old):
+            for one in old:
+                one.close()
+            await until(lambda: waits.state == "running", within=0.1)
+
+    run(test())
+
+
+def test_what_changes_while_all_is_asked_for_again_has_it_asked_once_more() -> None:
+    async def test() -> None:
         async with small_fleet("one", "two") as (fleet, (one, two)):
-            token = fleet.mesh("old", "node").alive(Token("old", Role.RCM, "node", "old"))
             first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
             waits = await two.request("second", {RC: {}}, min_runtime=600)
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.5)
             fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+            fleet.network.link(fleet.leader(), two.mesh).delay = 0.5
+            token = fleet.mesh("other", "node").alive(Token("other", Role.RCM, "node", "other"))
+            await asyncio.sleep(0.1)  # the question is answered, and the answer on its way
             await one.end(first)
-            assert (await fleet.holders(), waits.state) == (["second"], "queued")
             token.close()
-            await until(lambda: waits.state == "running", within=0.1)
+            await until(lambda: waits.state == "running", within=1.5)
+
+    run(test())
+
+
+def test_the_answer_of_an_rcm_that_has_been_replaced_is_none() -> None:
+    async def test() -> None:
+        async with granted_unheard() as (fleet, two, waits, _):
+            answers = fleet.network.link(fleet.leader(), two.mesh)
+            answers.loss = 1.0
+            fleet.mesh("third", "node").alive(Token("third", Role.RCM, "node", "third"))
+            await asyncio.sleep(0.5)
+            answers.loss = 0.0
+            await until(lambda: waits.state == "running", within=1.3)
 
     run(test())
 

@@ -49,11 +49,13 @@ class RcmLink:
         self.term: Term = NO_TERM
         """The highest term received or promised; what is of an older one is ignored."""
         self._unanswered = False
-        """Whether the last question had no answer at all."""
+        """Whether the last question had no answer, or none that counts."""
         self._is_ahead = False
         """Whether the last answer was of a lower term: its RCM is told."""
         self.leader_came = asyncio.Event()
         self._leaders: set[Token] = set()
+        self._changes = 0
+        """How often one came, or one of several went."""
         self._last_contact: Ns = mesh.now()
         self._stall = StallWatch(mesh.now)
         self._last_terms = LastTerms(mesh, supervisor, self._learn, timeout=QUERY_TIMEOUT)
@@ -117,6 +119,7 @@ class RcmLink:
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
         if self._leaders:
+            self._changes += 1
             # Also where one of two has gone: the answer of the other may have come second, and was not read.
             self.leader_came.set()
 
@@ -183,7 +186,8 @@ class RcmLink:
         # To an RCM that has been replaced and does not know it, a later one's place is one that can't be.
         ahead = self._is_ahead or arc.place is not None
         reply = await self.query(msgspec.structs.replace(ask, term=self.term) if ahead else ask)
-        self._unanswered = reply is None
+        # One that has been replaced and does not know it has not answered for the one that counts.
+        self._unanswered = reply is None or (reply.message is not None and reply.message.term < self.term)
         if reply is None:
             return None
         if reply.message is not None:
@@ -197,12 +201,13 @@ class RcmLink:
     async def keep_asking(self) -> NoReturn:
         """Asks for all that is open again, and withdraws what was given up, at every change of RCM and every
         few seconds; sooner where the RCM did not answer."""
-        unanswered = False
+        unanswered, known = False, self._changes
         while True:
-            self.leader_came.clear()
-            pause = BACKOFF[1] if unanswered and self.leader is not None else ASK_AGAIN
-            await self.leader_within(pause * RANDOM.get().uniform(0.8, 1.2))
-            unanswered = False
+            if self._changes == known:
+                self.leader_came.clear()
+                pause = BACKOFF[1] if unanswered and self.leader is not None else ASK_AGAIN
+                await self.leader_within(pause * RANDOM.get().uniform(0.8, 1.2))
+            unanswered, known = False, self._changes
             for arc in self.store.open:
                 if arc.open and self.store.resumed.is_set():
                     problem = await self.ask(arc)
