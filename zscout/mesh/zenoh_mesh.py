@@ -48,9 +48,10 @@ _PORT = re.compile(r":\d+$")
 
 
 def zenoh_config(config: MeshConfig) -> zenoh.Config:
-    """The Zenoh settings behind a `[mesh]` table."""
+    """The Zenoh settings behind a `[mesh]` table, for one session."""
     settings: dict[str, Any] = {
         "mode": "peer",
+        "id": increasing_id(),
         "scouting/multicast/enabled": config.multicast,
         "scouting/multicast/address": config.multicast_address,
         "scouting/multicast/interface": config.interface,
@@ -101,9 +102,7 @@ def increasing_id() -> str:
 
 
 async def _open(config: MeshConfig) -> Transport:
-    settings = zenoh_config(config)
-    settings.insert_json5("id", f'"{increasing_id()}"')
-    opening = _in_thread("joins the mesh", lambda: zenoh.open(settings))
+    opening = _in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config)))
     try:
         session = await asyncio.wrap_future(opening)
     except asyncio.CancelledError:
