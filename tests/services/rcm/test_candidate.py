@@ -78,6 +78,28 @@ def test_while_most_rcs_see_a_leader_nobody_takes_over() -> None:
     run(story())
 
 
+@pytest.mark.parametrize("stood_still", [False, True])
+def test_a_candidate_that_has_stood_still_does_not_lead_alone_at_once(
+    stood_still: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may be it that the others have lost."""
+
+    async def story() -> None:
+        fleet = FakeFleet("x", "y")
+        leader, heir = fleet.candidate("x"), fleet.candidate("y")
+        await until(lambda: leader.rcm)
+        await asyncio.sleep(5)
+        monkeypatch.setattr(heir._stall, "fresh", lambda: stood_still)
+        before = heir.mesh.now()
+        fleet.network.kill(leader.mesh)
+        await until(lambda: heir.rcm)
+        assert (heir.mesh.now() - before >= heir.election.silence) == stood_still
+        for one in (heir, leader):
+            await one.stop()
+
+    run(story())
+
+
 def test_a_leader_steps_down_for_a_higher_term_and_asks_nothing_more() -> None:
     async def story() -> None:
         fleet = FakeFleet()

@@ -180,6 +180,15 @@ def test_who_was_deposed_and_sees_nobody_else_waits_as_well() -> None:
     assert not seen.must_wait([], [False], LATER + SILENCE, "a")
 
 
+def test_who_has_stood_still_waits_where_nobody_tells_of_a_leader() -> None:
+    """It lost the leader's token first: the others' follow."""
+    seen = election()
+    seen.stood_still(LATER)
+    assert not seen.must_wait([False], [], LATER, "a")
+    assert seen.must_wait([], [], LATER, "a")
+    assert not seen.must_wait([], [], LATER + SILENCE, "a")
+
+
 @pytest.mark.parametrize(
     ("others", "own", "lost", "waits"),
     [

@@ -15,7 +15,7 @@ from typing import TypeVar
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_instance
 from zscout.mesh import Mesh, Reply
-from zscout.mesh.supervision import Supervisor, done_within
+from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
 from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd, disbelieved
 from zscout.services.placement.component_placer import ComponentPlacer
@@ -78,6 +78,8 @@ class Candidate:
         self._last_terms = LastTerms(mesh, self._supervisor, self._learn, timeout=self._timeout)
         guard = self._supervisor.guard
         try:
+            self._stall = StallWatch(mesh.now).start()
+            self._candidacy.callback(self._stall.stop)
             self._candidacy.callback(self.ledger.stop)
             self.ledger.start(self._supervisor)
             for declared in (
@@ -177,6 +179,8 @@ class Candidate:
     async def _leader_elsewhere(self) -> bool:
         """Whether RCs still see a leader: then it is this candidate that is cut off; or have promised a term to a
         candidate that may be about to lead."""
+        if self._stall.fresh():
+            self.election.stood_still(self.mesh.now())
         replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
         states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
         before = self.known

@@ -44,6 +44,7 @@ class Election:
         self._yields_until: Ns = 0
         self._lost: dict[str, Ns] = {}
         """Hosts whose candidates were seen to go, and when."""
+        self._stood_still: Ns | None = None
         self._alone_since: Ns | None = None
 
     def candidate(self, host: str, *, alive: bool, now: Ns) -> None:
@@ -88,6 +89,10 @@ class Election:
         self._yields_until = now + round((self.silence << min(self._depositions, MAX_DOUBLINGS)) * jitter)
         self._deposed, self._depositions = now, self._depositions + 1
 
+    def stood_still(self, now: Ns) -> None:
+        """This process has just gone on: what it sees go may have missed it, and not the other way round."""
+        self._stood_still = now
+
     def must_wait(self, others: Sequence[bool], own: Sequence[bool], now: Ns, leader: str | None) -> bool:
         """Whether to wait, by what RCs of other hosts and of this one say of a leader: whether they see one. `leader`
         is the host of the last one.
@@ -101,7 +106,10 @@ class Election:
         if self._deposed is not None and now < min(self._yields_until, self._deposed + ALONE * self.silence):
             # Who deposed this candidate goes on, though nobody who could say so is seen: the two would take turns.
             return True
-        cut_off = any(now - at <= self.silence for host, at in self._lost.items() if host not in (leader, self.host))
+        missed = [at for host, at in self._lost.items() if host not in (leader, self.host)]
+        if self._stood_still is not None:
+            missed.append(self._stood_still)
+        cut_off = any(now - at <= self.silence for at in missed)
         if sum(own) * 2 <= len(own) and not cut_off and self._alone_since is None:
             return False
         self._alone_since = now if self._alone_since is None else self._alone_since
