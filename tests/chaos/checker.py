@@ -338,7 +338,8 @@ def events(file: Path) -> Iterator[Json]:
     at = 0
     with file.open(errors="replace") as lines:
         for line in lines:
-            if (start := line.find('{"at":')) >= 0 and line.endswith("}\n"):
+            # The last one: who is killed as it writes leaves the beginning of another.
+            if (start := line.rfind('{"at":')) >= 0 and line.endswith("}\n"):
                 event: Json = json.loads(line[start:])
                 at = max(at, event["at"])
                 yield event

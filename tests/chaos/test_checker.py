@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.chaos.checker import Apart, Checker, Violation, check
+from tests.chaos.checker import Apart, Checker, Violation, check, events
 from tests.chaos.faults import SECOND, Fault, isolated
 from tests.chaos.report import figures, late, spread, table
 from tests.chaos.work import CAPACITY, CLIENT, HOSTS, Json, host_of, rcs_of
@@ -186,6 +186,13 @@ def test_errors_in_logs_are_found(tmp_path: Path) -> None:
     (tmp_path / "c1.log").write_text('{"at": 3, "do": "imported", "modules": ["zscout"]}\n{"at": 4, "do": "as')
     found = check(tmp_path, [], [], SECOND).found
     assert [one.promise for one in found] == ["the foreign ones are foreign", "17 no error unseen"]
+
+
+def test_a_line_that_was_broken_off_by_a_kill_hides_none_behind_it(tmp_path: Path) -> None:
+    (tmp_path / "n1.log").write_text(
+        'x DEBUG {"at":4,"do":"publish","rcs":{"a":[[{"y DEBUG {"at":5,"do":"up","holds":[]}\n'
+    )
+    assert [one["at"] for one in events(tmp_path / "n1.log")] == [5]
 
 
 def test_everything_has_its_host() -> None:
