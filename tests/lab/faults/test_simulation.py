@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -52,3 +53,10 @@ def test_what_is_left_of_the_faults_of_a_failing_run_fails_alike() -> None:
         less = shrink(failed)
         assert less.broken
         assert 0 < len(less.faults) < len(failed.faults)
+
+
+def test_runs_are_added_up_as_json() -> None:
+    program = "import sys; from zscout.cli.main import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "study", "faults", "--seed", "1-2", "--json"]
+    told = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=120).stdout)
+    assert (told["runs"], told["broken"], sum(told["faults"].values()) > 0) == (2, {}, True)

@@ -286,7 +286,8 @@ def faults(seeds: range, runs: int | None, guard: str | None, processes: int | N
 
     found = FaultStudy()
     common.run(run_trials(partial(run, guard=guard), list(seeds), processes, found.add))
-    _show(dataclasses.asdict(found), None, partial(print_report, found), as_json=as_json)
+    # Not `asdict`: in Python 3.11 it takes counters apart.
+    _show(vars(found), None, partial(print_report, found), as_json=as_json)
     return 1 if found.broken else 0
 
 

@@ -64,7 +64,7 @@ def promise(broken: str) -> str:
     return re.sub(r"\b[hc]\d+\S*|[\d.]+", "*", text)[:80]
 
 
-@dataclass(slots=True)
+@dataclass
 class FaultStudy:
     """Runs, added up."""
 
