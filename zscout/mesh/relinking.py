@@ -67,11 +67,12 @@ class Relinking:
         self._lock = threading.Lock()
         self._lost: dict[str, _Lost] = {}
         self._closed = threading.Event()
+        self._thread: threading.Thread | None = None
         callback: Callback[zenoh.LinkEvent] = Callback(self._on_link, lambda: None, indirect=False)
         self._listener = session.info.declare_link_events_listener(callback)
-        self._thread: threading.Thread | None = None
-        if not self._linked():
-            with self._lock:
+        alone = not self._linked()
+        with self._lock:
+            if alone and self._thread is None:  # a link may have come and gone already
                 self._begin(greet=True)
 
     def close(self) -> None:

@@ -113,7 +113,11 @@ async def _open(config: MeshConfig) -> Transport:
         raise
     except zenoh.ZError as error:
         raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
-    return ZenohTransport(session, _relinking(session, config) if config.multicast else None)
+    try:
+        return ZenohTransport(session, _relinking(session, config) if config.multicast else None)
+    except BaseException:
+        _in_thread("closes the mesh", session.close)
+        raise
 
 
 def _relinking(session: zenoh.Session, config: MeshConfig) -> Relinking:
