@@ -314,6 +314,41 @@ def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() -> None:
     run(test())
 
 
+def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made_again() -> None:
+    """A process that is killed takes along what it has sent and its links have not carried yet."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
+            grant = await old.granted(runs)
+            waits = await old.request("waits", {RC: {}}, min_runtime=3600)
+            next_leader = fleet.candidate("h1")
+            await asyncio.sleep(2)
+            before = {arc.id: arc.place for arc in (runs, waits)}
+            old.pause()
+            new.expect(old.open_requests())
+            leader = fleet.leader()
+            for other in (fleet.devices, next_leader.mesh, new.mesh):
+                fleet.network.link(leader, other).loss = 1.0
+            answers: list[str] = []
+            fleet.network.link(leader, old.mesh).trace = lambda _source, _target, kind, _: answers.append(kind)
+            moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
+            await until(lambda: "reply" in answers)
+            fleet.network.kill(leader)
+            await fleet.candidates.pop("h0").stop()
+            await moving
+            after = [await new.request(name, {RC: {}}, min_runtime=3600) for name in ("runs", "waits")]
+            assert {arc.id: arc.place for arc in after} == before
+            granted = await new.granted(after[0])
+            assert granted is not None
+            assert grant is not None
+            assert granted > grant
+            assert (await new.command(RC, granted, ECHO)).result == 7
+            assert after[1].state == "queued"
+
+    run(test())
+
+
 def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
     async def test() -> None:
         async with small_fleet("one", "two") as (fleet, (one, two)):

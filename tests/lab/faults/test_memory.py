@@ -184,19 +184,39 @@ def test_one_frozen_for_longer_is_given_up_and_returns() -> None:
     play(story, MemoryNetwork)
 
 
-def test_one_that_is_killed_is_gone_at_once_and_what_it_sent_arrives() -> None:
+def test_of_what_one_that_is_killed_sent_last_a_beginning_arrives() -> None:
+    arrived: set[int] = set()
+
     async def story(pair: Pair) -> None:
-        pair.b.put(NEWS, Ping(1))
-        asking = asyncio.create_task(pair.ask(2))
+        pair.b.put(NEWS, Ping(0))
+        await asyncio.sleep(1)
+        for number in (1, 2):
+            pair.b.put(NEWS, Ping(number))
+        asking = asyncio.create_task(pair.ask(3))
         await asyncio.sleep(0)
         pair.network.kill(pair.b)
         assert await asking == ([], 0.0)
         assert pair.lives == [True, False]
-        assert pair.heard == [1]
+        assert pair.heard == [0, 1, 2][: len(pair.heard)]
         assert pair.served == []
-        pair.b.put(NEWS, Ping(3))
+        arrived.add(len(pair.heard))
+        pair.b.put(NEWS, Ping(4))
         await asyncio.sleep(1)
-        assert pair.heard == [1]
+        assert 4 not in pair.heard
+
+    for seed in range(20):
+        play(story, lambda seed=seed: MemoryNetwork(seed=seed))  # type: ignore[misc]
+    assert arrived == {1, 2, 3}
+
+
+def test_one_may_be_killed_as_it_sends() -> None:
+    async def story(pair: Pair) -> None:
+        pair.network.after_sending(pair.b, ASK, lambda: pair.network.kill(pair.b))
+        pair.b.put(NEWS, Ping(1))
+        await asyncio.sleep(1)
+        assert (pair.heard, pair.lives) == ([1], [True])
+        assert (await pair.ask(2))[1] == 0.0
+        assert (pair.served, pair.lives) == ([2], [True, False])
 
     play(story, MemoryNetwork)
 

@@ -1,7 +1,8 @@
 """A client that moves: paused, it hands all that it has to another one, which expects it.
 
 The RCM's answer to the hand-over is the commit point. Before it the old client can go on as if nothing had
-been; after it only the new one, unless that is gone: then the old one takes back, and asks anew.
+been; after it only the new one, unless that is gone: then the old one takes back, and asks anew. An RCM that dies as it
+answers may take along what it told everybody else: what the new client has not heard of is handed over again.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ import asyncio
 import logging
 from collections.abc import Sequence
 
-from zscout.behaviors.client.rcm_link import BACKOFF, TRY_AGAIN, RcmLink
+from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN, RcmLink
 from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStore
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Sender
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Amounts, HandOver, Notice, OpenRequest, Problem
+from zscout.messages import Amounts, ClientRequests, HandOver, Notice, OpenRequest, Problem, RcAsk
 from zscout.messages.scheduling import MAX_OTHERS
 from zscout.types import SECOND
 
@@ -24,6 +25,8 @@ log = logging.getLogger(__name__)
 
 HAND_OVER = 10.0
 """Seconds within which the outcome of a hand-over must be known."""
+FIRST_PAUSE = 0.005
+"""Seconds before a hand-over is asked again, doubling: a notice comes about as soon as the answer."""
 EXPECT_TIMEOUT = 2.0
 """Seconds for which a request waits for the ARC that is expected in its stead."""
 TOKEN_GRACE = 1.0
@@ -178,7 +181,7 @@ class MovableClient:
     async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:
         """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
         term = self._rcm.term
-        pause, longest = BACKOFF
+        pause, longest = FIRST_PAUSE, BACKOFF[1]
         known_by = self.mesh.now() + round(TOKEN_GRACE * SECOND)
         while arcs := [arc for arc in arcs if arc.open]:
             first, *others = arcs
@@ -188,10 +191,15 @@ class MovableClient:
             notice, problem = (reply.message, reply.problem) if reply is not None else (None, None)
             if notice is not None and self._rcm.accept(notice.term):
                 # An RCM that came in between answers for the first alone: it may not know of the others.
-                for arc in arcs if notice.term == term else [first]:
+                told, awaited = arcs if notice.term == term else [first], await self._awaited_by(to)
+                if notice.state == "ended":
+                    awaited.discard(first.id)
+                moved = [arc for arc in told if arc.id not in awaited]
+                for arc in moved:
                     self._store.move(arc, notice)
-                continue
-            if problem is not None and problem.code == "not_running":
+                if moved:
+                    continue
+            elif problem is not None and problem.code == "not_running":
                 # It is over, or an RCM that has just taken the lead does not know it: this settles which.
                 await self._rcm.ask(first)
             elif problem is not None and problem.code == "unknown_client" and self.mesh.now() < known_by:
@@ -199,8 +207,13 @@ class MovableClient:
                 pause = BACKOFF[0]
             elif problem is not None and problem.code not in TRY_AGAIN:
                 raise RequestRefused(problem)
-            if not await self._rcm.leader_within(pause):
-                pause = min(longest, pause * 2)
+            pause = FIRST_PAUSE if await self._rcm.leader_within(pause) else min(longest, pause * 2)
+
+    async def _awaited_by(self, to: Sender) -> set[str]:
+        """Ids of what `to` expects and has had no notice of. Where it does not answer, the RCM's word has to do."""
+        reply = await self.mesh.ask_one(self.mesh.keys.requests(to), RcAsk(), ClientRequests, timeout=QUERY_TIMEOUT)
+        requests = reply.message.requests if reply is not None and reply.message is not None else []
+        return {request.id for request in requests if request.place is None}
 
     def take_back(self) -> None:
         """The client to which all was handed is gone: this one goes on, and asks anew for each, at its place.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Callable
+from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
@@ -12,8 +13,9 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from zscout import messages
-from zscout.behaviors.client.client import Client, RequestRefused
+from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.placer_client import PlacerClient
+from zscout.behaviors.client.request import Needs, OpenArc
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.component import Component, ComponentContext
 from zscout.behaviors.components.lifecycle import ComponentLifecycle
@@ -29,6 +31,10 @@ KIND: Final = "worker"
 KINDS: Final = {KIND: "zscout.lab.faults.components:Worker"}
 SUPERSEDED_WITHIN: Final = 2.0
 """Seconds without a fault after which no older incarnation acts beside a newer one."""
+NEEDS: Final[tuple[Needs, ...]] = ({"robot/c": {}, "radio/r": {"rate": 2}}, {"radio/r": {"rate": 2}})
+"""Of components: each has one of these."""
+LONGER: Final = 3600.0
+"""Seconds, more than any run takes: what they hold is never over by itself."""
 STEP: Final = 0.1
 """Seconds from one piece of work to the next."""
 
@@ -50,6 +56,10 @@ class Deeds:
     broken: Callable[[str], None]
     calm: Callable[[], float]
     """For how many seconds there was no fault: a host that is cut off knows of no newer incarnation."""
+    over: Callable[[], bool]
+    """Whether nothing is to be asked for any more."""
+    busy: dict[str, set[str]]
+    """By process: its ARCs that are not over."""
     done: dict[str, dict[str, int]] = field(default_factory=dict)
     """By component: how much each of its processes had done, the one that acted last at the end."""
 
@@ -69,24 +79,55 @@ DEEDS: Final[ContextVar[Deeds]] = ContextVar("DEEDS")
 
 
 class Worker(Component):
-    """Does one piece of work after the other, and counts them."""
+    """Does one piece of work after the other, and counts them; holds RCs meanwhile, while nobody else needs them."""
 
     def __init__(self, params: dict[str, Any]) -> None:
         self.done = 0
         self.restored: int | None = None
+        self.arc: OpenArc | None = None
+        self.handed = ""
+        """The id of the ARC that its predecessor had, if it had one."""
 
     async def run(self, context: ComponentContext) -> None:
-        while True:
-            self.done += 1
-            DEEDS.get().act(context.component, _here(), self.done, self.restored)
-            await asyncio.sleep(STEP)
-            await context.safe_point()
+        holding = asyncio.create_task(self._hold(context))
+        try:
+            while True:
+                self.done += 1
+                DEEDS.get().act(context.component, _here(), self.done, self.restored)
+                await asyncio.sleep(STEP)
+                await context.safe_point()
+        finally:
+            holding.cancel()
+
+    async def _hold(self, context: ComponentContext) -> None:
+        client, deeds = context.client, DEEDS.get()
+        needs = NEEDS[sum(context.component.encode()) % len(NEEDS)]
+        try:
+            while self.handed or not deeds.over():
+                deeds.busy[_here()] = {"work"}
+                arc = self.arc = await client.request("work", needs, priority=-1, min_runtime=LONGER)
+                if self.handed not in ("", arc.id):
+                    deeds.broken(f"{_here()} asks anew for what was handed to it as {self.handed}")
+                self.handed = ""
+                while not deeds.over() and (grant := await client.granted(arc)) is not None:
+                    while arc.grant == grant and not deeds.over():
+                        for rc in arc.rcs:
+                            with suppress(CommandRefused):
+                                await client.command(rc, grant, {"name": "echo", "value": self.done})
+                        await asyncio.sleep(RANDOM.get().uniform(STEP, 1.0))
+                if arc.open:
+                    await client.end(arc)
+                del deeds.busy[_here()]
+        except (RequestRefused, CommandRefused) as refused:
+            deeds.broken(f"what {_here()} asked for was thrown away: {refused.code}: {refused}")
 
     def checkpoint(self) -> bytes:
-        return str(self.done).encode()
+        arc = self.arc.id if self.arc is not None and self.arc.state in ("queued", "running") else ""
+        return f"{self.done} {arc}".encode()
 
     def restore(self, state: bytes) -> None:
-        self.done = self.restored = int(state)
+        done, self.handed = state.decode().split(" ")
+        self.done = self.restored = int(done)
 
 
 def _here() -> str:

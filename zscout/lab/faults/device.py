@@ -35,10 +35,11 @@ class Device:
     def begin(self, process: Process, holder: Holder) -> None:
         self.log(f"{self.name} begins for {holder.client} {holder.arc} {number(holder.grant)}")
         self._forget_dead()
-        if self.capacity is None:
-            others = [one for _, one in self.holders.values() if one.place != holder.place]
-            if others:
-                self.broken(f"two holders of {self.name}: {others[0].client} and {holder.client}")
+        # The same ARC, in another client: it was handed over.
+        self.holders = {grant: held for grant, held in self.holders.items() if held[1].place != holder.place}
+        if self.capacity is None and self.holders:
+            other = next(one for _, one in self.holders.values())
+            self.broken(f"two holders of {self.name}: {other.client} and {holder.client}")
         self.holders[holder.grant] = process, holder
         if self.capacity is not None:
             for parameter, most in self.capacity.items():

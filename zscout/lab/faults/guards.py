@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from msgspec.structs import replace
 
 from zscout.behaviors.client import rcm_link
+from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.rcm_link import RcmLink
 from zscout.behaviors.client.request import OpenArc, RequestStore
 from zscout.drivers import holds
@@ -108,6 +109,10 @@ async def _do_nothing(*_: object) -> None:
     pass
 
 
+async def _none_async(*_: object) -> set[str]:
+    return set()
+
+
 def _without_place(self: OpenArc, now: Ns, grant: Grant | None) -> dict[str, Any]:
     return _as_asked(self, now, grant) | {"place": None}
 
@@ -171,6 +176,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "absurd": Guard(
             "nobody believes a term far above the fleet's",
             {(holds, "absurd"): _no, (rcm_link, "absurd"): _no, (candidate, "absurd"): _no},
+        ),
+        "handed": Guard(
+            "what was handed over stays the old client's until the new one has heard of it",
+            {(MovableClient, "_awaited_by"): _none_async},
         ),
         "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
         "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),

@@ -168,11 +168,19 @@ class MemoryNetwork:
         self._changed()
 
     def kill(self, mesh: Mesh) -> None:
-        """As though its process was killed: what it has sent arrives, then its tokens die."""
+        """As though its process was killed: of what is under way on each of its links some may not have left it, and
+        the rest arrives, then its tokens die."""
         self.thaw(mesh)
         _memory(mesh)._inbox.close()
         for node in self._sessions(mesh):
+            for link in self._links.values():
+                if link.source is node and link.queue:
+                    link.queue = sorted(link.queue)[: self.random.randint(0, len(link.queue))]
             node.leave()
+
+    def after_sending(self, mesh: Mesh, kind: str, then: Callable[[], None] | None) -> None:
+        """Calls `then` once, as soon as `mesh` has sent a message of that kind to another process."""
+        _node(mesh).after = None if then is None else (kind, then)
 
     def remove(self, node: MemoryTransport) -> None:
         # What is under way is kept by the timers of its links; over one that is blocked nothing comes any more.
@@ -300,6 +308,9 @@ class MemoryLink:
 
     def send_message(self, kind: str, call: Callable[..., None], *args: Any) -> bool:
         """Like `send`, of what may be disturbed: whether it did not get lost."""
+        if (after := self.source.after) is not None and after[0] == kind and self.source is not self.target:
+            self.source.after = None
+            self.loop.call_soon(after[1], context=_NETWORK)
         if self.chance(self.loss):
             return False
         fate = self.disturbed.get(kind)
@@ -349,6 +360,7 @@ class MemoryTransport(Transport):
         self.loop, self.process = loop, PROCESS.get()
         self.frozen = False
         self.gone = False
+        self.after: tuple[str, Callable[[], None]] | None = None
         self.declared: list[str] = []
         self.followed: list[MemoryPublisher] = []
         self._queryables: list[tuple[str, Callable[[TransportQuery], None]]] = []

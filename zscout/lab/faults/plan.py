@@ -54,7 +54,7 @@ class Fault:
     whom: tuple[str, ...]
     """Processes or hosts; of a partition one side of it; of a cut from whom and to whom; an RC, and a host."""
     both: bool = True
-    """Of a cut: in both directions. Of a double: it leaves in order."""
+    """Of a cut: in both directions. Of a double: it leaves in order. Of a kill: at once, not at the next `message`."""
     message: str = ""
     how: Disturbance = field(default_factory=Disturbance)
     jump: int = 0
@@ -70,7 +70,7 @@ class Fault:
         what = {
             "freeze": "stands still",
             "stall": "does not come round to anything",
-            "kill": "is killed, and started again",
+            "kill": "is killed, and started again" if self.both else f"is killed as it sends: {self.message}",
             "cut": "cut from one another" if self.both else "the first can't reach the second",
             "isolate": "is cut off",
             "part": "are cut off from all others",

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from typing import Any, Final, TypeVar
 
 import msgspec
@@ -146,6 +147,8 @@ class Simulation:
         """By program: its ARCs that are not over."""
         self.present: list[Fault] = []
         """The faults of now."""
+        self.killed: set[Fault] = set()
+        """Those that have killed whom they were to kill."""
         self.calm_since = START
         """When the last fault ended."""
         self.everybody = [
@@ -170,7 +173,8 @@ class Simulation:
         self._digest = hashlib.blake2b(digest_size=16)
         self.network.trace = self._trace
         self.devices = {rc: self._device(rc) for rc in DEVICES}
-        DEEDS.set(Deeds(self.broken, lambda: 0.0 if self.present else loop.now - self.calm_since))
+        calm = lambda: 0.0 if self.present else loop.now - self.calm_since  # noqa: E731
+        DEEDS.set(Deeds(self.broken, calm, lambda: self.work.over, self.busy))
         self.component = type("Component", (SimulatedComponent,), {"processes": self})
         self.work = Work(DEVICES, self.size.pause, self.result.counts, self.log, self.broken)
         self.promises = Promises(
@@ -288,6 +292,7 @@ class Simulation:
 
     def end_process(self, name: str) -> None:
         process, mesh = self.running[name]
+        self.busy.pop(name, None)
         if not process.dead:
             process.kill()
             self.network.kill(mesh)
@@ -406,7 +411,10 @@ class Simulation:
         lasts, timing = self.loop.now - START - fault.at, self.fleet.timing
         just_over = 0 <= lasts - fault.lasts < 2 * AT_ONCE
         match fault.kind:
-            case "stall" | "kill" | "fail" | "double":
+            case "kill":
+                # What it said last may have reached some only.
+                return bool(names & {*fault.whom}) or since > fault.at
+            case "stall" | "fail" | "double":
                 return bool(names & {*fault.whom})
             case "freeze":
                 return just_over or bool(names & {*fault.whom})
@@ -443,8 +451,12 @@ class Simulation:
                 process, mesh = self.running[name]
                 if process.dead:
                     return
-                self._kill(name)
-                end = lambda: self.start(name)  # noqa: E731
+                kill = partial(self._kill, name, fault)
+                if fault.both:
+                    kill()
+                else:
+                    self.network.after_sending(mesh, fault.message, kill)
+                end = lambda: self.start(name) if fault in self.killed else self.network.after_sending(mesh, "", None)  # noqa: E731
             case "cut" | "isolate" | "part":
                 pairs = self._pairs(fault)
                 self.cuts.update(pairs)
@@ -500,7 +512,10 @@ class Simulation:
         lost = {fault.message for fault in self.present if fault.kind == "disturb" and fault.how.lost == 1}
         self.promises.unheard = not lost.isdisjoint(("grants", "alive"))
 
-    def _kill(self, name: str) -> None:
+    def _kill(self, name: str, fault: Fault) -> None:
+        if self.running[name][0].dead:
+            return
+        self.killed.add(fault)
         self.end_process(name)
         host, program = name.split("/")
         if program == "node":
@@ -511,7 +526,6 @@ class Simulation:
             del self.rcs[rc]
         if name in self.clients:
             self.programs.pop(name, None)
-            self.busy.pop(name, None)
             self.promises.forget_client(name)
 
     def _kill_spare(self, name: str, rc: str) -> None:
