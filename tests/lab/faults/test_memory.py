@@ -184,6 +184,17 @@ def test_one_frozen_for_longer_is_given_up_and_returns() -> None:
     play(story, MemoryNetwork)
 
 
+def test_one_that_stood_still_as_another_left_sees_that() -> None:
+    async def story(pair: Pair) -> None:
+        pair.network.freeze(pair.a)
+        await asyncio.sleep(1.1)
+        await pair.b.close()
+        pair.network.thaw(pair.a)
+        await until(lambda: pair.lives == [True, False])
+
+    play(story, MemoryNetwork)
+
+
 def test_of_what_one_that_is_killed_sent_last_a_beginning_arrives() -> None:
     arrived: set[int] = set()
 

@@ -194,7 +194,7 @@ class MovableClient:
                 told, awaited = arcs if notice.term == term else [first], await self._awaited_by(to)
                 if notice.state == "ended":
                     awaited.discard(first.id)
-                moved = [arc for arc in told if arc.id not in awaited]
+                moved = [arc for arc in told if arc.open and arc.id not in awaited]
                 for arc in moved:
                     self._store.move(arc, notice)
                 if moved:

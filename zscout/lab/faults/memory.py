@@ -174,8 +174,8 @@ class MemoryNetwork:
         _memory(mesh)._inbox.close()
         for node in self._sessions(mesh):
             for link in self._links.values():
-                if link.source is node and link.queue:
-                    link.queue = sorted(link.queue)[: self.random.randint(0, len(link.queue))]
+                if link.source is node:
+                    link.lose_the_last()
             node.leave()
 
     def after_sending(self, mesh: Mesh, kind: str, then: Callable[[], None] | None) -> None:
@@ -185,7 +185,7 @@ class MemoryNetwork:
     def remove(self, node: MemoryTransport) -> None:
         # What is under way is kept by the timers of its links; over one that is blocked nothing comes any more.
         for link in self._links.values():
-            if link.source is node and link.blocked and not link.lost:
+            if link.source is node and link.blocked:
                 link.call_in(self.lease, link.target.call, link.target.disconnected, node)
         self.nodes.remove(node)
         self._links = {ends: link for ends, link in self._links.items() if node not in ends}
@@ -322,6 +322,12 @@ class MemoryLink:
         for _ in range(2 if self.chance(fate.twice) else 1):
             self.send(call, *args, late=self._random.random() * fate.by if self.chance(fate.late) else None)
         return True
+
+    def lose_the_last(self) -> None:
+        """Of what is under way, some did not leave the source. That it is gone was not said by itself."""
+        if self.queue:
+            queue, sent = sorted(self.queue), self._random.randint(0, len(self.queue))
+            self.queue = queue[:sent] + [one for one in queue[sent:] if one[2] == self.target.disconnected]
 
     def pump(self) -> None:
         """Delivers what is due, and calls itself when more is."""
