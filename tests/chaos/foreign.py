@@ -142,8 +142,13 @@ class Peer:
                     (self.leaders.add if alive else self.leaders.discard)(key)
                 if alive:
                     on_leader()
+            if "/rc/" in key:
+                self.on_rc("/".join(key.split("/")[-3:-1]), alive)
 
         self.declare(lambda session: self._watched(session, on_token))
+
+    def on_rc(self, rc: str, alive: bool) -> None:
+        """The token of an RC has come or gone."""
 
     def _watched(self, session: zenoh.Session, on_token: Callable[[zenoh.Sample], None]) -> Any:
         def on_sample(sample: zenoh.Sample) -> None:
@@ -522,6 +527,9 @@ class Request:
     grant: Any = None
     rcs: list[str] = field(default_factory=list)
     unconfirmed: Json = field(default_factory=dict)
+    missing: dict[str, bool] = field(default_factory=dict)
+    """RCs that did not confirm its last grant, and whether each is seen."""
+    reachable: bool = False
     last: tuple[Term, int] = (NO_TERM, 0)
     end: int = 0
     due: int = 0
@@ -603,6 +611,16 @@ class Client(Peer):
                 self.ask_anew(request)
             self.news.notify_all()
 
+    def on_rc(self, rc: str, alive: bool) -> None:
+        """ "Entering": the link to one that did not confirm is back."""
+        with self.news:
+            for request in self.requests.values():
+                if rc in request.missing:
+                    back, request.missing[rc] = alive and not request.missing[rc], alive
+                    if back and all(request.missing.values()):
+                        request.reachable, request.due = True, now()
+            self.news.notify_all()
+
     def ask_anew(self, request: Request) -> None:
         """It had its time, and this client never heard of it."""
         old, new = request.asked["id"], secrets.token_hex(8)
@@ -653,6 +671,8 @@ class Client(Peer):
             message = self.told(request) | request.unconfirmed | {"op": "request"}
             if self.ahead or request.place is not None:
                 message["term"] = self.term
+            if request.reachable:
+                message["reachable"], request.reachable = True, False
             request.due = now() + round(SECOND * 5 * self.rng.uniform(0.8, 1.2))
             dropped = request.last if request.state == "asking" else None
         replies = self.schedule("Ask", message)
@@ -706,6 +726,8 @@ class Client(Peer):
                 return False
             if refused:
                 request.unconfirmed = {"grant": grant, "rcs": request.rcs, "unconfirmed": refused}
+                seen = {"/".join(key.split("/")[-3:-1]) for key in self.tokens if "/rc/" in key}
+                request.missing = {rc: rc in seen for rc in refused}
                 self.lose(request, "not confirmed")
                 return False
             say("entered", id=request.asked["id"], grant=grant)

@@ -26,6 +26,7 @@ from zscout.scheduling.model import (
     RcJoined,
     RcLost,
     RcReported,
+    Reachable,
     Released,
     Requested,
     Tick,
@@ -47,6 +48,7 @@ OPS = (
     "rules",
     "rc ends",
     "unconfirmed",
+    "reachable",
     "client lost",
     "hand over",
     "hand over all",
@@ -145,6 +147,8 @@ class Chaos:
             held = self.core._state.running[running[pick % len(running)]]
             assert held.hold is not None
             self.send(Unconfirmed(held.id, held.hold.grant, (min(held.needs),)))
+        elif op == "reachable" and arcs:
+            self.send(Reachable(arcs[pick % len(arcs)]))
         elif op == "client lost":
             self.send(ClientLost(f"host/{pick % 3}"))
         elif op == "hand over" and arcs:

@@ -40,6 +40,7 @@ from zscout.scheduling.model import (
     RcJoined,
     RcLost,
     RcReported,
+    Reachable,
     RecoveredHold,
     Released,
     Requested,
@@ -94,6 +95,8 @@ class CorePlayer:
             case "unconfirmed":
                 grant, rcs = second.split()
                 return Unconfirmed(first, Grant(*_place(grant)), tuple(rcs.split(",")))
+            case "reachable":
+                return Reachable(first)
             case "waiting":
                 request, options = _request(rest)
                 self.waiting.append(Requested(request, _place(options["place"])))

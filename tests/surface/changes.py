@@ -11,6 +11,7 @@ _STARTS_IN: Final = "a notice carries its estimate, so that who waits need not a
 _CONTEXT: Final = "the field's word for what a component is given; Stage is the same class. It is given by position"
 _WHY: Final = "what `reason` says in words, as data: no program need read English"
 _UNCONFIRMED: Final = "a grant that its RCs do not confirm is queued again at its place, instead of thrown away"
+_REACHABLE: Final = "what was held back is granted as soon as the link to its RC stands again"
 _PLACE: Final = "a place is kept though the first question, without it, came late"
 _TERM: Final = "a client that promised a higher term tells a leader that has not heard of it"
 _TABLE1: Final = (
@@ -78,6 +79,7 @@ ADDED: Final[dict[str, str]] = {
     "live > status > .queue[].why": _WHY,
     "live > why waiter > .arcs[].why": _WHY,
     "messages > zscout.Ask.v1 > fields > grant": _UNCONFIRMED,
+    "messages > zscout.Ask.v1 > fields > reachable": _REACHABLE,
     "messages > zscout.Ask.v1 > fields > unconfirmed": _UNCONFIRMED,
     "messages > zscout.Ask.v1 > fields > term": _TERM,
     "python > what Client.request gives > attributes > unconfirmed": _UNCONFIRMED,

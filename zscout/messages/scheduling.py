@@ -51,6 +51,8 @@ class Ask(_Wanted, frozen=True, tag_field="op", tag="request"):
     unconfirmed: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
     """Those of them that did not confirm it. If it is still in force, it is revoked, and the ARC is queued with its
     place."""
+    reachable: bool = False
+    """One of those has shown itself to the client anew: what was held back for them need wait no more."""
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):

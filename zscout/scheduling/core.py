@@ -205,6 +205,9 @@ class Core:
                 self._show_place(arc, place)
             case model.Unconfirmed(arc, grant, rcs):
                 self._not_confirmed(arc, grant, rcs)
+            case model.Reachable(arc):
+                if (held_back := self._state.held_back.get(arc)) is not None:
+                    self._state.consider_again(held_back)
             case model.HandedOver(arc, to, renamed):
                 self._hand_over(arc, to, renamed)
             case model.LeadTaken():

@@ -334,6 +334,13 @@ class Unconfirmed:
 
 
 @dataclass(frozen=True, slots=True)
+class Reachable:
+    """One of the RCs that a client could not confirm a grant with has shown itself to it anew."""
+
+    arc: ArcId
+
+
+@dataclass(frozen=True, slots=True)
 class HandedOver:
     """An ARC goes on in another client (migration), by the name `renamed`: same place; if it runs, same RCs,
     same end, new grant."""
@@ -399,6 +406,7 @@ Event: TypeAlias = (
     | ClientLost
     | PlaceShown
     | Unconfirmed
+    | Reachable
     | HandedOver
     | LeadTaken
     | Adopted

@@ -256,8 +256,11 @@ class SchedulerState:
         """Considers again who was held back until now, and for this RC."""
         for arc in list(self.held_back.values()):
             if arc.held_back is not None and (arc.held_back[0] <= self.now or rc in arc.held_back[1]):
-                self.dequeue(arc)
-                self.enqueue(arc, arc.since)
+                self.consider_again(arc)
+
+    def consider_again(self, arc: Arc) -> None:
+        self.dequeue(arc)
+        self.enqueue(arc, arc.since)
 
     def forget(self, arc: Arc) -> None:
         """An ARC that neither waits nor runs is over for good."""

@@ -11,7 +11,7 @@ import pytest
 
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.arc import Revoked, hold, holds
-from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.client.client import CONFIRM_TIMEOUT, Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.components.component import ComponentContext, SafePointGate
 from zscout.behaviors.components.shipped import Counter
@@ -24,6 +24,7 @@ from zscout.lab.faults.virtual_time import START
 from zscout.mesh import Declaration, IncomingQuery, ZenohMesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import Ask, Grants, Notice
+from zscout.scheduling.model import HOLD_BACK
 from zscout.services.rcm import request_handler
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import SECOND, Place, Term
@@ -345,6 +346,25 @@ def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made_again
             assert granted > grant
             assert (await new.command(RC, granted, ECHO)).result == 7
             assert after[1].state == "queued"
+
+    run(test())
+
+
+@pytest.mark.parametrize("cut", [0.9, 1.5, 8.0])
+def test_a_client_that_sees_its_rc_anew_is_granted_at_once(cut: float) -> None:
+    """Not when what was held back longer each time is over: nobody else was cut off."""
+
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            network, (client, rc) = fleet.network, (one.mesh, fleet.devices)
+            for source, target in ((client, rc), (rc, client)):
+                network.cut(source, target)
+            arc = await one.request("first", {RC: {}}, min_runtime=600)
+            granting = asyncio.create_task(one.granted(arc))
+            await asyncio.sleep(cut)
+            assert not granting.done()
+            network.heal()
+            await asyncio.wait_for(granting, 0.3 if cut > CONFIRM_TIMEOUT else HOLD_BACK / SECOND)
 
     run(test())
 

@@ -19,7 +19,7 @@ from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import OpenArc, RequestStore
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import BadName, Keys, Sender
-from zscout.mesh import Mesh
+from zscout.mesh import Declaration, Mesh
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import Amounts, Notice, OpenRequest, Problem, ReasonInfo
 from zscout.types import SECOND, Grant, Ns, Place, Term
@@ -32,8 +32,13 @@ NOBODY = cast("Client", None)
 
 
 def mesh(now: Callable[[], Ns]) -> Mesh:
-    """The parts of a mesh that decisions of a client need."""
+    """The parts of a mesh that decisions of a client need. Nobody is seen there."""
+
+    async def living(*_: Any, **__: Any) -> list[Any]:
+        return []
+
     parts = SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=now, suspicions=Suspicions(now, lambda: None))
+    parts.living, parts.watch = living, lambda *_: Declaration(lambda: None)
     return cast("Mesh", parts)
 
 

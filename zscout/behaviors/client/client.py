@@ -7,6 +7,7 @@ import logging
 import os
 import socket
 from collections.abc import Callable, Coroutine, Generator, Mapping
+from contextlib import ExitStack, closing
 from decimal import Decimal
 from typing import Any, Final, Generic, Self, TypeVar
 
@@ -18,7 +19,7 @@ from zscout.config.fleet import Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
 from zscout.mesh.renewal import PATIENCE
-from zscout.mesh.supervision import Supervisor
+from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import Done, Foresight, Notice, Problem, RcmState
 from zscout.types import SECOND, Grant, Ns, Term
 
@@ -36,6 +37,8 @@ NOT_HELD = frozenset({"ended", "free", "not_holder"})
 """What an RC answers to a command under a hold that is over."""
 NOT_CONFIRMED = CONFIRM_AGAIN | NOT_HELD | {"wrong_client"}
 """Refusals after which an ARC is queued again; others concern whoever asked for it."""
+HELD_BACK = 30.0
+"""Seconds for which an RCM does not grant again what was not confirmed, at most."""
 TOLD_WITHIN = 1.0
 """Seconds within which a notice says so too; else the RC is believed."""
 RENEW_TOKEN: Final[Ns] = SECOND // 2
@@ -205,8 +208,10 @@ class Client(MovableClient):
                 if other := [refused for refused in refusals if refused.code not in NOT_CONFIRMED]:
                     await self.end(arc)
                     raise other[0]
-                arc.not_confirmed([refused.rc for refused in refusals], str(refusals[0]), self.mesh.now())
+                rcs = [refused.rc for refused in refusals]
+                arc.not_confirmed(rcs, str(refusals[0]), self.mesh.now())
                 self._store.notify(arc)
+                self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
                 await self._rcm.submit(arc)
             else:
                 await self.changed(arc)
@@ -234,6 +239,29 @@ class Client(MovableClient):
         for rc, refused in zip(arc.rcs, refusals, strict=True):
             await self._look_at_silence(rc, silent=refused is not None and refused.code == "unknown")
         return [refused for refused in refusals if refused is not None]
+
+    async def _ask_when_reachable(self, arc: OpenArc, rcs: list[str]) -> None:
+        """Where tokens of RCs that did not confirm go, or have gone, and come back, links are back: `arc` is held back
+        for nothing."""
+        keys, back = self.mesh.keys, asyncio.Event()
+        gone = {rc for rc in rcs if not await self.mesh.living(keys.alive_rc(rc), timeout=QUERY_TIMEOUT)}
+
+        def on_token(token: Token, alive: bool) -> None:
+            if not alive:
+                gone.add(token.name)
+            elif token.name in gone:
+                gone.remove(token.name)
+                if not gone:
+                    back.set()
+
+        with ExitStack() as watched:
+            for rc in rcs:
+                watched.enter_context(closing(self.mesh.watch(keys.alive_rc(rc), on_token)))
+            if await done_within(HELD_BACK, back.wait()):
+                while arc.state == "asking":
+                    await self._store.changed(arc)
+                if arc.state == "queued":
+                    await self._rcm.ask(arc, reachable=True)
 
     async def _look_at_silence(self, rc: str, *, silent: bool) -> None:
         """An RC that the RCM sees, and so should this client."""

@@ -180,9 +180,9 @@ class RcmLink:
             if not await self.leader_within(pause * RANDOM.get().uniform(0.8, 1.2)):
                 pause = min(longest, pause * 2)
 
-    async def ask(self, arc: OpenArc) -> Problem | None:
+    async def ask(self, arc: OpenArc, *, reachable: bool = False) -> Problem | None:
         """Asks once, and applies the answer. Returns why it was refused, if it was."""
-        ask = arc.ask(self.mesh.now())
+        ask = arc.ask(self.mesh.now(), reachable=reachable)
         # To an RCM that has been replaced and does not know it, a later one's place is one that can't be.
         ahead = self._is_ahead or arc.place is not None
         reply = await self.query(msgspec.structs.replace(ask, term=self.term) if ahead else ask)

@@ -197,9 +197,11 @@ class OpenArc:
         self.state, self.reason, self.outcome, self.since = "asking", reason, None, now
         self.why = None
 
-    def ask(self, now: Ns) -> Ask:
+    def ask(self, now: Ns, *, reachable: bool = False) -> Ask:
+        """`reachable`: the RCs that did not confirm its last grant have shown themselves anew."""
         grant, unconfirmed = self.unconfirmed or (self.grant, [])
-        return Ask(**self._as_asked(now, grant), estimate=self.estimate, unconfirmed=unconfirmed)
+        asked = self._as_asked(now, grant)
+        return Ask(**asked, estimate=self.estimate, unconfirmed=unconfirmed, reachable=reachable)
 
     def open_request(self, now: Ns) -> OpenRequest:
         """As it is reported to an RCM that takes the lead."""

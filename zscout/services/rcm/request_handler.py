@@ -39,6 +39,7 @@ from zscout.scheduling.model import (
     Outcome,
     PlaceShown,
     Queued,
+    Reachable,
     Released,
     Requested,
     Unconfirmed,
@@ -133,6 +134,8 @@ class RequestHandler:
                 self._emit(PlaceShown(arc, ask.place))
             if ask.grant is not None and ask.unconfirmed:
                 self._emit(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
+            if ask.reachable:
+                self._emit(Reachable(arc))
             query.answer(self._standing(arc, ask))
         elif self._registry.ended(arc) and not self._registry.reopens(arc):
             query.answer(self._registry.notice(arc))
