@@ -260,7 +260,7 @@ class Client(MovableClient):
             if await done_within(HELD_BACK, back.wait()):
                 while arc.state == "asking":
                     await self._store.changed(arc)
-                if arc.state == "queued":
+                if arc.state == "queued" and not self.paused:
                     await self._rcm.ask(arc, reachable=True)
 
     async def _look_at_silence(self, rc: str, *, silent: bool) -> None:
