@@ -369,6 +369,26 @@ def test_a_client_that_sees_its_rc_anew_is_granted_at_once(cut: float) -> None:
     run(test())
 
 
+def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_same() -> None:
+    """For the hold lease: that ends the hold, and its ARC is asked for again, by whoever has it."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            arc = await old.request("runs", {RC: {}}, min_runtime=3600)
+            await old.granted(arc)
+            old.pause()
+            new.expect(old.open_requests())
+            before, link = (arc.id, arc.place), fleet.network.link(fleet.leader(), old.mesh)
+            link.loss = 1.0
+            await until(lambda: arc.state == "asking")
+            link.loss = 0.0
+            await old.hand_over_all(new.mesh.me)
+            after = await new.request("runs", {RC: {}}, min_runtime=3600)
+            assert (after.id, after.place) == before
+
+    run(test())
+
+
 def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
     async def test() -> None:
         async with small_fleet("one", "two") as (fleet, (one, two)):

@@ -154,7 +154,7 @@ class MovableClient:
             self._store.forget(arc)
 
     def open_requests(self) -> list[OpenRequest]:
-        """What is queued or running: what `hand_over_all` would hand over now."""
+        """What an RCM has answered and is not over: what `hand_over_all` would hand over now."""
         now = self.mesh.now()
         return [arc.open_request(now) for arc in self._store.acknowledged]
 

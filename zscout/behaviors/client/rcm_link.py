@@ -27,6 +27,8 @@ BACKOFF = (0.05, 1.0)
 """Seconds before a query without an answer is repeated: first, and at most."""
 END_TRIES = 3
 TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full", "old_term"})
+DEPOSED = frozenset({"not_leading", "old_term"})
+"""What an RCM says that has been replaced."""
 CHECKS_PER_LEASE = 10
 """How often within a hold lease a client checks whether an RCM published."""
 LEADERLESS: Final = 5.0
@@ -144,10 +146,17 @@ class RcmLink:
     # Requests
 
     async def query(self, operation: Operation) -> Reply[Notice] | None:
-        """An RCM's answer to an operation; None: none came, and it was carried out or not."""
-        reply = await self.mesh.ask_one(self.key, operation, Notice, timeout=QUERY_TIMEOUT)
-        await self._look_for_contradictions(silent=reply is None)
-        return reply
+        """An RCM's answer to an operation, of several that which counts; None: none came, and it was carried out or
+        not."""
+        replies = await self.mesh.ask(self.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=self._counts)
+        await self._look_for_contradictions(silent=not replies)
+        return max(replies, key=self._counts, default=None)
+
+    def _counts(self, reply: Reply[Notice]) -> bool:
+        """Whether it is not the word of an RCM that has been replaced."""
+        if reply.message is not None:
+            return reply.message.term >= self.term
+        return reply.problem is None or reply.problem.code not in DEPOSED
 
     async def _look_for_contradictions(self, *, silent: bool) -> None:
         """An RCM that is seen or heard answers, and one that answers is heard; where candidates are seen one leads

@@ -259,8 +259,8 @@ class RequestStore:
 
     @property
     def acknowledged(self) -> list[OpenArc]:
-        """Those that the RCM has answered: queued or running."""
-        return [arc for arc in self.open if arc.state != "asking"]
+        """Those that an RCM has answered: queued, running, or asked for again at their place."""
+        return [arc for arc in self.open if arc.state != "asking" or arc.place is not None]
 
     def add(self, arc: OpenArc) -> None:
         self.arcs[arc.id] = arc

@@ -122,7 +122,7 @@ class Worker(Component):
             deeds.broken(f"what {_here()} asked for was thrown away: {refused.code}: {refused}")
 
     def checkpoint(self) -> bytes:
-        arc = self.arc.id if self.arc is not None and self.arc.state in ("queued", "running") else ""
+        arc = self.arc.id if self.arc is not None and self.arc.open and self.arc.place is not None else ""
         return f"{self.done} {arc}".encode()
 
     def restore(self, state: bytes) -> None:
