@@ -19,7 +19,7 @@ from zscout.config.fleet import default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryNetwork
+from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryNetwork, MemoryTransport
 from zscout.lab.faults.virtual_time import START
 from zscout.mesh import Declaration, IncomingQuery, ZenohMesh
 from zscout.mesh.supervision import StallWatch
@@ -611,5 +611,30 @@ def test_a_counter_keeps_its_hold_where_a_command_is_not_answered(
             await until(lambda: counter.count == 6)
             assert [arc.grant for arc in one._store.open] == before
             counting.cancel()
+
+    run(test())
+
+
+def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_anew() -> None:
+    """Links came back without its token, its subscription of notices and its `requests`: only what it asks arrives."""
+
+    async def test() -> None:
+        async with small_fleet("one", "two") as (fleet, (one, _)):
+            arc = await one.request("first", {RC: {}}, min_runtime=600)
+            await one.granted(arc)
+            leader, asking = fleet.leader(), one.mesh
+            assert isinstance(asking, MemoryMesh)
+            before, client = leader._transport.current, asking._transport.current
+            assert isinstance(before, MemoryTransport)
+            assert isinstance(client, MemoryTransport)
+            fleet.network.link(one.mesh, leader).hidden = {*client.declarations()}
+            before.disconnected(client)
+            await until(lambda: leader._transport.current is not before)
+            await asyncio.sleep(FLEET.mesh.lease + 1)
+            outcomes: list[str | None] = []
+            one.watch(lambda arc: outcomes.append(arc.outcome))
+            await asyncio.sleep(10)
+            assert arc.state == "running"
+            assert "client_lost" not in outcomes
 
     run(test())

@@ -138,6 +138,9 @@ class Membership:
         if timer := self._unseen.pop(client, None):
             timer.cancel()
             self.expect(client)
+        if self._sought and client not in self.clients:
+            key = self.mesh.keys.requests(client_of(client))
+            self.mesh.suspicions.suspect(_sign(key), so=key in self._sought)
 
     def find(self, client: ClientId, then: Callable[[bool], None]) -> None:
         """Calls `then` with whether a client has a token: at once where it was seen, else once the mesh was
@@ -248,7 +251,7 @@ class Membership:
                 self._supervisor.spawn(self._keep_seeking(key, kind, is_seen))
 
     async def _keep_seeking(self, key: str, kind: type[Struct], is_seen: Callable[[], bool]) -> None:
-        sign = f"{key} answers, and its token is missing"
+        sign = _sign(key)
         while self._sought[key] and not is_seen():
             self._sought[key] -= 1
             await asyncio.sleep(SEEK_EVERY)
@@ -464,6 +467,10 @@ class Membership:
         """A term that somebody has heard of; `obeyed_by` an RC or a client that is seen."""
         if term > self.term:
             self._on_newer(term, obeyed_by)
+
+
+def _sign(key: str) -> str:
+    return f"{key} answers, and its token is missing"
 
 
 def discrepancies(
