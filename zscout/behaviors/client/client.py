@@ -258,7 +258,7 @@ class Client(MovableClient):
             for rc in rcs:
                 watched.enter_context(closing(self.mesh.watch(keys.alive_rc(rc), on_token)))
             if await done_within(HELD_BACK, back.wait()):
-                while arc.state == "asking":
+                while arc.state == "asking" and arc.id in self._store.arcs:
                     await self._store.changed(arc)
                 if arc.state == "queued" and not self.paused:
                     await self._rcm.ask(arc, reachable=True)

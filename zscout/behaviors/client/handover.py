@@ -191,7 +191,8 @@ class MovableClient:
             notice, problem = (reply.message, reply.problem) if reply is not None else (None, None)
             if notice is not None and self._rcm.accept(notice.term):
                 # An RCM that came in between answers for the first alone: it may not know of the others.
-                told, awaited = arcs if notice.term == term else [first], await self._awaited_by(to)
+                told = arcs if notice.term == term else [first]
+                awaited = await self._awaited_by(to)
                 if notice.state == "ended":
                     awaited.discard(first.id)
                 moved = [arc for arc in told if arc.open and arc.id not in awaited]
