@@ -1,0 +1,81 @@
+"""Candidates, RCs and clients on a mesh in memory, in virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from tests.mesh.kit import until
+from zscout.behaviors.client.client import Client
+from zscout.config.fleet import default_fleet
+from zscout.drivers.generic import ExclusiveDriver
+from zscout.drivers.resource_controller import ResourceController
+from zscout.keyexpr import Sender
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
+from zscout.mesh.supervision import StallWatch
+from zscout.services.rcm.candidate import Candidate
+from zscout.types import SECOND
+
+RC, OTHER = "robot/x", "robot/y"
+ECHO = {"name": "echo", "value": 7}
+FLEET = default_fleet()
+
+
+class SmallFleet:
+    """Candidates, RC and OTHER on a host of their own, and clients, each with its place on one network."""
+
+    def __init__(self) -> None:
+        self.network = MemoryNetwork(lease=FLEET.mesh.lease)
+        self.candidates: dict[str, Candidate] = {}
+        self.clients: list[Client] = []
+        self.devices = self.mesh("devices", "node")
+        self.stall = StallWatch(self.devices.now).start()
+        self.rcs = [
+            ResourceController(
+                self.devices, name, ExclusiveDriver(), hold_lease=FLEET.timing.hold_lease / SECOND, stall=self.stall
+            )
+            for name in (RC, OTHER)
+        ]
+
+    def mesh(self, host: str, name: str) -> MemoryMesh:
+        return self.network.open(FLEET.name, Sender(host, name))
+
+    def candidate(self, host: str) -> Candidate:
+        candidate = self.candidates[host] = Candidate(self.mesh(host, "node"), FLEET)
+        candidate.start()
+        return candidate
+
+    def client(self, name: str) -> Client:
+        client = Client(self.mesh("h", name), FLEET).start()
+        self.clients.append(client)
+        return client
+
+    def leader(self) -> MemoryMesh:
+        (leader,) = [one.mesh for one in self.candidates.values() if one.rcm is not None]
+        assert isinstance(leader, MemoryMesh)
+        return leader
+
+    async def holders(self, rc: str = RC) -> list[str]:
+        state = await self.clients[0].state()
+        assert state is not None
+        return [view.arc for view in state.holds if rc in view.needs]
+
+
+@asynccontextmanager
+async def small_fleet(*clients: str) -> AsyncIterator[tuple[SmallFleet, list[Client]]]:
+    fleet = SmallFleet()
+    for rc in fleet.rcs:
+        await rc.start()
+    fleet.candidate("h0")
+    made = [fleet.client(name) for name in clients]
+    await until(lambda: made[0].leader == "h0")
+    try:
+        yield fleet, made
+    finally:
+        for client in fleet.clients:
+            await client.close()
+        for candidate in fleet.candidates.values():
+            await candidate.stop()
+        for rc in fleet.rcs:
+            await rc.stop()
+        fleet.stall.stop()

@@ -1,0 +1,96 @@
+"""All that one client asked for and holds goes on in another: what the move of a component rests on."""
+
+from __future__ import annotations
+
+import asyncio
+
+from tests.behaviors.client.small_fleet import ECHO, RC, small_fleet
+from tests.mesh.kit import run, until
+from zscout.messages import Grants
+
+
+def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() -> None:
+    """What a component's move rests on: nobody of equal priority gets in between."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new", "rival") as (fleet, (old, new, rival)):
+            arc = await old.request("tally", {RC: {}}, min_runtime=3600)
+            await old.granted(arc)
+            waits = await rival.request("rival", {RC: {}}, min_runtime=1)
+            holders: list[str] = []
+            states: list[str] = [waits.state]
+            rival.watch(lambda arc: states.append(arc.state))
+            rival.mesh.subscribe(
+                rival.mesh.keys.grants,
+                Grants,
+                lambda _, grants: holders.extend(holder.arc for holder in grants.rcs.get(RC, [])),
+            )
+            fleet.network.link(fleet.leader(), fleet.devices).delay = 0.05
+            for source, target in [(old, new), (new, old)] * 3:
+                source.pause()
+                target.expect(source.open_requests())
+                await source.hand_over_all(target.mesh.me)
+                moved = await target.request("tally", {RC: {}}, min_runtime=3600)
+                grant = await target.granted(moved)
+                assert grant is not None
+                assert (await target.command(RC, grant, ECHO)).result == 7
+                source.resume()
+            await asyncio.sleep(10)
+            assert (set(states), set(holders)) == ({"queued"}, {"tally"})
+
+    run(test())
+
+
+def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made_again() -> None:
+    """A process that is killed takes along what it has sent and its links have not carried yet."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
+            grant = await old.granted(runs)
+            waits = await old.request("waits", {RC: {}}, min_runtime=3600)
+            next_leader = fleet.candidate("h1")
+            await asyncio.sleep(2)
+            before = {arc.id: arc.place for arc in (runs, waits)}
+            old.pause()
+            new.expect(old.open_requests())
+            leader = fleet.leader()
+            for other in (fleet.devices, next_leader.mesh, new.mesh):
+                fleet.network.link(leader, other).loss = 1.0
+            answers: list[str] = []
+            fleet.network.link(leader, old.mesh).trace = lambda _source, _target, kind, _: answers.append(kind)
+            moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
+            await until(lambda: "reply" in answers)
+            fleet.network.kill(leader)
+            await fleet.candidates.pop("h0").stop()
+            await moving
+            after = [await new.request(name, {RC: {}}, min_runtime=3600) for name in ("runs", "waits")]
+            assert {arc.id: arc.place for arc in after} == before
+            granted = await new.granted(after[0])
+            assert granted is not None
+            assert grant is not None
+            assert granted > grant
+            assert (await new.command(RC, granted, ECHO)).result == 7
+            assert after[1].state == "queued"
+
+    run(test())
+
+
+def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_same() -> None:
+    """For the hold lease: that ends the hold, and its ARC is asked for again, by whoever has it."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            arc = await old.request("runs", {RC: {}}, min_runtime=3600)
+            await old.granted(arc)
+            old.pause()
+            new.expect(old.open_requests())
+            before, link = (arc.id, arc.place), fleet.network.link(fleet.leader(), old.mesh)
+            link.loss = 1.0
+            await until(lambda: arc.state == "asking")
+            link.loss = 0.0
+            await old.hand_over_all(new.mesh.me)
+            after = await new.request("runs", {RC: {}}, min_runtime=3600)
+            assert (after.id, after.place) == before
+
+    run(test())
