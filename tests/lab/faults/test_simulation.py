@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import subprocess
@@ -11,7 +12,7 @@ import pytest
 
 from zscout.lab.faults.guards import GUARDS, without
 from zscout.lab.faults.runs import shrink
-from zscout.lab.faults.simulation import simulate
+from zscout.lab.faults.simulation import Simulation, simulate
 
 SEEDS = [seed for seed in range(1, 200) if seed % 10 != 9]
 """Small runs; every tenth is one of many programs."""
@@ -39,6 +40,16 @@ def test_a_seed_is_one_run_to_the_byte_whatever_the_order_of_sets() -> None:
         said.append(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
     assert len(said[0].splitlines()) > 1_000
     assert said[0] == said[1]
+
+
+def test_a_run_leaves_nothing_in_memory() -> None:
+    def left() -> int:
+        gc.collect()
+        return sum(type(one) is Simulation for one in gc.get_objects())
+
+    before = left()
+    simulate(1)
+    assert left() == before
 
 
 @pytest.mark.parametrize("guard", MISSED)

@@ -481,8 +481,8 @@ class MemoryTransport(Transport):
         def undeclare() -> None:
             finalizer()
 
-        # Zenoh's, too, die with whoever should have kept them.
-        finalizer = weakref.finalize(undeclare, self._undeclare_token, key)
+        # Zenoh's, too, die with whoever should have kept them. What finalizes is kept for good: it must not hold this.
+        finalizer = weakref.finalize(undeclare, _call, weakref.WeakMethod(self._undeclare_token), key)
         return undeclare
 
     def _undeclare_token(self, key: str) -> None:
@@ -641,6 +641,11 @@ class _Query(TransportQuery):
 
     __del__ = drop
     """A handler that forgets a query drops it."""
+
+
+def _call(method: weakref.WeakMethod[Callable[[str], None]], argument: str) -> None:
+    if (alive := method()) is not None:
+        alive(argument)
 
 
 def _add(items: list[Any], item: Any) -> Undeclare:
