@@ -14,7 +14,7 @@ from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import Role, Token
-from zscout.lab.faults.memory import Disturbance
+from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryTransport
 from zscout.mesh import Declaration, IncomingQuery
 from zscout.messages import Ask, Notice
 from zscout.services.rcm import request_handler
@@ -62,6 +62,35 @@ def test_holds_and_places_outlive_a_change_of_leader() -> None:
                 await asyncio.sleep(7)
                 assert [(arc.state, arc.place) for arc in waits] == [("queued", place) for place in places]
             assert await two.granted(waits[0]) is not None
+
+    run(test())
+
+
+def test_who_answers_a_new_leader_is_not_dropped_though_its_token_is_missing() -> None:
+    """As where links came back without all declarations while another led, and nobody noticed."""
+
+    async def test() -> None:
+        async with small_fleet("watch", "one") as (fleet, (watch, one)):
+            next_leader = fleet.candidate("h1").mesh
+            assert isinstance(next_leader, MemoryMesh)
+            before, client = (mesh._transport.current for mesh in (next_leader, one.mesh))
+            assert isinstance(before, MemoryTransport)
+            assert isinstance(client, MemoryTransport)
+            await asyncio.sleep(0.1)
+            fleet.network.link(one.mesh, next_leader).hidden = {
+                one for one in client.declarations() if type(one) is str
+            }
+            before.disconnected(client)
+            async with hold(one, "first", {RC: {}}, min_runtime=600) as held:
+                outcomes: list[str | None] = []
+                one.watch(lambda arc: outcomes.append(arc.outcome))
+                fleet.network.kill(fleet.leader())
+                del fleet.candidates["h0"]
+                await until(lambda: watch.leader == "h1")
+                await until(lambda: next_leader._transport.current is not before, within=10)
+                await asyncio.sleep(10)
+                assert held.active
+                assert "client_lost" not in outcomes
 
     run(test())
 

@@ -129,9 +129,25 @@ class Membership:
     # Clients
 
     def expect(self, client: ClientId) -> None:
-        """A client with requests must live: one that is not among `clients` yet gets a lease to show itself."""
+        """A client with requests must live: one that is not among `clients` yet gets a lease to show itself, and is
+        asked before it is dropped."""
         if client not in self._unseen:
-            self._unseen[client] = self._supervisor.call_later(self._lease, self._client_lost, client)
+            self._unseen[client] = self._supervisor.call_later(self._lease, self._overdue, client)
+
+    def _overdue(self, client: ClientId) -> None:
+        self._supervisor.spawn(self._ask_unseen(client, self._unseen[client]))
+
+    async def _ask_unseen(self, client: ClientId, timer: asyncio.TimerHandle) -> None:
+        key = self.mesh.keys.requests(client_of(client))
+        reply = await self.mesh.ask_one(key, RcAsk(), ClientRequests, timeout=self._timeout)
+        if self._unseen.get(client) is not timer:
+            return  # it has shown itself
+        if reply is None:
+            self._client_lost(client)
+        else:
+            self.mesh.suspicions.suspect(_sign(key))
+            del self._unseen[client]
+            self.expect(client)
 
     def heard(self, client: ClientId) -> None:
         """A client that says something lives, though its token is not seen."""
@@ -161,6 +177,7 @@ class Membership:
             instances.add(token.instance)
             if timer := self._unseen.pop(client, None):
                 timer.cancel()
+                self.mesh.suspicions.suspect(_sign(self.mesh.keys.requests(client_of(client))), so=False)
             return
         instances.discard(token.instance)
         if not instances:
