@@ -146,13 +146,17 @@ class Membership:
             self._client_lost(client)
         else:
             self.mesh.suspicions.suspect(_sign(key))
-            del self._unseen[client]
+            self._no_longer_unseen(client)
             self.expect(client)
+
+    def _no_longer_unseen(self, client: ClientId) -> bool:
+        if (timer := self._unseen.pop(client, None)) is not None:
+            timer.cancel()
+        return timer is not None
 
     def heard(self, client: ClientId) -> None:
         """A client that says something lives, though its token is not seen."""
-        if timer := self._unseen.pop(client, None):
-            timer.cancel()
+        if self._no_longer_unseen(client):
             self.expect(client)
         if self._sought and client not in self.clients:
             key = self.mesh.keys.requests(client_of(client))
@@ -175,8 +179,7 @@ class Membership:
         instances = self.clients.setdefault(client, set())
         if alive:
             instances.add(token.instance)
-            if timer := self._unseen.pop(client, None):
-                timer.cancel()
+            if self._no_longer_unseen(client):
                 self.mesh.suspicions.suspect(_sign(self.mesh.keys.requests(client_of(client))), so=False)
             return
         instances.discard(token.instance)
@@ -242,8 +245,7 @@ class Membership:
         """This leader was not away: what went has gone."""
         doubted, self._doubted = self._doubted, set()
         for client in sorted(doubted):
-            if timer := self._unseen.pop(client, None):
-                timer.cancel()
+            if client in self._unseen:
                 self._client_lost(client)
         self._drop_unseen()
 
@@ -253,7 +255,7 @@ class Membership:
         return host in others or any(client.startswith(f"{host}/") for client in self.clients)
 
     def _client_lost(self, client: ClientId) -> None:
-        self._unseen.pop(client, None)
+        self._no_longer_unseen(client)
         self._seek(self.mesh.keys.requests(client_of(client)), ClientRequests, lambda: client in self.clients)
         self._emit(ClientLost(client))
 
