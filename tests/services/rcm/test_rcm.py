@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from tests.mesh.kit import run, until
-from tests.services.rcm.kit import FakeFleet, Refusal, grant_of
+from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, grant_of
 from zscout.messages import Cancel, EndedHold, HandOver, Release
 from zscout.scheduling.model import Adopted, ArcRequest, RcJoined, RecoveredHold
 from zscout.types import SECOND, Grant, Place, Term
@@ -216,9 +216,8 @@ def test_a_client_that_is_gone_leaves_nothing() -> None:
         await until(lambda: robot.arcs == ["third"])
         assert asyncio.get_running_loop().time() - begin < 0.01
         assert (await fleet.state()).queue == []
-        # Who asks and shows no token is dropped after a lease.
-        ghost = fleet.client("ghost")
-        ghost.token.close()
+        # Who asks, shows no token and does not answer is dropped after a lease.
+        ghost = FakeClient(fleet.mesh("desk", "ghost"), fleet.log)
         await ghost.ask("fourth", "robot/a", priority=5)
         await until(lambda: robot.arcs == ["fourth"])
         await until(lambda: robot.arcs == ["third"], within=2 * fleet.fleet.mesh.lease)
@@ -226,18 +225,26 @@ def test_a_client_that_is_gone_leaves_nothing() -> None:
     run(story())
 
 
-def test_a_client_that_goes_in_the_burst_of_its_request_leaves_nothing() -> None:
+@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize("goes_first", [False, True])
+def test_a_client_that_goes_in_the_burst_of_its_request_leaves_nothing(goes_first: bool, alone: bool) -> None:
+    """`alone`: no other host is there that could say whether the leader was away."""
+
     async def story() -> None:
         fleet = FakeFleet()
         fleet.rcm()
-        robot = fleet.rc("robot/a")
-        await fleet.joined(robot)
+        if not alone:
+            await fleet.joined(fleet.rc("robot/a"))
         client = fleet.client("brief")
+        if goes_first:
+            client.token.close()
         asking = asyncio.ensure_future(client.ask("brief", "robot/a"))
         await asyncio.sleep(0)
         client.token.close()
         await asking
-        await until(lambda: robot.arcs == [], within=2 * fleet.fleet.mesh.lease)
+        await asyncio.sleep(2 * fleet.fleet.mesh.lease)
+        state = await fleet.state()
+        assert (state.holds, state.queue, fleet.failures) == ([], [], [])
 
     run(story())
 
