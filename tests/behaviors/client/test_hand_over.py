@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
+
 from tests.behaviors.client.small_fleet import ECHO, RC, small_fleet
 from tests.mesh.kit import run, until
+from zscout.behaviors.client.client import RequestRefused
+from zscout.lab.faults.memory import Disturbance
 from zscout.messages import Grants
 
 
@@ -92,5 +96,49 @@ def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_same() ->
             await old.hand_over_all(new.mesh.me)
             after = await new.request("runs", {RC: {}}, min_runtime=3600)
             assert (after.id, after.place) == before
+
+    run(test())
+
+
+def test_what_the_new_client_does_not_hear_of_is_asked_for_as_what_it_was() -> None:
+    """Neither a notice nor the question of the old client reaches it: the RCM's word has to do."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
+            grant = await old.granted(runs)
+            waits = await old.request("waits", {RC: {}}, min_runtime=3600)
+            before = {arc.id: arc.place for arc in (runs, waits)}
+            old.pause()
+            new.expect(old.open_requests())
+            fleet.network.disturb({"notice": Disturbance(lost=1.0), "requests": Disturbance(lost=1.0)})
+            await old.hand_over_all(new.mesh.me)
+            after = [await new.request(name, {RC: {}}, min_runtime=3600) for name in ("runs", "waits")]
+            assert {arc.id: arc.place for arc in after} == before
+            granted = await new.granted(after[0])
+            assert granted is not None
+            assert grant is not None
+            assert granted > grant
+            assert await fleet.holders() == ["runs"]
+
+    run(test())
+
+
+def test_what_was_given_up_while_its_hand_over_was_undecided_is_not_taken_back() -> None:
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
+            await old.granted(runs)
+            old.pause()
+            new.expect(old.open_requests())
+            fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+            ending = asyncio.create_task(old.end(runs))
+            with pytest.raises(RequestRefused, match="no RCM told"):
+                await old.hand_over_all(new.mesh.me)
+            fleet.network.kill(new.mesh)
+            old.take_back()
+            await ending
+            await asyncio.sleep(1)
+            assert (await fleet.holders(), old.open_requests()) == ([], [])
 
     run(test())

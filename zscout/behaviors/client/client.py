@@ -170,11 +170,11 @@ class Client(MovableClient):
 
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)
-        if (expected := await self._claim(check_name(name, "arc"), wanted)) is not None:
-            return expected
-        seconds, now = Decimal(str(min_runtime)), self.mesh.now()
-        arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, since=now)
-        self._store.add(arc)
+        arc = await self._claim(check_name(name, "arc"), wanted)
+        if arc is None:
+            seconds, now = Decimal(str(min_runtime)), self.mesh.now()
+            arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, since=now)
+            self._store.add(arc)
         try:
             await self._rcm.submit(arc)
         except BaseException as error:

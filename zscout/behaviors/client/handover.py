@@ -76,8 +76,7 @@ class MovableClient:
         """Applies a notice of what is expected, or was handed over. False if it is of neither."""
         if (arc := self._store.expected.get(notice.id)) is not None:
             if arc.take_first(notice, self.mesh.now()):
-                del self._store.expected[arc.id]
-                self._store.add(arc)
+                self._store.adopt(arc)
                 self._store.notify(arc)
                 self.expected_came.set()
                 self._supervisor.spawn(self._give_back_unwanted(arc))
@@ -92,7 +91,8 @@ class MovableClient:
         return False
 
     async def _claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
-        """The ARC of this name and these needs that is expected, once it has come; None if there is none."""
+        """The ARC of this name and these needs that is expected, once it has come; None if there is none. What does not
+        come may have been handed over unheard: it is to be asked for, under its id, at its place."""
         unclaimed = self._unclaimed.values()
         arc = next((arc for arc in unclaimed if (arc.name, arc.needs) == (name, needs)), None)
         if arc is None:
@@ -103,7 +103,10 @@ class MovableClient:
                 while arc.id in self._store.expected:
                     await self._store.changed(arc)
         except TimeoutError:
-            log.warning("%s was not handed over within %g s; it is asked for anew", name, EXPECT_TIMEOUT)
+            log.warning(
+                "%s was handed over and nothing heard of it for %g s; it is asked for", name, EXPECT_TIMEOUT
+            )
+            self._store.adopt(arc)
         finally:
             if arc.id in self._store.expected:
                 self._store.forget(arc)

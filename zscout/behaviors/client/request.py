@@ -272,6 +272,13 @@ class RequestStore:
         self.withdrawn.pop(arc.id, None)
         self.expected[arc.id] = arc
 
+    def adopt(self, arc: OpenArc) -> None:
+        """What was expected is this client's: told so by a notice, or to be asked for."""
+        if self.expected.pop(arc.id, None) is not None:
+            if arc.state == "expected":
+                arc.state = "asking"
+            self.add(arc)
+
     def forget(self, arc: OpenArc) -> None:
         self.arcs.pop(arc.id, None)
         self.moved.pop(arc.id, None)
@@ -298,7 +305,7 @@ class RequestStore:
         if notice.outcome == "handed_over" and not self.resumed.is_set():
             # Not before the hand-over is answered: an RCM that dies first may not have notified the other.
             return
-        if notice.outcome == "handed_over" and arc.id in self.reclaimed:
+        if notice.outcome == "handed_over" and arc.id in self.reclaimed and arc.open:
             self.move(arc, notice)
             self.reclaim(arc)
         elif arc.take(notice, self._now()):
