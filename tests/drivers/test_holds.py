@@ -6,6 +6,7 @@ from collections.abc import Callable
 from decimal import Decimal
 
 import pytest
+from msgspec.structs import replace
 
 from zscout.drivers.holds import REMEMBERED, HoldChange, HoldTable
 from zscout.messages import MAX_JUMP, Grants, Holder, HoldView, RcmState, Revocation
@@ -161,6 +162,12 @@ def test_read(read: RcmState, carries: bool, now_holds: list[int], presents: boo
     change = rc.apply_snapshot(read, NOW, lambda holders: carries)
     assert (grants(rc), change.announce) == (now_holds, presents)
     assert not change.removed
+
+
+def test_what_is_read_under_a_newer_grant_is_not_held_twice() -> None:
+    rc = holding(HELD)
+    change = rc.apply_snapshot(state(5, replace(view(4), place=Place(TERM, 2))), NOW, lambda holders: len(holders) == 1)
+    assert (grants(rc), [one.grant for one in change.removed]) == ([4], [Grant(TERM, 2)])
 
 
 def test_what_is_read_of_a_free_rc_is_held_whole() -> None:

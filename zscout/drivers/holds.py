@@ -123,8 +123,8 @@ class HoldTable:
     ) -> HoldChange:
         """Takes a snapshot: what was missed is added, what the snapshot does not know is announced.
 
-        It ends nothing, so what is still held here may be over: beside that only such a holder begins with whom the
-        device `carries` them all, and an exclusive one carries no second."""
+        It ends nothing but older holds of what it names, so what is still held here may be over: beside that only such
+        a holder begins with whom the device `carries` them all, and an exclusive one carries no second."""
         change = HoldChange()
         if not self._accept(state, change, now):
             return change
@@ -141,11 +141,16 @@ class HoldTable:
             own: dict[str, Any] = {"rcs": sorted(view.needs), "params": view.needs[self.rc]}
             shared = {name: getattr(view, name) for name in Holder.__struct_fields__ if name not in own}
             holder = Holder(**shared, **own)
-            if self.held and not carries([*(held.holder for held in self.held.values()), holder]):
+            # An ARC has one hold: its older one is over.
+            older = [grant for grant, held in self.held.items() if held.holder.place == holder.place]
+            others = [held.holder for grant, held in self.held.items() if grant not in older]
+            if self.held and not carries([*others, holder]):
                 change.announce = True
                 self._awaited.add(view.grant)
-            else:
-                self._begin(holder, change, now)
+                continue
+            for grant in older:
+                self._remove(grant, "it was granted anew", change)
+            self._begin(holder, change, now)
         return change
 
     def _accept(self, update: Grants | RcmState, change: HoldChange, now: Ns) -> bool:

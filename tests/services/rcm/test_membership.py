@@ -12,7 +12,9 @@ from msgspec.structs import replace
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, FakeRc
-from zscout.messages import Holder, OpenRequest, RcState
+from zscout.lab.faults.memory import Disturbance
+from zscout.mesh import IncomingQuery
+from zscout.messages import Holder, OpenRequest, RcAsk, RcState
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined, Requested
 from zscout.scheduling.strategies import STRATEGIES
@@ -320,5 +322,30 @@ def test_a_client_whose_whole_host_dies_is_dropped_as_soon_as_another_host_answe
         await until(lambda: any(grants.revoked for grants in fleet.published))
         assert fleet.watcher.now() - died < SECOND // 20
         rcm.stop()
+
+    run(story())
+
+
+class FakeEndingRc(FakeRc):
+    """Its hold ends just before it is asked for a promise."""
+
+    def _on_asked(self, query: IncomingQuery[RcAsk]) -> None:
+        if query.message.promise is not None:
+            self.holders = []
+        super()._on_asked(query)
+
+
+def test_an_answer_from_before_the_promise_is_none() -> None:
+    async def story() -> None:
+        fleet = FakeFleet("h1")
+        held = replace(HELD, rcs=["robot/a"])
+        rc = FakeEndingRc(fleet.mesh("devices"), "robot/a", term=HELD.grant.term, holders=[held])
+        rc.start()
+        fleet.network.disturb({"rc/state": Disturbance(old=1.0)})
+        fleet.candidate("h1")
+        await until(lambda: rc.term > HELD.grant.term, within=5)
+        await asyncio.sleep(2)
+        assert len(rc.asked) > 1
+        assert not [holder for grants in fleet.published for holder in grants.rcs.get("robot/a", [])]
 
     run(story())

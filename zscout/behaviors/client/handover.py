@@ -103,9 +103,7 @@ class MovableClient:
                 while arc.id in self._store.expected:
                     await self._store.changed(arc)
         except TimeoutError:
-            log.warning(
-                "%s was handed over and nothing heard of it for %g s; it is asked for", name, EXPECT_TIMEOUT
-            )
+            log.warning("%s was handed over and nothing heard of it for %g s; it is asked for", name, EXPECT_TIMEOUT)
             self._store.adopt(arc)
         finally:
             if arc.id in self._store.expected:

@@ -221,7 +221,8 @@ class Candidate:
         if self.known > term:
             self.election.rivalled(self.mesh.now())
             return False
-        answers = self._credible(rcs, lambda state: keys.rc_state(state.rc))
+        # One of a lower term is from before the promise.
+        answers = [one for one in self._credible(rcs, lambda state: keys.rc_state(state.rc)) if one[0].term >= term]
         refused = (reply.problem.term for reply in rcs if reply.problem is not None)
         if not answers and any(other is not None and disbelieved(term, other) for other in refused):
             log.info("no RC believes term %d while they hear an RCM of another: waiting", term.counter)
