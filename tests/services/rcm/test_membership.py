@@ -120,6 +120,26 @@ def test_a_client_whose_rcs_come_back_one_after_the_other_has_a_lease_from_the_l
     run(story())
 
 
+def test_what_somebody_asked_for_long_ago_is_waited_for_whoever_believes_to_hold_it_now() -> None:
+    """As on a host that was cut off and led alone: its own client asked first, and nobody else was there."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm(5)
+        later = replace(
+            HELD, id="later", arc="later", client="desk/two", grant=HELD.grant._replace(seq=5), rcs=["robot/c"]
+        )
+        one, two = fleet.client("one"), fleet.client("two")
+        first = asyncio.create_task(one.ask("tally", "robot/c", grant=HELD.grant, rcs=["robot/c"]))
+        await asyncio.sleep(0.8)
+        asking = asyncio.create_task(two.ask("later", "robot/c", grant=later.grant, rcs=["robot/c"]))
+        assert (await first).state == "queued"
+        fleet.rc("robot/c", term=HELD.grant.term, holders=[later])
+        assert (await asking).grant == later.grant
+
+    run(story())
+
+
 def test_what_its_client_gave_up_with_another_leader_ends_once_the_client_is_heard() -> None:
     """That one's last word did not reach the RCs."""
 

@@ -74,8 +74,8 @@ class Membership:
         self._unseen: dict[ClientId, asyncio.TimerHandle] = {}
         self._absence = Absence(mesh, fleet.mesh.lease, supervisor, self._is_present)
         self._rc_tokens: dict[RcName, dict[str, Token]] = {}
-        self._awaited: dict[RcName, Ns] = {}
-        """RCs that clients hold, and no token of which was ever seen: since when that is known."""
+        self._awaited: dict[ArcId, Ns] = {}
+        """What clients hold of RCs of which no token was ever seen: since when that is known."""
         self._blinked: set[str] = set()
         """Instances of RCs that count as there, and whose tokens went as this leader was away."""
         self._rc_seen: dict[RcName, Ns] = {}
@@ -282,20 +282,27 @@ class Membership:
 
     # RCs
 
-    def awaits(self, rcs: Iterable[RcName]) -> bool:
-        """Whether it may soon be known what one of `rcs` holds: it is pending; or it has not answered, and its token
-        was seen for less than a lease, or this reign has never seen one and was asked for it less than a lease ago:
-        links come back one after the other."""
+    def awaits(self, arc: ArcId, rcs: Iterable[RcName]) -> bool:
+        """Whether it may soon be known whether `arc` holds one of `rcs`: that is pending; or it has not answered, and
+        its token was seen for less than a lease, or this reign has never seen one and was asked for `arc` less than a
+        lease ago: links come back one after the other."""
         now, lease = self.mesh.now(), round(self._lease * SECOND)
         for rc in rcs:
             if rc in self._pending:
                 return True
-            if rc not in self._joined and rc not in self._named and len(self._awaited) < MAX_SOUGHT:
-                self._awaited.setdefault(rc, now)
-            since = self._rc_seen.get(rc, self._awaited.get(rc))
+            since = self._rc_seen.get(rc)
+            if since is None and rc not in self._named:
+                since = self._asked_since(arc, now, lease)
             if rc not in self._joined and since is not None and now - since < lease:
                 return True
         return False
+
+    def _asked_since(self, arc: ArcId, now: Ns, lease: Ns) -> Ns | None:
+        if arc not in self._awaited and len(self._awaited) >= MAX_SOUGHT:
+            self._awaited = {one: since for one, since in self._awaited.items() if now - since < lease}
+        if len(self._awaited) < MAX_SOUGHT:
+            self._awaited.setdefault(arc, now)
+        return self._awaited.get(arc)
 
     def _on_rc_token(self, token: Token, alive: bool) -> None:
         tokens = self._rc_tokens.setdefault(token.name, {})

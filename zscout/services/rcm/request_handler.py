@@ -122,7 +122,7 @@ class RequestHandler:
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
         arc = arc_id(str(sender), ask.id)
         self._keep_order(arc)
-        if self._may_hold(arc, ask) and self._membership.awaits(ask.rcs) and len(self._deferred) < MAX_BATCH:
+        if self._may_hold(arc, ask) and self._membership.awaits(arc, ask.rcs) and len(self._deferred) < MAX_BATCH:
             self._deferred[query] = None
             self._supervisor.call_later(self._lease, self._resume)
         elif arc in self.waiting:
