@@ -50,6 +50,8 @@ class Reconciler:
             record.token = True
             if record.migration is None and record.state != "stopping":
                 self.lifecycle.runs(record)
+        elif host in state.alive:
+            self._given_twice(record, host, token=True)
 
     def vanished(self, token: TokenVanished) -> None:
         """How it ended, its host reports; a token may also be gone for a while with the network."""
@@ -69,6 +71,30 @@ class Reconciler:
                 self.lifecycle.timer(record)
         elif move is not None and incarnation == move.incarnation:
             move.token, move.target = False, "unknown"
+
+    def _given_twice(self, record: ComponentRecord, host: HostName, *, token: bool) -> None:
+        """Two placers that did not see each other gave one number twice. Of two that live the one on the greater host
+        goes on, as they decide themselves where they see each other."""
+        state, other = self.state, record.host
+        if other is None or other == host:
+            return
+        lives = record.token or record.confirmed
+        if record.state == "stopping" or (lives and host < other):
+            state.stop(record.component, record.incarnation, host)
+            return
+        if lives:
+            state.stop(record.component, record.incarnation, other)
+        self._is_at(record, record.incarnation, host, token=token)
+        record.confirmed = not token
+
+    def _is_at(self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool) -> None:
+        """This is the incarnation that counts, and it runs there."""
+        self.migrations.cancel(record)
+        self.state.component_left(record)
+        record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
+        record.superseded = False
+        record.host_reason = f"found running on {host}"
+        self.lifecycle.runs(record, anew=True)
 
     def _must_not_live(self, record: ComponentRecord) -> bool:
         """Its incarnation ended, or is being stopped and its host was believed gone."""
@@ -93,12 +119,7 @@ class Reconciler:
             return
         if record.host is not None:
             self.surplus.add(record.component, record.incarnation, record.host, record.start_until, token=record.token)
-        self.migrations.cancel(record)
-        self.state.component_left(record)
-        record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
-        record.superseded = False
-        record.host_reason = f"found running on {host}"
-        self.lifecycle.runs(record, anew=True)
+        self._is_at(record, incarnation, host, token=token)
 
     # Hosts' lists
 
@@ -174,6 +195,8 @@ class Reconciler:
             elif record.state in ("waiting", "backing_off"):
                 record.enter("starting")
                 self.state.start(record)
+        elif listed.phase in RUNNING and host in self.state.alive:
+            self._given_twice(record, host, token=False)
 
     def _listed_as_ended(self, record: ComponentRecord, host: HostName, listed: ComponentView) -> None:
         move, incarnation = record.migration, listed.incarnation

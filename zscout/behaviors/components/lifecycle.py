@@ -263,7 +263,7 @@ class ComponentLifecycle:
         if self._move is not None and incarnation == self._move.incarnation:
             self._move.successor_runs.set()
         # Two placers that did not see each other may have given the same number.
-        elif (incarnation, token.instance) > (self._job.start.incarnation, self._instance):
+        elif (incarnation, token.host, token.instance) > (self._job.start.incarnation, self._job.host, self._instance):
             ends = EndReport("superseded", f"incarnation {incarnation} runs on {token.host}")
             self._away = self._away or ends
             self.end(ends)
