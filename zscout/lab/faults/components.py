@@ -48,9 +48,6 @@ class Processes(Protocol):
     def end_process(self, name: str) -> None:
         """Nothing of it runs any more."""
 
-    def watch(self, name: str, client: Client) -> None:
-        """What the client of a process is told is held against the promises."""
-
 
 @dataclass(slots=True)
 class Deeds:
@@ -162,9 +159,7 @@ class SimulatedComponent(ComponentProcess):
             return told
 
         async def connect(name: str, *, fleet: Fleet, host: str) -> Client:
-            client = Client(mesh, fleet).start()
-            self.processes.watch(self._name, client)
-            return client
+            return Client(mesh, fleet).start()
 
         async def live(life: ComponentLifecycle) -> None:
             ends = await life.run()

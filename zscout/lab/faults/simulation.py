@@ -370,24 +370,20 @@ class Simulation:
     async def _client(self, name: str, mesh: MemoryMesh) -> None:
         client = self.programs[name] = Client(mesh, self.fleet).start()
         busy = self.busy[name] = set()
-        self.watch(name, client)
-        await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
-
-    # Faults
-
-    def watch(self, name: str, client: Client) -> None:
-        """Whatever this client is told is held against the promises."""
         began: dict[str, tuple[Grant | None, float]] = {}
         """By ARC: its last grant, and since when it was known here."""
 
-        def told(arc: OpenArc) -> None:
+        def watch(arc: OpenArc) -> None:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
             grant, since = began.get(arc.id, (None, 0.0))
             self.promises.told(name, arc, client.term, touched=self._touched(since, name, *arc.rcs, *arc.needs))
             if arc.grant is not None and arc.grant != grant:
                 began[arc.id] = arc.grant, self.loop.now - START
 
-        client.watch(told)
+        client.watch(watch)
+        await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
+
+    # Faults
 
     def _touched(self, since: float, *whom: str) -> bool:
         """Whether a fault may be felt by these processes and RCs: one of now, or one that was over lately. What began
