@@ -48,6 +48,9 @@ class Processes(Protocol):
     def end_process(self, name: str) -> None:
         """Nothing of it runs any more."""
 
+    def watch(self, name: str, client: Client) -> None:
+        """What the client of a process is told is held against the promises."""
+
 
 @dataclass(slots=True)
 class Deeds:
@@ -159,7 +162,9 @@ class SimulatedComponent(ComponentProcess):
             return told
 
         async def connect(name: str, *, fleet: Fleet, host: str) -> Client:
-            return Client(mesh, fleet).start()
+            client = Client(mesh, fleet).start()
+            self.processes.watch(self._name, client)
+            return client
 
         async def live(life: ComponentLifecycle) -> None:
             ends = await life.run()

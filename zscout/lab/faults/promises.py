@@ -73,6 +73,10 @@ class Promises:
         """By grant: the RCs that have held it."""
         self._taken: set[str] = set()
         """Grants that an RCM has ended, and not for a loss."""
+        self._released: set[str] = set()
+        """Those of them that it took for given back."""
+        self._handed: dict[str, tuple[str, list[str]]] = {}
+        """By ARC: what its old client held as it was handed over, until the new one is told how it stands."""
         self._dropped: dict[str, float] = {}
         """ARCs whose clients were taken for gone, and when."""
         self._places: dict[tuple[str, str], Place] = {}
@@ -93,6 +97,7 @@ class Promises:
         if what["do"] == "publish":
             ended = self._ended_by.setdefault(str(what["term"]), set())
             self._taken |= {str(grant) for grant, outcome in what["ends"] if outcome not in LOSSES}
+            self._released |= {str(grant) for grant, outcome in what["ends"] if outcome == "released"}
             for rc, holders in what["rcs"].items():
                 for grant, arc, *_ in holders:
                     answer = self._answers.get((what["instances"].get(rc), str(what["term"])))
@@ -151,6 +156,7 @@ class Promises:
         if arc.grant is not None:
             granted = _written(arc.grant)
             self._granted[full] = granted, arc.rcs
+        self._follow_hand_over(name, arc, held, touched=touched)
         lost = (arc.outcome in LOSSES or granted not in ("", held[0])) and self._stood(*held)
         if (lost or arc.outcome == "client_lost") and arc.unconfirmed is None and not touched:
             how = f"was granted anew {granted}" if granted else arc.outcome
@@ -163,6 +169,16 @@ class Promises:
             self._dropped[full] = self._now()
         if arc.outcome == "client_lost" and not arc.open:
             self._broken(f"{name} lives, and was dropped")
+
+    def _follow_hand_over(self, name: str, arc: OpenArc, held: tuple[str, list[str]], *, touched: bool) -> None:
+        """What the old client held as it let go, the new one holds, unless it was taken by an RCM that knew of it."""
+        if arc.state == "moved" and held[0] and not touched:
+            self._handed[arc.id] = held
+        elif arc.id in self._handed and arc.state in ("queued", "running"):
+            grant, rcs = self._handed.pop(arc.id)
+            lost = grant in self._released or self._stood(grant, rcs)
+            if arc.state == "queued" and lost and not touched:
+                self._broken(f"{name} {arc.name} was held as it was handed over, and is not: {arc.reason}")
 
     def _stood(self, grant: str, rcs: Sequence[str]) -> bool:
         """Whether this was a hold that went on: all of its RCs had it, and no RCM ended it but for a loss."""

@@ -370,20 +370,24 @@ class Simulation:
     async def _client(self, name: str, mesh: MemoryMesh) -> None:
         client = self.programs[name] = Client(mesh, self.fleet).start()
         busy = self.busy[name] = set()
+        self.watch(name, client)
+        await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
+
+    # Faults
+
+    def watch(self, name: str, client: Client) -> None:
+        """Whatever this client is told is held against the promises."""
         began: dict[str, tuple[Grant | None, float]] = {}
         """By ARC: its last grant, and since when it was known here."""
 
-        def watch(arc: OpenArc) -> None:
+        def told(arc: OpenArc) -> None:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
             grant, since = began.get(arc.id, (None, 0.0))
             self.promises.told(name, arc, client.term, touched=self._touched(since, name, *arc.rcs, *arc.needs))
             if arc.grant is not None and arc.grant != grant:
                 began[arc.id] = arc.grant, self.loop.now - START
 
-        client.watch(watch)
-        await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
-
-    # Faults
+        client.watch(told)
 
     def _touched(self, since: float, *whom: str) -> bool:
         """Whether a fault may be felt by these processes and RCs: one of now, or one that was over lately. What began
@@ -397,16 +401,16 @@ class Simulation:
             if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
         failing = {one for fault in faults if fault.kind in ("freeze", "stall", "kill") for one in fault.whom}
-        able = {host for host in self.candidates_at if f"{host}/node" not in failing}
-        return any(self._touches(fault, names, hosts, since, able) for fault in faults)
+        sound = {host for host in self.hosts if f"{host}/node" not in failing}
+        return any(self._touches(fault, names, hosts, since, sound) for fault in faults)
 
     def _led_since(self, at: float) -> set[str]:
         """Hosts whose leaders lead, and did then."""
         led = ((host, one.rcm.term) for host, one in self.candidates.items() if one.rcm is not None)
         return {host for host, term in led if self.promises.terms.get(term, self.loop.now) < at + START}
 
-    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float, able: set[str]) -> bool:
-        """`able`: hosts whose candidates are touched by no fault of their own."""
+    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float, sound: set[str]) -> bool:
+        """`sound`: hosts whose nodes are touched by no fault of their own."""
         # Of a leader's links the first was lost as the others came back: nobody can tell that from a host that goes.
         lasts, timing = self.loop.now - START - fault.at, self.fleet.timing
         just_over = 0 <= lasts - fault.lasts < 2 * AT_ONCE
@@ -421,11 +425,11 @@ class Simulation:
             case "isolate" | "part":
                 side = hosts & {*fault.whom}
                 there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
-                parted = bool(side and hosts - side) or not there & able
+                parted = bool(side and hosts - side) or not there & sound & {*self.candidates_at}
                 # A leader on the other side that goes on has given to others what it did not see for a lease.
                 left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and self._led_since(fault.at) - there
                 # A candidate that is left alone waits for as long as a hold lasts: it may be cut off itself.
-                alone = len(there) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
+                alone = len(there & sound) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
                 return just_over or parted or bool(left) or alone or since > fault.at
             case _:
                 return True
