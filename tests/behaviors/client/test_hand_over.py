@@ -8,9 +8,30 @@ import pytest
 
 from tests.behaviors.client.small_fleet import ECHO, RC, small_fleet
 from tests.mesh.kit import run, until
-from zscout.behaviors.client.client import RequestRefused
+from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.lab.faults.memory import Disturbance
 from zscout.messages import Grants
+from zscout.types import Grant, Place
+
+
+async def runs_and_waits(old: Client) -> tuple[Grant, list[tuple[str, Place | None]]]:
+    """Two ARCs for RC: the grant of the one that runs, and the ids and places of both."""
+    runs = await old.request("runs", {RC: {}}, min_runtime=3600)
+    grant = await old.granted(runs)
+    assert grant is not None
+    waits = await old.request("waits", {RC: {}}, min_runtime=3600)
+    return grant, [(arc.id, arc.place) for arc in (runs, waits)]
+
+
+async def both_go_on(new: Client, grant: Grant, places: list[tuple[str, Place | None]]) -> None:
+    """Under their ids, at their places; what ran was granted anew."""
+    runs, waits = [await new.request(name, {RC: {}}, min_runtime=3600) for name in ("runs", "waits")]
+    assert [(arc.id, arc.place) for arc in (runs, waits)] == places
+    granted = await new.granted(runs)
+    assert granted is not None
+    assert granted > grant
+    assert (await new.command(RC, granted, ECHO)).result == 7
+    assert waits.state == "queued"
 
 
 def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() -> None:
@@ -50,12 +71,9 @@ def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made_again
 
     async def test() -> None:
         async with small_fleet("old", "new") as (fleet, (old, new)):
-            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
-            grant = await old.granted(runs)
-            waits = await old.request("waits", {RC: {}}, min_runtime=3600)
+            grant, places = await runs_and_waits(old)
             next_leader = fleet.candidate("h1")
             await asyncio.sleep(2)
-            before = {arc.id: arc.place for arc in (runs, waits)}
             old.pause()
             new.expect(old.open_requests())
             leader = fleet.leader()
@@ -68,14 +86,7 @@ def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made_again
             fleet.network.kill(leader)
             await fleet.candidates.pop("h0").stop()
             await moving
-            after = [await new.request(name, {RC: {}}, min_runtime=3600) for name in ("runs", "waits")]
-            assert {arc.id: arc.place for arc in after} == before
-            granted = await new.granted(after[0])
-            assert granted is not None
-            assert grant is not None
-            assert granted > grant
-            assert (await new.command(RC, granted, ECHO)).result == 7
-            assert after[1].state == "queued"
+            await both_go_on(new, grant, places)
 
     run(test())
 
@@ -105,20 +116,12 @@ def test_what_the_new_client_does_not_hear_of_is_asked_for_as_what_it_was() -> N
 
     async def test() -> None:
         async with small_fleet("old", "new") as (fleet, (old, new)):
-            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
-            grant = await old.granted(runs)
-            waits = await old.request("waits", {RC: {}}, min_runtime=3600)
-            before = {arc.id: arc.place for arc in (runs, waits)}
+            grant, places = await runs_and_waits(old)
             old.pause()
             new.expect(old.open_requests())
             fleet.network.disturb({"notice": Disturbance(lost=1.0), "requests": Disturbance(lost=1.0)})
             await old.hand_over_all(new.mesh.me)
-            after = [await new.request(name, {RC: {}}, min_runtime=3600) for name in ("runs", "waits")]
-            assert {arc.id: arc.place for arc in after} == before
-            granted = await new.granted(after[0])
-            assert granted is not None
-            assert grant is not None
-            assert granted > grant
+            await both_go_on(new, grant, places)
             assert await fleet.holders() == ["runs"]
 
     run(test())

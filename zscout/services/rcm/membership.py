@@ -397,12 +397,12 @@ class Membership:
                     self.see(reply.problem.term, obeyed_by=token.name)
                     if not (self._joined or self._pending) and disbelieved(self.term, reply.problem.term):
                         self.on_disbelieved(token.name, reply.problem.term)
-                state = reply.message
-                # One of a lower term is from before the promise.
-                current = state is not None and state.instance == token.instance and state.term >= self.term
-                if state is not None and current and self._is_wanted(token):
-                    self._answered(state)
-                    return
+                match reply.message:
+                    # One of a lower term is from before the promise.
+                    case RcState(instance=token.instance, term=term) as state if term >= self.term:
+                        if self._is_wanted(token):
+                            self._answered(state)
+                            return
             # No answer can come at once, and again and again: a token may outlive its RC.
             await asyncio.sleep(self._timeout)
 
