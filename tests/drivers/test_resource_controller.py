@@ -15,7 +15,8 @@ from tests.mesh.kit import run, until
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.resource_controller import EARLY_PER_HOST, SAY_AGAIN, CommandQuery, ResourceController, WorkQueue
 from zscout.keyexpr import Role, Sender
-from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryNetwork
+from zscout.lab.faults.link import Disturbance
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import Mesh
 from zscout.messages import Grants, RcAsk, RcmState, RcState
 from zscout.types import SECOND, Grant

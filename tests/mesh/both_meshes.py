@@ -110,7 +110,7 @@ class Memory(World):
         while not condition():
             assert loop.time() < end
             loop.jump(0.001)
-            for link in self.network._links.values():
+            for link in self.network.links.values():
                 link.pump()
 
 

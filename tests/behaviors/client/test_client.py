@@ -14,7 +14,8 @@ from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.components.component import ComponentContext, SafePointGate
 from zscout.behaviors.components.shipped import Counter
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import Disturbance, MemoryMesh
+from zscout.lab.faults.link import Disturbance
+from zscout.lab.faults.memory import MemoryMesh
 from zscout.lab.faults.virtual_time import START
 from zscout.mesh import ZenohMesh
 from zscout.types import SECOND

@@ -9,7 +9,7 @@ import pytest
 from tests.behaviors.client.small_fleet import ECHO, RC, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.client import Client, RequestRefused
-from zscout.lab.faults.memory import Disturbance
+from zscout.lab.faults.link import Disturbance
 from zscout.messages import Grants
 from zscout.types import Grant, Place
 

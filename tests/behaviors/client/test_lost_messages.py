@@ -10,7 +10,8 @@ import pytest
 from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.client import CONFIRM_TIMEOUT, CommandRefused
-from zscout.lab.faults.memory import Disturbance, MemoryMesh, MemoryTransport
+from zscout.lab.faults.link import Disturbance
+from zscout.lab.faults.memory import MemoryMesh, MemoryTransport
 from zscout.scheduling.model import HOLD_BACK
 from zscout.types import SECOND
 

@@ -232,6 +232,20 @@ def test_one_may_be_killed_as_it_sends() -> None:
     play(story, MemoryNetwork)
 
 
+def test_what_arrives_of_one_that_has_gone_leaves_no_link_with_it() -> None:
+    async def story(pair: Pair) -> None:
+        pair.network.link(pair.b, pair.a).delay = 0.5
+        other = pair.network.open("test", Sender("c", "test"))
+        before = len(pair.network.links)
+        pair.b.put(NEWS, Ping(1))
+        await pair.b.close()
+        await other.close()
+        await until(lambda: pair.heard == [1])
+        assert (before, len(pair.network.links)) == (9, 1)
+
+    play(story, MemoryNetwork)
+
+
 def test_the_same_seed_makes_the_same_run() -> None:
     def trace() -> list[tuple[int, str, int]]:
         events: list[tuple[int, str, int]] = []

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, FakeRc
-from zscout.lab.faults.memory import Disturbance
+from zscout.lab.faults.link import Disturbance
 from zscout.mesh import IncomingQuery
 from zscout.messages import Holder, OpenRequest, RcAsk, RcState
 from zscout.scheduling.core import Core

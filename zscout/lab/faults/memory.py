@@ -1,11 +1,8 @@
 """A mesh in memory: many processes' places on one event loop, on a network that fails to order.
 
-What it does like Zenoh is what `tests/mesh/both_meshes.py` lets tests try on both. Links behave like TCP with a lease:
-what is sent arrives in order; over a link that is cut, or to or from a frozen process, it waits; after
-`lease` seconds of that both sides give the link up, and see each other's tokens die, until it works again.
-
-Messages of a kind may be disturbed besides: lost, late, repeated, or answered with an old answer; and a link that comes
-back may do so without some of what was declared (`Disturbance`, `MemoryNetwork.forgetful`)."""
+What it does like Zenoh is what `tests/mesh/both_meshes.py` lets tests try on both. Where a link is blocked for `lease`
+seconds both sides give it up, and see each other's tokens die, until it works again; it may come back without some of
+what was declared (`MemoryNetwork.forgetful`). What happens on the way is `link.py`'s."""
 
 from __future__ import annotations
 
@@ -15,15 +12,13 @@ import random
 import weakref
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextvars import Context
-from dataclasses import dataclass
 from functools import lru_cache
-from heapq import heappop, heappush
 from typing import Any, Final
 
 import zenoh
 
 from zscout.keyexpr import Keys, Sender
+from zscout.lab.faults.link import Disturbance, MemoryLink, Trace, kind_of
 from zscout.lab.faults.virtual_time import PROCESS, VirtualTimeLoop
 from zscout.mesh import Mesh, MeshError
 from zscout.mesh.renewal import RenewableTransport
@@ -34,22 +29,6 @@ from zscout.types import SECOND, Ns
 @lru_cache(1 << 16)
 def intersects(one: str, other: str) -> bool:
     return one == other or zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other))
-
-
-_NETWORK: Final = Context()
-"""Of the network's own timers: they belong to no process, and its clock is virtual time."""
-
-
-@dataclass(frozen=True, slots=True)
-class Disturbance:
-    """How likely a message is lost, comes twice, or comes up to `by` seconds later, overtaken by others; of an answer:
-    that it is the one before it on the same key."""
-
-    lost: float = 0.0
-    twice: float = 0.0
-    late: float = 0.0
-    by: float = 0.0
-    old: float = 0.0
 
 
 class MemoryMesh(Mesh):
@@ -83,11 +62,11 @@ class MemoryNetwork:
         self.delay, self.lease, self.impatience, self.relink = delay, lease, impatience, relink
         self.random = random.Random(seed)  # noqa: S311 - what failed once must fail again
         self.nodes: list[MemoryTransport] = []
-        self.trace: Callable[[str, str, str, tuple[Any, ...]], None] | None = None
-        """Told of each message that arrives: from which process to which, its kind, and what it is."""
+        self.trace: Trace | None = None
         self.forgetful = 0.0
         """How likely each declaration stays unknown to a peer whose link comes back, until it is lost again."""
-        self._links: dict[tuple[MemoryTransport, MemoryTransport], MemoryLink] = {}
+        self.links: dict[tuple[MemoryTransport, MemoryTransport], MemoryLink] = {}
+        """Of all that live, those with themselves included; a new one is made when it is first needed."""
         self._ids = itertools.count(1)
         self._is_cut: Callable[[str, str], bool] = lambda _one, _other: False
         self._disturbed: Mapping[str, Disturbance] = {}
@@ -117,14 +96,14 @@ class MemoryNetwork:
         """Of all links, those of sessions to come included, those are cut for which that is true of the names of both
         processes."""
         self._is_cut = is_cut
-        for link in self._links.values():
+        for link in self.links.values():
             link.cut = link.source is not link.target and is_cut(str(link.source), str(link.target))
         self._changed()
 
     def disturb(self, disturbed: Mapping[str, Disturbance]) -> None:
         """From now on, on all links but those of a session with itself."""
         self._disturbed = disturbed
-        for link in self._links.values():
+        for link in self.links.values():
             link.disturbed = {} if link.source is link.target else disturbed
             link.answers.clear()
 
@@ -140,7 +119,7 @@ class MemoryNetwork:
     def isolate(self, mesh: Mesh) -> None:
         """Cuts all links of `mesh`, in both directions."""
         node = _node(mesh)
-        for link in self._links.values():
+        for link in self.links.values():
             if node in (link.source, link.target) and link.source is not link.target:
                 link.cut = True
         self._changed()
@@ -148,7 +127,7 @@ class MemoryNetwork:
     def heal(self) -> None:
         """All links work again."""
         self._is_cut = lambda _one, _other: False
-        for link in self._links.values():
+        for link in self.links.values():
             link.cut = False
         self._changed()
 
@@ -173,7 +152,7 @@ class MemoryNetwork:
         self.thaw(mesh)
         _memory(mesh)._inbox.close()
         for node in self._sessions(mesh):
-            for link in self._links.values():
+            for link in self.links.values():
                 if link.source is node:
                     link.lose_the_last()
             node.leave()
@@ -184,19 +163,21 @@ class MemoryNetwork:
 
     def remove(self, node: MemoryTransport) -> None:
         # What is under way is kept by the timers of its links; over one that is blocked nothing comes any more.
-        for link in self._links.values():
+        for link in self.links.values():
             if link.source is node and link.blocked:
                 link.call_in(self.lease, link.target.call, link.target.disconnected, node)
         self.nodes.remove(node)
-        self._links = {ends: link for ends, link in self._links.items() if node not in ends}
+        self.links = {ends: link for ends, link in self.links.items() if node not in ends}
         self.match()
 
     def between(self, source: MemoryTransport, target: MemoryTransport) -> MemoryLink:
-        link = self._links.get((source, target))
+        link = self.links.get((source, target))
         if link is None:
-            link = self._links[source, target] = MemoryLink(self, source, target)
+            link = MemoryLink(source, target, self.delay, self.random, self.trace)
             if source is not target:
                 link.cut, link.disturbed = self._is_cut(str(source), str(target)), self._disturbed
+            if not (source.gone or target.gone):  # what arrives late may be of one that has gone
+                self.links[source, target] = link
         return link
 
     def match(self) -> None:
@@ -205,10 +186,13 @@ class MemoryNetwork:
             for publisher in node.followed:
                 publisher.update()
 
-    def _relink(self, link: MemoryLink, back: MemoryLink, forgetful: float) -> None:
+    def _relink(self, source: MemoryTransport, target: MemoryTransport, forgetful: float) -> None:
+        if source.gone or target.gone:
+            return
+        link, back = self.between(source, target), self.between(target, source)
         link.relinking = None
-        if link.lost and not (link.blocked or back.blocked or link.source.gone or link.target.gone):
-            self._connect(link.source, link.target, forgetful)
+        if link.lost and not (link.blocked or back.blocked):
+            self._connect(source, target, forgetful)
 
     def _connect(self, one: MemoryTransport, other: MemoryTransport, forgetful: float = 0.0) -> None:
         for source, target in dict.fromkeys([(one, other), (other, one)]):
@@ -221,10 +205,10 @@ class MemoryNetwork:
         self.match()
 
     def _changed(self) -> None:
-        for link in tuple(self._links.values()):
-            back = self.between(link.target, link.source)
-            if link is back:
+        for (source, target), link in tuple(self.links.items()):
+            if source is target:
                 continue
+            back = self.between(target, source)
             if link.blocked:
                 if link.expiry is None and not link.lost:
                     patience = self.lease * (1 - self.impatience * self.random.random())
@@ -236,9 +220,9 @@ class MemoryNetwork:
                 if link.lost and not back.blocked and not (link.relinking or back.relinking):
                     if self.relink:
                         late = self.relink * self.random.random()
-                        link.relinking = link.call_in(late, self._relink, link, back, self.forgetful)
+                        link.relinking = link.call_in(late, self._relink, source, target, self.forgetful)
                     else:
-                        self._connect(link.source, link.target, self.forgetful)
+                        self._connect(source, target, self.forgetful)
                 link.pump()
 
     def _expire(self, *links: MemoryLink) -> None:
@@ -253,108 +237,6 @@ class MemoryNetwork:
                 link.queue.clear()
                 link.target.call(link.target.disconnected, link.source)
         self.match()
-
-
-class MemoryLink:
-    """One direction between two processes: what is sent arrives in order, or, with probability `loss`, not at
-    all; after `delay` seconds and up to `jitter` more."""
-
-    def __init__(self, network: MemoryNetwork, source: MemoryTransport, target: MemoryTransport) -> None:
-        self.loop = source.loop
-        self.source, self.target = source, target
-        self.delay, self.jitter, self.loss = network.delay, 0.0, 0.0
-        self.cut = False
-        self.lost = False
-        """Whether it was blocked for longer than the lease: there is no link then."""
-        self.disturbed: Mapping[str, Disturbance] = {}
-        """By kind of message, see `kind_of`."""
-        self.hidden: set[object] = set()
-        """What the source has declared and the target does not know."""
-        self.answers: dict[str, bytes] = {}
-        """The last answer on each key, while answers are disturbed."""
-        self.expiry: asyncio.TimerHandle | None = None
-        self.relinking: asyncio.TimerHandle | None = None
-        self.queue: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
-        self._last = 0.0
-        """When what was sent last is due: what comes in order comes no sooner."""
-        self._numbers = itertools.count()
-        self._random, self.trace = network.random, network.trace
-        self._timer: asyncio.TimerHandle | None = None
-
-    @property
-    def blocked(self) -> bool:
-        return self.cut or self.source.frozen or self.target.frozen
-
-    def call_in(self, seconds: float, call: Callable[..., None], *args: Any) -> asyncio.TimerHandle:
-        return self.loop.call_at(self.loop.now + seconds, call, *args, context=_NETWORK)
-
-    def chance(self, probability: float) -> bool:
-        return probability > 0 and self._random.random() < probability
-
-    def send(self, call: Callable[..., None], *args: Any, last: bool = False, late: float | None = None) -> None:
-        """`late`: so many seconds later than others, which may overtake it."""
-        if self.loop.is_closed():  # what is garbage then undeclares itself
-            return
-        if self.source is self.target:
-            call(*args)
-        elif last or not (self.lost or self.source.gone):
-            due = self.loop.now + self.delay + (self._random.random() * self.jitter if self.jitter else 0.0)
-            if late is None:
-                due = self._last = max(due, self._last)
-            else:
-                due += late
-            heappush(self.queue, (due, next(self._numbers), call, args))
-            self.pump()
-
-    def send_message(self, kind: str, call: Callable[..., None], *args: Any) -> bool:
-        """Like `send`, of what may be disturbed: whether it did not get lost."""
-        if (after := self.source.after) is not None and after[0] == kind and self.source is not self.target:
-            self.source.after = None
-            self.loop.call_soon(after[1], context=_NETWORK)
-        if self.chance(self.loss):
-            return False
-        fate = self.disturbed.get(kind)
-        if fate is None:
-            self.send(call, *args)
-            return True
-        if self.chance(fate.lost):
-            return False
-        for _ in range(2 if self.chance(fate.twice) else 1):
-            self.send(call, *args, late=self._random.random() * fate.by if self.chance(fate.late) else None)
-        return True
-
-    def lose_the_last(self) -> None:
-        """Of what is under way, some did not leave the source. That it is gone was not said by itself."""
-        if self.queue:
-            queue, sent = sorted(self.queue), self._random.randint(0, len(self.queue))
-            self.queue = queue[:sent] + [one for one in queue[sent:] if one[2] == self.target.disconnected]
-
-    def pump(self) -> None:
-        """Delivers what is due, and calls itself when more is."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        while self.queue and not self.blocked:
-            due = self.queue[0][0]
-            if due > self.loop.now:
-                self._timer = self.call_in(due - self.loop.now, self.pump)
-                return
-            _, _, call, args = heappop(self.queue)
-            if not self.target.gone:
-                if self.trace is not None:
-                    self.trace(str(self.source), str(self.target), call.__name__, args)
-                self.target.call(call, *args)
-
-
-@lru_cache(1 << 14)
-def kind_of(key: str) -> str:
-    """The kind of a message on `key`: `grants`, `schedule`, `vote`, `command`, `rc/state` and so on."""
-    parts = key.split("/")[2:]
-    if not parts:
-        return key
-    at = {"rc": 3, "host": 2, "client": 3}.get(parts[0], 1)
-    name = parts[at] if len(parts) > at else parts[-1]
-    return f"{parts[0]}/{name}" if name == "state" else name
 
 
 class MemoryTransport(Transport):

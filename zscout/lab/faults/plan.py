@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
-from zscout.lab.faults.memory import Disturbance
+from zscout.lab.faults.link import Disturbance
 from zscout.messages import MAX_COUNTER
 
 FaultKind: TypeAlias = Literal[
