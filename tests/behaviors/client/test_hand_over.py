@@ -91,6 +91,32 @@ def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made_again
     run(test())
 
 
+def test_what_a_new_leader_does_not_know_to_be_held_yet_is_handed_over_as_what_it_is() -> None:
+    """Its client has answered that leader, and its RC, not in time, has not."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            grant, places = await runs_and_waits(old)
+            next_leader = fleet.candidate("h1")
+            await asyncio.sleep(2)
+            old.pause()
+            new.expect(old.open_requests())
+            answers = fleet.network.link(fleet.devices, next_leader.mesh)
+            usual, answers.delay = answers.delay, 0.3
+            fleet.network.kill(fleet.leader())
+            await fleet.candidates.pop("h0").stop()
+            await until(lambda: old.leader == "h1")
+            answers.delay = usual
+            states: dict[str, list[str]] = {"runs": [], "waits": []}
+            new.watch(lambda arc: states[arc.name].append(arc.state))
+            await old.hand_over_all(new.mesh.me)
+            await both_go_on(new, grant, places)
+            assert {name: {*told} for name, told in states.items()} == {"runs": {"running"}, "waits": {"queued"}}
+            assert await fleet.holders() == ["runs"]
+
+    run(test())
+
+
 def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_same() -> None:
     """For the hold lease: that ends the hold, and its ARC is asked for again, by whoever has it."""
 

@@ -117,6 +117,7 @@ class Rcm:
             self.membership.expect(request.client)
             if request.client not in recovered.answered:
                 self._recover(request)
+        self.requests.believed = recovered.believed
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*joined, lead], named=recovered.rcs)

@@ -35,6 +35,8 @@ class RecoveredState:
     """Of that, what its client does not ask for any more."""
     holds: list[RecoveredHold] = field(default_factory=list)
     waiting: list[Requested] = field(default_factory=list)
+    believed: dict[ArcId, list[RcName]] = field(default_factory=dict)
+    """Of what waits: the RCs that its client believes to hold. They may not have answered yet."""
     answered: set[ClientId] = field(default_factory=set)
     """The clients that have said what they ask for."""
 
@@ -105,6 +107,8 @@ def recover(states: Iterable[RcState], clients: Collection[ClientRequests], now:
                 wanted = _request(arc, client, request.needs, request)
                 since = now - round(request.waited * SECOND)
                 result.waiting.append(Requested(wanted, request.place, since))
+                if request.grant is not None:
+                    result.believed[arc] = request.rcs
         except (BadName, ValueError) as error:
             log.warning("the request %s is not carried on: %s", arc, error)
     # A client that handed over a hold, and missed the answer, lists it as well: what the RCs hold counts.

@@ -5,7 +5,7 @@ their order."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import TypeAlias
 
@@ -46,7 +46,7 @@ from zscout.scheduling.model import (
 )
 from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.registry import RequestRegistry, arc_id, request_id
-from zscout.types import SECOND, ArcId, ClientId, Place
+from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
 Query: TypeAlias = IncomingQuery[Operation]
 
@@ -83,7 +83,9 @@ class RequestHandler:
         self._batch: dict[ArcId, Requested | Cancelled | Released] = {}
         """Operations of the present burst that are not decided yet."""
         self._deferred: dict[Query, None] = {}
-        """Asked by clients that believe to hold, while their RCs have not said so."""
+        """Asked by clients that believe to hold, or handed over by them, while their RCs have not said so."""
+        self.believed: Mapping[ArcId, Collection[RcName]] = {}
+        """Of what waited as the lead was taken: the RCs that its client believed to hold."""
         self._lease = fleet.mesh.lease
         membership.on_settled = self._resume
         self._moving: dict[Query, None] = {}
@@ -123,8 +125,7 @@ class RequestHandler:
         arc = arc_id(str(sender), ask.id)
         self._keep_order(arc)
         if self._may_hold(arc, ask) and self._membership.awaits(arc, ask.rcs) and len(self._deferred) < MAX_BATCH:
-            self._deferred[query] = None
-            self._supervisor.call_later(self._lease, self._resume)
+            self._defer(query)
         elif arc in self.waiting:
             self.waiting[arc].append(query)
         elif self.core.arc(arc) is not None:
@@ -160,11 +161,19 @@ class RequestHandler:
         unknown = ask.grant is not None and ask.grant.term < self.core.term and not ask.unconfirmed
         return unknown and (known is None or known.hold is None) and not self._registry.ended(arc)
 
+    def _may_be_held(self, arc: ArcId) -> bool:
+        known = self.core.arc(arc)
+        return known is not None and known.hold is None and self._membership.awaits(arc, self.believed.get(arc, ()))
+
     def _standing(self, arc: ArcId, ask: Ask) -> Notice:
         """How an open ARC stands, for a client that may not have heard how its last hold ended."""
         if ask.grant is not None and not ask.unconfirmed and self.core.is_queued(arc):
             return self._registry.interrupted(arc, ask.grant)
         return self._registry.notice(arc)
+
+    def _defer(self, query: Query) -> None:
+        self._deferred[query] = None
+        self._supervisor.call_later(self._lease, self._resume)
 
     def _resume(self) -> None:
         """Looks again at what was asked by clients that believe to hold."""
@@ -271,6 +280,10 @@ class RequestHandler:
         to = str(client_of(operation.to))
         for other in operation.others:
             check_name(other, "id")
+        arcs = [arc_id(sender, one) for one in (operation.id, *operation.others)]
+        if any(self._may_be_held(arc) for arc in arcs) and len(self._deferred) < MAX_BATCH:
+            self._defer(query)
+            return
         self.flush()
         if sender == to or self.core.arc(arc_id(sender, operation.id)) is None:
             self._answer_handed_over(query, operation, sender, to)
