@@ -222,7 +222,7 @@ def test_of_what_one_that_is_killed_sent_last_a_beginning_arrives() -> None:
 
 def test_one_may_be_killed_as_it_sends() -> None:
     async def story(pair: Pair) -> None:
-        pair.network.after_sending(pair.b, ASK, lambda: pair.network.kill(pair.b))
+        pair.network.after_sending(pair.b, ASK, lambda _: pair.network.kill(pair.b))
         pair.b.put(NEWS, Ping(1))
         await asyncio.sleep(1)
         assert (pair.heard, pair.lives) == ([1], [True])

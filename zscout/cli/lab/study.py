@@ -252,7 +252,8 @@ def faults(seeds: range, runs: int | None, guard: str | None, processes: int | N
     """Runs a whole fleet under faults in virtual time, and checks every promise (docs/promises.md).
 
     Candidates, RCs and clients as they are, on a mesh in memory: messages of each kind lost, late, twice;
-    partitions, freezes, crashes, clocks that run apart. Every tenth run is one of 5 minutes with 20 programs.
+    partitions, freezes, crashes, clocks that run apart. Every tenth run is one of 5 minutes with 20 programs,
+    and in every tenth nothing fails but nodes, in the steps of a component's move.
     One seed is one run, to the byte. Where a promise breaks, `--seed A` leaves out faults until no more can
     be left out, and prints what happened. Exit code 1: a promise was not kept.
 

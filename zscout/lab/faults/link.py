@@ -15,6 +15,8 @@ from functools import lru_cache
 from heapq import heappop, heappush
 from typing import Any, Final, Protocol, TypeAlias
 
+import msgspec
+
 from zscout.lab.faults.virtual_time import VirtualTimeLoop
 
 Trace: TypeAlias = Callable[[str, str, str, tuple[Any, ...]], None]
@@ -41,8 +43,9 @@ class End(Protocol):
     loop: VirtualTimeLoop
     frozen: bool
     gone: bool
-    after: tuple[str, Callable[[], None]] | None
-    """A kind of message, and what is called once one of it was sent."""
+    after: tuple[str, Callable[[Any], None]] | None
+    """A kind of message or an operation, and what is called once one of it, or an answer to it, was sent: with the
+    session to which."""
 
     def call(self, f: Callable[..., None], *args: Any) -> None:
         """Calls `f` as code of its process."""
@@ -102,11 +105,12 @@ class MemoryLink:
             heappush(self.queue, (due, next(self._numbers), call, args))
             self.pump()
 
-    def send_message(self, kind: str, call: Callable[..., None], *args: Any) -> bool:
+    def send_message(self, kind: str, call: Callable[..., None], *args: Any, operation: str = "") -> bool:
         """Like `send`, of what may be disturbed: whether it did not get lost."""
-        if (after := self.source.after) is not None and after[0] == kind and self.source is not self.target:
+        after = self.source.after
+        if after is not None and after[0] in (kind, operation) and self.source is not self.target:
             self.source.after = None
-            self.loop.call_soon(after[1], context=_NETWORK)
+            self.loop.call_soon(after[1], self.target, context=_NETWORK)
         if self.chance(self.loss):
             return False
         fate = self.disturbed.get(kind)
@@ -119,10 +123,11 @@ class MemoryLink:
             self.send(call, *args, late=self._random.random() * fate.by if self.chance(fate.late) else None)
         return True
 
-    def lose_the_last(self) -> None:
-        """Of what is under way, some did not leave the source. That it is gone was not said by itself."""
+    def lose_the_last(self, sent: int | None = None) -> None:
+        """Of what is under way, `sent` have left the source, or some. That it is gone was not said by itself."""
         if self.queue:
-            queue, sent = sorted(self.queue), self._random.randint(0, len(self.queue))
+            queue = sorted(self.queue)
+            sent = self._random.randint(0, len(queue)) if sent is None else sent
             self.queue = queue[:sent] + [one for one in queue[sent:] if one[2] == self.target.disconnected]
 
     def pump(self) -> None:
@@ -151,3 +156,18 @@ def kind_of(key: str) -> str:
     at = {"rc": 3, "host": 2, "client": 3}.get(parts[0], 1)
     name = parts[at] if len(parts) > at else parts[-1]
     return f"{parts[0]}/{name}" if name == "state" else name
+
+
+class _Operation(msgspec.Struct):
+    op: str = ""
+
+
+_decoder: Final = msgspec.json.Decoder(_Operation)
+
+
+def operation_of(payload: bytes | None) -> str:
+    """The operation that a query asks for, `hand_over` or the like; "" if there is none in it."""
+    try:
+        return _decoder.decode(payload or b"{}").op
+    except msgspec.MsgspecError:
+        return ""

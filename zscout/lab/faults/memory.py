@@ -18,7 +18,7 @@ from typing import Any, Final
 import zenoh
 
 from zscout.keyexpr import Keys, Sender
-from zscout.lab.faults.link import Disturbance, MemoryLink, Trace, kind_of
+from zscout.lab.faults.link import Disturbance, MemoryLink, Trace, kind_of, operation_of
 from zscout.lab.faults.virtual_time import PROCESS, VirtualTimeLoop
 from zscout.mesh import Mesh, MeshError
 from zscout.mesh.renewal import RenewableTransport
@@ -146,19 +146,20 @@ class MemoryNetwork:
                 node.process.go_on()
         self._changed()
 
-    def kill(self, mesh: Mesh) -> None:
+    def kill(self, mesh: Mesh, reached: MemoryTransport | None = None) -> None:
         """As though its process was killed: of what is under way on each of its links some may not have left it, and
-        the rest arrives, then its tokens die."""
+        the rest arrives, then its tokens die. `reached`: all that is under way to that one arrives, and no more."""
         self.thaw(mesh)
         _memory(mesh)._inbox.close()
         for node in self._sessions(mesh):
             for link in self.links.values():
-                if link.source is node:
-                    link.lose_the_last()
+                if link.source is node and link.target is not reached:
+                    link.lose_the_last(None if reached is None else 0)
             node.leave()
 
-    def after_sending(self, mesh: Mesh, kind: str, then: Callable[[], None] | None) -> None:
-        """Calls `then` once, as soon as `mesh` has sent a message of that kind to another process."""
+    def after_sending(self, mesh: Mesh, kind: str, then: Callable[[MemoryTransport], None] | None) -> None:
+        """Calls `then` once, as soon as `mesh` has sent a message of that kind, an operation or its answer, to another
+        process: with that one's session."""
         _node(mesh).after = None if then is None else (kind, then)
 
     def remove(self, node: MemoryTransport) -> None:
@@ -248,7 +249,7 @@ class MemoryTransport(Transport):
         self.loop, self.process = loop, PROCESS.get()
         self.frozen = False
         self.gone = False
-        self.after: tuple[str, Callable[[], None]] | None = None
+        self.after: tuple[str, Callable[[MemoryTransport], None]] | None = None
         self.declared: list[str] = []
         self.followed: list[MemoryPublisher] = []
         self._queryables: list[tuple[str, Callable[[TransportQuery], None]]] = []
@@ -310,7 +311,7 @@ class MemoryTransport(Transport):
         get.waiting = {query.id: node for node, query, _ in queries}
         get.check()
         for node, query, on_query in queries:
-            if not self._to(node).send_message(kind_of(key), on_query, query):
+            if not self._to(node).send_message(kind_of(key), on_query, query, operation=query.operation):
                 query.lose()
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
@@ -489,6 +490,7 @@ class _Query(TransportQuery):
         self._get: _Get | None = get
         self._back, self._kind = node.network.between(node, get.node), kind_of(key)
         self._key, self._payload = key, payload
+        self.operation = operation_of(payload)
 
     @property
     def key(self) -> str:
@@ -510,7 +512,7 @@ class _Query(TransportQuery):
             if (fate := back.disturbed.get(self._kind)) is not None:
                 before, back.answers[key] = back.answers.get(key, payload), payload
                 payload = before if back.chance(fate.old) else payload
-            back.send_message(self._kind, self._get.reply, self.id, key, payload, ok)
+            back.send_message(self._kind, self._get.reply, self.id, key, payload, ok, operation=self.operation)
             self.drop()
 
     def lose(self) -> None:

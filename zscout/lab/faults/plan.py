@@ -42,6 +42,11 @@ RELINK = 1.0
 """Seconds after which links that were lost stand again, at most."""
 MESSAGES = ("grants", "rc/state", "rcm/state", "schedule", "notice", "requests", "command", "vote", "alive")
 """Kinds of messages that may be disturbed."""
+OPERATIONS = ("hand_over", "move", "restore", "activate")
+"""Steps of a component's move: the first node that asks for one of them, or answers, may be killed as it does, and
+nobody but the other hears what it has just said."""
+UNTIL_ASKED = 5
+"""How many times longer than others a kill waits for one of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +57,12 @@ class Fault:
     lasts: float
     kind: FaultKind
     whom: tuple[str, ...]
-    """Processes or hosts; of a partition one side of it; of a cut from whom and to whom; an RC, and a host."""
+    """Processes or hosts; of a partition one side of it; of a cut from whom and to whom; of a kill one or
+    the first of several to say something; an RC, and a host."""
     both: bool = True
     """Of a cut: in both directions. Of a double: it leaves in order. Of a kill: at once, not at the next `message`."""
     message: str = ""
+    """A kind of messages, or of a kill an operation."""
     how: Disturbance = field(default_factory=Disturbance)
     jump: int = 0
 
@@ -70,7 +77,7 @@ class Fault:
         what = {
             "freeze": "stands still",
             "stall": "does not come round to anything",
-            "kill": "is killed, and started again" if self.both else f"is killed as it sends: {self.message}",
+            "kill": "is killed, and started again" if self.both else f"killed, the first that sends: {self.message}",
             "cut": "cut from one another" if self.both else "the first can't reach the second",
             "isolate": "is cut off",
             "part": "are cut off from all others",
@@ -88,11 +95,12 @@ def draw(
 ) -> list[Fault]:
     """`count` faults within `span` seconds, most of them 0.5 to 1.5 s long: about a lease, the worst there is."""
     rng = random.Random(f"faults {seed}")  # noqa: S311 - what failed once must fail again
-    nodes = [name for name in processes if name.endswith("/node")]
+    # One of its own: a seed that has no such fault is what it was before there were any.
+    steps = random.Random(f"operations {seed}")  # noqa: S311
+    nodes = _nodes(processes)
     faults = []
     for _ in range(count):
-        at = 3.0 + rng.random() * (span - 3.0)
-        lasts = rng.uniform(*rng.choices(LASTING, SHARES)[0])
+        at, lasts = _when(rng, span)
         kind = rng.choices(tuple(KINDS), tuple(KINDS.values()))[0]
         whom: tuple[str, ...] = ()
         apart = lasts + LONGER * rng.random()
@@ -124,5 +132,30 @@ def draw(
                 by=rng.choice((0.05, 0.5, 2.0)),
                 old=rng.choice((0, 0, 0.2)),
             )
-        faults.append(Fault(at, lasts, kind, whom, rng.random() < 0.7, rng.choice(MESSAGES), how, rng.choice(JUMPS)))
+        both, message, jump = rng.random() < 0.7, rng.choice(MESSAGES), rng.choice(JUMPS)
+        if kind == "kill" and not both and steps.random() < 0.5:
+            faults.append(_at_a_step(steps, nodes, at, lasts))
+        else:
+            faults.append(Fault(at, lasts, kind, whom, both, message, how, jump))
     return sorted(faults, key=lambda fault: fault.at)
+
+
+def draw_moves(seed: int, processes: Sequence[str], *, count: int, span: float) -> list[Fault]:
+    """Nothing but nodes that are killed in the steps of a component's move."""
+    rng = random.Random(f"moves {seed}")  # noqa: S311
+    nodes = _nodes(processes)
+    return sorted((_at_a_step(rng, nodes, *_when(rng, span)) for _ in range(count)), key=lambda fault: fault.at)
+
+
+def _nodes(processes: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name for name in processes if name.endswith("/node"))
+
+
+def _when(rng: random.Random, span: float) -> tuple[float, float]:
+    """When it begins, and for how long it lasts."""
+    at = 3.0 + rng.random() * (span - 3.0)
+    return at, rng.uniform(*rng.choices(LASTING, SHARES)[0])
+
+
+def _at_a_step(rng: random.Random, nodes: tuple[str, ...], at: float, lasts: float) -> Fault:
+    return Fault(at, UNTIL_ASKED * lasts, "kill", nodes, both=False, message=rng.choice(OPERATIONS))

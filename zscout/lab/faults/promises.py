@@ -73,10 +73,15 @@ class Promises:
         """By grant: the RCs that have held it."""
         self._taken: set[str] = set()
         """Grants that an RCM has ended, and not for a loss."""
-        self._released: set[str] = set()
-        """Those of them that it took for given back."""
-        self._handed: dict[str, tuple[str, list[str]]] = {}
-        """By ARC: what its old client held as it was handed over, until the new one is told how it stands."""
+        self._taken_away: set[str] = set()
+        """Those of them that their clients were not to keep: neither given back nor handed over."""
+        self._interrupted: set[str] = set()
+        """Grants that have ended at an RC, and no other of the same ARC began there as they did."""
+        self._owner: dict[str, str] = {}
+        """By ARC: the client that was told last that it waits or runs."""
+        self._handed: dict[str, tuple[str, str]] = {}
+        """By ARC: its old client, and the grant that it had as it was handed over, until the new one is told how it
+        stands."""
         self._dropped: dict[str, float] = {}
         """ARCs whose clients were taken for gone, and when."""
         self._places: dict[tuple[str, str], Place] = {}
@@ -97,7 +102,8 @@ class Promises:
         if what["do"] == "publish":
             ended = self._ended_by.setdefault(str(what["term"]), set())
             self._taken |= {str(grant) for grant, outcome in what["ends"] if outcome not in LOSSES}
-            self._released |= {str(grant) for grant, outcome in what["ends"] if outcome == "released"}
+            kept = (*LOSSES, "released", "handed_over")
+            self._taken_away |= {str(grant) for grant, outcome in what["ends"] if outcome not in kept}
             for rc, holders in what["rcs"].items():
                 for grant, arc, *_ in holders:
                     answer = self._answers.get((what["instances"].get(rc), str(what["term"])))
@@ -122,9 +128,12 @@ class Promises:
             self._answers.setdefault((instance, str(what["promised"])), set()).update(map(str, what["holds"]))
             self._promised[instance] = max(what["promised"], promised)
         held, ended = {str(grant) for grant in what["holds"]}, self._ended.setdefault(instance, set())
-        for grant in held - self._held.get(instance, set()):
+        begins, ends = held - self._held.get(instance, set()), self._held.get(instance, set()) - held
+        for grant in begins:
             self._had.setdefault(grant, set()).add(rc)
-        ended |= self._held.get(instance, set()) - held
+        go_on = {self._request_of(grant) for grant in begins}
+        self._interrupted |= {grant for grant in ends if self._request_of(grant) not in go_on}
+        ended |= ends
         if again := held & ended:
             self._broken(f"{rc} holds {', '.join(sorted(again))} again")
         self._held[instance] = held
@@ -172,13 +181,21 @@ class Promises:
 
     def _follow_hand_over(self, name: str, arc: OpenArc, held: tuple[str, list[str]], *, touched: bool) -> None:
         """What the old client held as it let go, the new one holds, unless it was taken by an RCM that knew of it."""
-        if arc.state == "moved" and held[0] and not touched:
-            self._handed[arc.id] = held
-        elif arc.id in self._handed and arc.state in ("queued", "running"):
-            grant, rcs = self._handed.pop(arc.id)
-            lost = grant in self._released or self._stood(grant, rcs)
-            if arc.state == "queued" and lost and not touched:
+        grant, rcs = held
+        if arc.state == "moved":
+            had = rcs and self._had.get(grant, set()).issuperset(rcs)
+            if had and self._owner.get(arc.id) == name and not touched:
+                self._handed[arc.id] = name, grant
+        elif arc.state in ("queued", "running"):
+            self._owner[arc.id] = name
+            old, grant = self._handed.pop(arc.id, (name, ""))
+            lost = arc.state == "queued" or grant in self._interrupted
+            if lost and grant not in self._taken_away and name != old and not touched:
                 self._broken(f"{name} {arc.name} was held as it was handed over, and is not: {arc.reason}")
+
+    def _request_of(self, grant: str) -> str:
+        """The id that its client gave it, whoever that is."""
+        return self._arc_of.get(grant, grant).split("/")[-1]
 
     def _stood(self, grant: str, rcs: Sequence[str]) -> bool:
         """Whether this was a hold that went on: all of its RCs had it, and no RCM ended it but for a loss."""

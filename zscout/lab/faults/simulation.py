@@ -9,9 +9,10 @@ import asyncio
 import gc
 import hashlib
 import logging
+import math
 import random
 from collections import Counter
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
@@ -30,8 +31,8 @@ from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.lab.faults import plan
 from zscout.lab.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent, operate, report_load
 from zscout.lab.faults.device import Device, WatchedCapacity, WatchedExclusive
-from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
-from zscout.lab.faults.plan import Fault
+from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork, MemoryTransport
+from zscout.lab.faults.plan import OPERATIONS, Fault
 from zscout.lab.faults.programs import Work
 from zscout.lab.faults.promises import LEFT_OVER, Promises
 from zscout.lab.faults.virtual_time import PROCESS, START, Process, VirtualTimeLoop
@@ -80,11 +81,18 @@ class Size:
     """Seconds with faults and new requests."""
     pause: float = 3.0
     """Seconds from one request of a program to its next, at most."""
+    moves_only: bool = False
+    """Nothing fails but nodes, in the steps of a component's move: no other fault excuses what breaks."""
 
     @classmethod
     def of(cls, seed: int) -> Size:
-        """Every tenth run is a long one of many."""
-        return cls(hosts=4, clients=20, faults=30, span=300.0, pause=60.0) if seed % 10 == 9 else cls()
+        """Every tenth run is a long one of many, and every tenth one of moves that fail."""
+        match seed % 10:
+            case 9:
+                return cls(hosts=4, clients=20, faults=30, span=300.0, pause=60.0)
+            case 7:
+                return cls(moves_only=True)
+        return cls()
 
 
 @dataclass(slots=True)
@@ -147,14 +155,17 @@ class Simulation:
         """By program: its ARCs that are not over."""
         self.present: list[Fault] = []
         """The faults of now."""
-        self.killed: set[Fault] = set()
-        """Those that have killed whom they were to kill."""
+        self.killed: dict[Fault, tuple[str, float]] = {}
+        """Those that have killed a process, it, and after how many seconds."""
         self.calm_since = START
         """When the last fault ended."""
         self.everybody = [
             *dict.fromkeys((*(f"{host}/node" for host in self.hosts), *self.where.values(), *self.clients))
         ]
-        drawn = plan.draw(seed, self.everybody, self.hosts, sorted(DEVICES), count=size.faults, span=size.span)
+        if size.moves_only:
+            drawn = plan.draw_moves(seed, self.everybody, count=size.faults, span=size.span)
+        else:
+            drawn = plan.draw(seed, self.everybody, self.hosts, sorted(DEVICES), count=size.faults, span=size.span)
         self.faults = drawn if faults is None else list(faults)
         self.cuts: Counter[tuple[str, str]] = Counter()
         self.result = Result(seed, self.faults)
@@ -290,12 +301,13 @@ class Simulation:
         self._cut()
         return self.running[name]
 
-    def end_process(self, name: str) -> None:
+    def end_process(self, name: str, reached: MemoryTransport | None = None) -> None:
+        """Nothing of it runs any more, and of what it has just said nothing arrives but at `reached`, or some."""
         process, mesh = self.running[name]
         self.busy.pop(name, None)
         if not process.dead:
             process.kill()
-            self.network.kill(mesh)
+            self.network.kill(mesh, reached)
 
     def _start(self, process: Process, name: str, mesh: MemoryMesh) -> None:
         host, program = name.split("/")
@@ -400,36 +412,44 @@ class Simulation:
             for fault in self.faults
             if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
         ]
-        failing = {one for fault in faults if fault.kind in ("freeze", "stall", "kill") for one in fault.whom}
+        failing = {one for fault in faults if fault.kind in ("freeze", "stall") for one in fault.whom}
+        failing |= {self.killed[fault][0] for fault in faults if fault in self.killed}
         sound = {host for host in self.hosts if f"{host}/node" not in failing}
-        return any(self._touches(fault, names, hosts, since, sound) for fault in faults)
+        sides = [self._side(fault, hosts) for fault in faults if fault.kind in ("isolate", "part")]
+        beside = {*self.hosts}.intersection(*sides) & sound
+        return any(self._touches(fault, names, hosts, since, beside) for fault in faults)
+
+    def _side(self, fault: Fault, hosts: set[str]) -> set[str]:
+        """The hosts that a partition leaves with these; none, if it parts them."""
+        one, other = {*fault.whom}, {*self.hosts} - {*fault.whom}
+        return next((side for side in (one, other) if hosts <= side), set())
 
     def _led_since(self, at: float) -> set[str]:
         """Hosts whose leaders lead, and did then."""
         led = ((host, one.rcm.term) for host, one in self.candidates.items() if one.rcm is not None)
         return {host for host, term in led if self.promises.terms.get(term, self.loop.now) < at + START}
 
-    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float, sound: set[str]) -> bool:
-        """`sound`: hosts whose nodes are touched by no fault of their own."""
+    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float, beside: set[str]) -> bool:
+        """`beside`: hosts that no partition parts from these, and whose nodes are touched by no fault of their own."""
         # Of a leader's links the first was lost as the others came back: nobody can tell that from a host that goes.
         lasts, timing = self.loop.now - START - fault.at, self.fleet.timing
         just_over = 0 <= lasts - fault.lasts < 2 * AT_ONCE
         match fault.kind:
             case "kill":
+                name, at = self.killed.get(fault, ("", math.inf))
                 # What it said last may have reached some only.
-                return bool(names & {*fault.whom}) or since > fault.at
+                return name in names or 0 < since - at < self.fleet.mesh.lease
             case "stall" | "fail" | "double":
                 return bool(names & {*fault.whom})
             case "freeze":
                 return just_over or bool(names & {*fault.whom})
             case "isolate" | "part":
-                side = hosts & {*fault.whom}
-                there = {*fault.whom} if side else {*self.hosts} - {*fault.whom}
-                parted = bool(side and hosts - side) or not there & sound & {*self.candidates_at}
+                there = self._side(fault, hosts)
+                parted = not beside & {*self.candidates_at}
                 # A leader on the other side that goes on has given to others what it did not see for a lease.
                 left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and self._led_since(fault.at) - there
                 # A candidate that is left alone waits for as long as a hold lasts: it may be cut off itself.
-                alone = len(there & sound) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
+                alone = len(beside) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
                 return just_over or parted or bool(left) or alone or since > fault.at
             case _:
                 return True
@@ -451,16 +471,15 @@ class Simulation:
                     process.stop()
                     end = process.go_on
             case "kill":
-                (name,) = fault.whom
-                process, mesh = self.running[name]
-                if process.dead:
+                armed = {name: self.running[name][1] for name in fault.whom if not self.running[name][0].dead}
+                if not armed:
                     return
-                kill = partial(self._kill, name, fault)
-                if fault.both:
-                    kill()
-                else:
-                    self.network.after_sending(mesh, fault.message, kill)
-                end = lambda: self.start(name) if fault in self.killed else self.network.after_sending(mesh, "", None)  # noqa: E731
+                for name, mesh in armed.items():
+                    if fault.both:
+                        self._kill(name, fault)
+                    else:
+                        self.network.after_sending(mesh, fault.message, partial(self._kill, name, fault))
+                end = partial(self._revive, fault, armed.values())
             case "cut" | "isolate" | "part":
                 pairs = self._pairs(fault)
                 self.cuts.update(pairs)
@@ -516,11 +535,11 @@ class Simulation:
         lost = {fault.message for fault in self.present if fault.kind == "disturb" and fault.how.lost == 1}
         self.promises.unheard = not lost.isdisjoint(("grants", "alive"))
 
-    def _kill(self, name: str, fault: Fault) -> None:
-        if self.running[name][0].dead:
+    def _kill(self, name: str, fault: Fault, reached: MemoryTransport | None = None) -> None:
+        if fault in self.killed or self.running[name][0].dead:
             return
-        self.killed.add(fault)
-        self.end_process(name)
+        self.killed[fault] = name, self.loop.now - START
+        self.end_process(name, reached if fault.message in OPERATIONS else None)
         host, program = name.split("/")
         if program == "node":
             for other in [other for other in self.running if other.startswith(f"{host}/") and "." in other]:
@@ -531,6 +550,12 @@ class Simulation:
         if name in self.clients:
             self.programs.pop(name, None)
             self.promises.forget_client(name)
+
+    def _revive(self, fault: Fault, armed: Iterable[MemoryMesh]) -> None:
+        for mesh in armed:
+            self.network.after_sending(mesh, "", None)
+        if fault in self.killed:
+            self.start(self.killed[fault][0])
 
     def _kill_spare(self, name: str, rc: str) -> None:
         self.end_process(name)
