@@ -239,6 +239,10 @@ class Keys:
         """Tokens of all instances of one RC."""
         return f"{self.base}/alive/*/{Role.RC}/{check_rc(rc)}/*"
 
+    def alive_session(self, program: Sender) -> str:
+        """Tokens of all sessions of one program."""
+        return f"{self.base}/alive/{program.host}/{Role.SESSION}/{program.client}/*"
+
     def alive_any(self, role: str = "*") -> str:
         """Tokens of a role, or of all."""
         return f"{self.base}/alive/*/{role}/**" if role != "*" else f"{self.base}/alive/**"

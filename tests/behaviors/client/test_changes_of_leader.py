@@ -67,7 +67,8 @@ def test_holds_and_places_outlive_a_change_of_leader() -> None:
     run(test())
 
 
-def test_who_answers_a_new_leader_is_not_dropped_though_its_token_is_missing() -> None:
+@pytest.mark.parametrize("missing", [Role.SESSION, "requests"], ids=["it answers", "its session is seen"])
+def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_token_is_missing(missing: str) -> None:
     """As where links came back without all declarations while another led, and nobody noticed."""
 
     async def test() -> None:
@@ -78,10 +79,13 @@ def test_who_answers_a_new_leader_is_not_dropped_though_its_token_is_missing() -
             assert isinstance(before, MemoryTransport)
             assert isinstance(client, MemoryTransport)
             await asyncio.sleep(0.1)
-            fleet.network.link(one.mesh, next_leader).hidden = {
-                one for one in client.declarations() if type(one) is str
-            }
+            link = fleet.network.link(one.mesh, next_leader)
+            hidden = f"/{Role.CLIENT}/one/", f"/{missing}"
+            link.hidden = {one for one in client.declarations() if any(part in str(one) for part in hidden)}
             before.disconnected(client)
+            for token in client.declared:
+                if token not in link.hidden:
+                    before.on_token(client, token, True)
             async with hold(one, "first", {RC: {}}, min_runtime=600) as held:
                 outcomes: list[str | None] = []
                 one.watch(lambda arc: outcomes.append(arc.outcome))

@@ -10,8 +10,8 @@ from tests.behaviors.client.small_fleet import ECHO, RC, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.lab.faults.link import Disturbance
-from zscout.messages import Grants
-from zscout.types import Grant, Place
+from zscout.messages import ClientRequests, Grants, RcAsk
+from zscout.types import Grant, Place, Term
 
 
 async def runs_and_waits(old: Client) -> tuple[Grant, list[tuple[str, Place | None]]]:
@@ -113,6 +113,32 @@ def test_what_a_new_leader_does_not_know_to_be_held_yet_is_handed_over_as_what_i
             await both_go_on(new, grant, places)
             assert {name: {*told} for name, told in states.items()} == {"runs": {"running"}, "waits": {"queued"}}
             assert await fleet.holders() == ["runs"]
+
+    run(test())
+
+
+def test_a_promise_that_is_made_as_a_hand_over_is_answered_counts() -> None:
+    """Who stands for the lead has been told that the ARC is the old client's."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
+            await old.granted(runs)
+            old.pause()
+            new.expect(old.open_requests())
+            fleet.network.link(new.mesh, old.mesh).delay = 0.2
+            moved: list[Term] = []
+            old.watch(lambda arc: moved.append(arc.last[0]) if arc.state == "moved" else None)
+            moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
+            await until(new.open_requests)
+            candidate, promised = fleet.mesh("h1", "node"), Term(2, "f" * 12)
+            ask = candidate.keys.requests(old.mesh.me)
+            reply = await candidate.ask_one(ask, RcAsk(promise=promised), ClientRequests, timeout=1)
+            assert reply is not None
+            assert reply.message is not None
+            assert [request.id for request in reply.message.requests] == [runs.id]
+            await moving
+            assert moved[0] > promised
 
     run(test())
 

@@ -190,10 +190,11 @@ class MovableClient:
             self._rcm.leader_came.clear()
             reply = await self._rcm.query(operation)
             notice, problem = (reply.message, reply.problem) if reply is not None else (None, None)
+            awaited = await self._awaited_by(to) if notice is not None else set()
+            # Who was promised to meanwhile has been told that they are here.
             if notice is not None and self._rcm.accept(notice.term):
                 # An RCM that came in between answers for the first alone: it may not know of the others.
                 told = arcs if notice.term == term else [first]
-                awaited = await self._awaited_by(to)
                 if notice.state == "ended":
                     awaited.discard(first.id)
                 moved = [arc for arc in told if arc.open and arc.id not in awaited]
@@ -201,8 +202,9 @@ class MovableClient:
                     self._store.move(arc, notice)
                 if moved:
                     continue
-            elif problem is not None and problem.code == "not_running":
-                # It is over, or an RCM that has just taken the lead does not know it: this settles which.
+            elif notice is not None or (problem is not None and problem.code == "not_running"):
+                # It is over, or an RCM that has just taken the lead does not know it: this settles which. And one of a
+                # lower term than was promised hears of that.
                 await self._rcm.ask(first)
             elif problem is not None and problem.code == "unknown_client" and self.mesh.now() < known_by:
                 # It sees the RCM; the RCM may not have seen its token yet.

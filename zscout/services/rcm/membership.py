@@ -129,8 +129,8 @@ class Membership:
     # Clients
 
     def expect(self, client: ClientId) -> None:
-        """A client with requests must live: one that is not among `clients` yet gets a lease to show itself, and is
-        asked before it is dropped."""
+        """A client with requests must live: one that is not among `clients` yet gets a lease to show itself. It is not
+        dropped if it answers then, or its session is seen."""
         if client not in self._unseen:
             self._unseen[client] = self._supervisor.call_later(self._lease, self._overdue, client)
 
@@ -138,11 +138,13 @@ class Membership:
         self._supervisor.spawn(self._ask_unseen(client, self._unseen[client]))
 
     async def _ask_unseen(self, client: ClientId, timer: asyncio.TimerHandle) -> None:
-        key = self.mesh.keys.requests(client_of(client))
-        reply = await self.mesh.ask_one(key, RcAsk(), ClientRequests, timeout=self._timeout)
+        keys, program = self.mesh.keys, client_of(client)
+        key = keys.requests(program)
+        lives = await self.mesh.ask_one(key, RcAsk(), ClientRequests, timeout=self._timeout) is not None
+        lives = lives or bool(await self.mesh.living(keys.alive_session(program), timeout=self._timeout))
         if self._unseen.get(client) is not timer:
             return  # it has shown itself
-        if reply is None:
+        if not lives:
             self._client_lost(client)
         else:
             self.mesh.suspicions.suspect(_sign(key))
