@@ -94,6 +94,7 @@ ADDED: Final[dict[str, str]] = {
     "keys > zscout/FLEET/alive/*/rc/KIND/NAME/*": _INSTANCE,
     "keys > zscout/FLEET/alive/*/session/**": _SESSION,
     "keys > zscout/FLEET/alive/HOST/session/NAME/INSTANCE": _SESSION,
+    "keys > zscout/FLEET/alive/HOST/session/CLIENT/*": _SESSION,
     "messages > zscout.ClientRequests.v1 > fields > term": _ABOVE,
     "messages > zscout.Ask.v1 > fields > rcs": _GANG,
     "messages > zscout.OpenRequest.v1 > fields > rcs": _GANG,
