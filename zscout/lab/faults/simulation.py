@@ -157,6 +157,8 @@ class Simulation:
         """The faults of now."""
         self.killed: dict[Fault, tuple[str, float]] = {}
         """Those that have killed a process, it, and after how many seconds."""
+        self.led_throughout: dict[Fault, set[str]] = {}
+        """By fault that is over: hosts whose leaders led before it began, and as it ended."""
         self.calm_since = START
         """When the last fault ended."""
         self.everybody = [
@@ -447,7 +449,8 @@ class Simulation:
                 there = self._side(fault, hosts)
                 parted = not beside & {*self.candidates_at}
                 # A leader on the other side that goes on has given to others what it did not see for a lease.
-                left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and self._led_since(fault.at) - there
+                led = self.led_throughout.get(fault, set()) | self._led_since(fault.at)
+                left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and led - there
                 # A candidate that is left alone waits for as long as a hold lasts: it may be cut off itself.
                 alone = len(beside) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
                 return just_over or parted or bool(left) or alone or since > fault.at
@@ -523,6 +526,7 @@ class Simulation:
 
     def _end(self, fault: Fault, end: Callable[[], object]) -> None:
         self.log(f"OVER  {fault.kind} {' '.join(fault.whom)}")
+        self.led_throughout[fault] = self._led_since(fault.at)
         end()
         self.loop.call_later(fault.felt, self._forget_fault, fault)
 
