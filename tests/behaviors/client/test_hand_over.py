@@ -10,6 +10,7 @@ from tests.behaviors.client.small_fleet import ECHO, RC, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.lab.faults.link import Disturbance
+from zscout.lab.faults.memory import MemoryMesh
 from zscout.messages import ClientRequests, Grants, RcAsk
 from zscout.types import Grant, Place, Term
 
@@ -112,6 +113,40 @@ def test_what_a_new_leader_does_not_know_to_be_held_yet_is_handed_over_as_what_i
             await old.hand_over_all(new.mesh.me)
             await both_go_on(new, grant, places)
             assert {name: {*told} for name, told in states.items()} == {"runs": {"running"}, "waits": {"queued"}}
+            assert await fleet.holders() == ["runs"]
+
+    run(test())
+
+
+def test_what_rcs_hold_for_the_new_client_is_handed_over_though_the_new_leader_does_not_see_that_one() -> None:
+    """An RCM carried it out, and was heard by the RC alone."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new") as (fleet, (old, new)):
+            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
+            await old.granted(runs)
+            leader, next_leader = fleet.leader(), fleet.candidate("h1").mesh
+            assert isinstance(next_leader, MemoryMesh)
+            await asyncio.sleep(2)
+            old.pause()
+            new.expect(old.open_requests())
+            for ends in ((new.mesh, next_leader), (next_leader, new.mesh)):
+                fleet.network.cut(*ends)
+            await asyncio.sleep(1.5)
+            for other in (old.mesh, new.mesh, next_leader):
+                fleet.network.link(leader, other).loss = 1.0
+            moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
+            await until(lambda: [held.holder.client for held in fleet.rcs[0].holds.held.values()] == ["h/new"])
+            answers = fleet.network.link(fleet.devices, next_leader)
+            usual, answers.delay = answers.delay, 0.3
+            fleet.network.kill(leader)
+            await fleet.candidates.pop("h0").stop()
+            await until(lambda: old.leader == "h1")
+            answers.delay = usual
+            await moving
+            assert runs.state == "moved"
+            fleet.network.heal()
+            assert await new.granted(await new.request("runs", {RC: {}}, min_runtime=3600)) is not None
             assert await fleet.holders() == ["runs"]
 
     run(test())

@@ -61,6 +61,10 @@ class ComponentLifecycle:
         self._instance = f"{job.start.incarnation}-{new_instance()}"
         self._restored = asyncio.Event()
         self._activated = asyncio.Event()
+        self._handed = asyncio.Event()
+        """It has been handed an ARC, and no older incarnation is seen: nobody will activate it."""
+        self._older: set[str] = set()
+        """Instances of older incarnations that are seen."""
         self._left = asyncio.Event()
         """It is over here, whatever run() does: another one goes on."""
         self._away: EndReport | None = None
@@ -139,7 +143,8 @@ class ComponentLifecycle:
                 await _finds(client, Role.RCM, [lambda _: True], LINKED)
                 await self._report(PhaseReport("standby", movable))
                 # Once restored it has as long again to be activated, or handed an ARC.
-                called = self._activated, client.expected_came
+                called = self._activated, self._handed
+                self._supervisor.spawn(self._see_handed(client))
                 if not await _first(STAND_BY, *called, self._restored) or not await _first(STAND_BY, *called):
                     return EndReport("stopped", f"it stood by for {STAND_BY:g} s and nothing was handed to it")
             return await self._perform(client, made, movable)
@@ -253,12 +258,23 @@ class ComponentLifecycle:
         self._restored.set()
         await self._report(OrderAnswer(number))
 
+    async def _see_handed(self, client: Client) -> None:
+        await client.expected_came.wait()
+        if not self._older:
+            self._handed.set()
+
     def _on_component(self, token: Token, alive: bool) -> None:
-        if not alive or token.name != self._job.start.component:
+        if token.name != self._job.start.component:
             return
         try:
             incarnation = incarnation_of(token.instance)
         except BadName:
+            return
+        if incarnation < self._job.start.incarnation:
+            (self._older.add if alive else self._older.discard)(token.instance)
+            if not self._older and self._client is not None and self._client.expected_came.is_set():
+                self._handed.set()
+        if not alive:
             return
         if self._move is not None and incarnation == self._move.incarnation:
             self._move.successor_runs.set()

@@ -285,8 +285,13 @@ class RequestHandler:
             self._defer(query)
             return
         self.flush()
-        if sender == to or self.core.arc(arc_id(sender, operation.id)) is None:
+        own, goal = self.core.arc(arc_id(sender, operation.id)), self.core.arc(arc_id(to, operation.id))
+        if sender == to or own is None:
             self._answer_handed_over(query, operation, sender, to)
+            return
+        if goal is not None and goal.place == own.place:
+            # An RCM before this one has carried it out: by the word of RCs the new client holds it, wherever that is.
+            self._hand_over(query, operation, sender, to)
             return
         if len(self._moving) >= MAX_BATCH:
             raise Refused("busy", f"{MAX_BATCH} hand-overs wait here already; ask again")
