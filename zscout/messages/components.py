@@ -61,7 +61,8 @@ class StartComponent(Message, frozen=True, tag_field="op", tag="start"):
     """Starts a component. Answered with a ComponentView once it runs (or stands by), or has failed.
 
     `standby`: it gets ready to take over from an earlier incarnation, and does not run before it is
-    activated, or has been handed an ARC and sees no token of that one. Idempotent: for the same incarnation, answered with its present state."""
+    activated, or has been handed an ARC and sees no token of that one. Idempotent: for the same incarnation,
+    answered with its present state."""
 
     component: ComponentName
     incarnation: Incarnation
