@@ -6,19 +6,36 @@ import asyncio
 
 import pytest
 
-from tests.behaviors.client.small_fleet import ECHO, RC, small_fleet
+from tests.behaviors.client.small_fleet import ECHO, RC, SmallFleet, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.client import Client, RequestRefused
+from zscout.behaviors.client.request import OpenArc
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh
 from zscout.messages import ClientRequests, Grants, RcAsk
 from zscout.types import Grant, Place, Term
 
 
+async def running(old: Client) -> OpenArc:
+    arc = await old.request("runs", {RC: {}}, min_runtime=3600)
+    await old.granted(arc)
+    return arc
+
+
+async def succeed(next_leader: MemoryMesh, fleet: SmallFleet, old: Client) -> None:
+    """The leader dies, and RCs answer the next one after clients."""
+    answers = fleet.network.link(fleet.devices, next_leader)
+    usual, answers.delay = answers.delay, 0.3
+    fleet.network.kill(fleet.leader())
+    await fleet.candidates.pop("h0").stop()
+    await until(lambda: old.leader == "h1")
+    answers.delay = usual
+
+
 async def runs_and_waits(old: Client) -> tuple[Grant, list[tuple[str, Place | None]]]:
     """Two ARCs for RC: the grant of the one that runs, and the ids and places of both."""
-    runs = await old.request("runs", {RC: {}}, min_runtime=3600)
-    grant = await old.granted(runs)
+    runs = await running(old)
+    grant = runs.grant
     assert grant is not None
     waits = await old.request("waits", {RC: {}}, min_runtime=3600)
     return grant, [(arc.id, arc.place) for arc in (runs, waits)]
@@ -98,16 +115,12 @@ def test_what_a_new_leader_does_not_know_to_be_held_yet_is_handed_over_as_what_i
     async def test() -> None:
         async with small_fleet("old", "new") as (fleet, (old, new)):
             grant, places = await runs_and_waits(old)
-            next_leader = fleet.candidate("h1")
+            next_leader = fleet.candidate("h1").mesh
+            assert isinstance(next_leader, MemoryMesh)
             await asyncio.sleep(2)
             old.pause()
             new.expect(old.open_requests())
-            answers = fleet.network.link(fleet.devices, next_leader.mesh)
-            usual, answers.delay = answers.delay, 0.3
-            fleet.network.kill(fleet.leader())
-            await fleet.candidates.pop("h0").stop()
-            await until(lambda: old.leader == "h1")
-            answers.delay = usual
+            await succeed(next_leader, fleet, old)
             states: dict[str, list[str]] = {"runs": [], "waits": []}
             new.watch(lambda arc: states[arc.name].append(arc.state))
             await old.hand_over_all(new.mesh.me)
@@ -123,8 +136,7 @@ def test_what_rcs_hold_for_the_new_client_is_handed_over_though_the_new_leader_d
 
     async def test() -> None:
         async with small_fleet("old", "new") as (fleet, (old, new)):
-            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
-            await old.granted(runs)
+            runs = await running(old)
             leader, next_leader = fleet.leader(), fleet.candidate("h1").mesh
             assert isinstance(next_leader, MemoryMesh)
             await asyncio.sleep(2)
@@ -137,12 +149,7 @@ def test_what_rcs_hold_for_the_new_client_is_handed_over_though_the_new_leader_d
                 fleet.network.link(leader, other).loss = 1.0
             moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
             await until(lambda: [held.holder.client for held in fleet.rcs[0].holds.held.values()] == ["h/new"])
-            answers = fleet.network.link(fleet.devices, next_leader)
-            usual, answers.delay = answers.delay, 0.3
-            fleet.network.kill(leader)
-            await fleet.candidates.pop("h0").stop()
-            await until(lambda: old.leader == "h1")
-            answers.delay = usual
+            await succeed(next_leader, fleet, old)
             await moving
             assert runs.state == "moved"
             fleet.network.heal()
@@ -157,8 +164,7 @@ def test_a_promise_that_is_made_as_a_hand_over_is_answered_counts() -> None:
 
     async def test() -> None:
         async with small_fleet("old", "new") as (fleet, (old, new)):
-            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
-            await old.granted(runs)
+            runs = await running(old)
             old.pause()
             new.expect(old.open_requests())
             fleet.network.link(new.mesh, old.mesh).delay = 0.2
@@ -183,8 +189,7 @@ def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_same() ->
 
     async def test() -> None:
         async with small_fleet("old", "new") as (fleet, (old, new)):
-            arc = await old.request("runs", {RC: {}}, min_runtime=3600)
-            await old.granted(arc)
+            arc = await running(old)
             old.pause()
             new.expect(old.open_requests())
             before, link = (arc.id, arc.place), fleet.network.link(fleet.leader(), old.mesh)
@@ -217,8 +222,7 @@ def test_what_the_new_client_does_not_hear_of_is_asked_for_as_what_it_was() -> N
 def test_what_was_given_up_while_its_hand_over_was_undecided_is_not_taken_back() -> None:
     async def test() -> None:
         async with small_fleet("old", "new") as (fleet, (old, new)):
-            runs = await old.request("runs", {RC: {}}, min_runtime=3600)
-            await old.granted(runs)
+            runs = await running(old)
             old.pause()
             new.expect(old.open_requests())
             fleet.network.disturb({"notice": Disturbance(lost=1.0)})

@@ -65,6 +65,9 @@ class ComponentLifecycle:
         """It has been handed an ARC, and no older incarnation is seen: nobody will activate it."""
         self._older: set[str] = set()
         """Instances of older incarnations that are seen."""
+        self._alone = asyncio.Event()
+        """None is."""
+        self._alone.set()
         self._left = asyncio.Event()
         """It is over here, whatever run() does: another one goes on."""
         self._away: EndReport | None = None
@@ -260,8 +263,8 @@ class ComponentLifecycle:
 
     async def _see_handed(self, client: Client) -> None:
         await client.expected_came.wait()
-        if not self._older:
-            self._handed.set()
+        await self._alone.wait()
+        self._handed.set()
 
     def _on_component(self, token: Token, alive: bool) -> None:
         if token.name != self._job.start.component:
@@ -272,8 +275,7 @@ class ComponentLifecycle:
             return
         if incarnation < self._job.start.incarnation:
             (self._older.add if alive else self._older.discard)(token.instance)
-            if not self._older and self._client is not None and self._client.expected_came.is_set():
-                self._handed.set()
+            (self._alone.clear if self._older else self._alone.set)()
         if not alive:
             return
         if self._move is not None and incarnation == self._move.incarnation:
