@@ -10,10 +10,10 @@ import asyncio
 import itertools
 import random
 import weakref
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import zenoh
 
@@ -24,6 +24,8 @@ from zscout.mesh import Mesh, MeshError
 from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.transport import Collector, OnSample, Quality, Transport, TransportPublisher, TransportQuery, Undeclare
 from zscout.types import SECOND, Ns
+
+H = TypeVar("H")
 
 
 @lru_cache(1 << 16)
@@ -50,6 +52,14 @@ def _node(mesh: Mesh) -> MemoryTransport:
     return node
 
 
+class Neighbour(NamedTuple):
+    """A session that another one is linked to, and the link in both directions."""
+
+    node: MemoryTransport
+    to: MemoryLink
+    back: MemoryLink
+
+
 class MemoryNetwork:
     """The processes of a fleet, and the links between them.
 
@@ -67,6 +77,8 @@ class MemoryNetwork:
         """How likely each declaration stays unknown to a peer whose link comes back, until it is lost again."""
         self.links: dict[tuple[MemoryTransport, MemoryTransport], MemoryLink] = {}
         """Of all that live, those with themselves included; a new one is made when it is first needed."""
+        self._linked: dict[MemoryTransport, list[Neighbour]] = {}
+        """As `linked` tells it, until any link changes."""
         self._ids = itertools.count(1)
         self._is_cut: Callable[[str, str], bool] = lambda _one, _other: False
         self._disturbed: Mapping[str, Disturbance] = {}
@@ -168,6 +180,7 @@ class MemoryNetwork:
             if link.source is node and link.blocked:
                 link.call_in(self.lease, link.target.call, link.target.disconnected, node)
         self.nodes.remove(node)
+        self._linked.clear()
         self.links = {ends: link for ends, link in self.links.items() if node not in ends}
         self.match()
 
@@ -180,6 +193,13 @@ class MemoryNetwork:
             if not (source.gone or target.gone):  # what arrives late may be of one that has gone
                 self.links[source, target] = link
         return link
+
+    def linked(self, node: MemoryTransport) -> list[Neighbour]:
+        """The sessions that one is linked to, itself included."""
+        if (linked := self._linked.get(node)) is None:
+            everybody = [Neighbour(one, self.between(node, one), self.between(one, node)) for one in self.nodes]
+            linked = self._linked[node] = [one for one in everybody if not one.to.lost]
+        return linked
 
     def match(self) -> None:
         """Tells publishers that follow their subscribers of changes."""
@@ -196,6 +216,7 @@ class MemoryNetwork:
             self._connect(source, target, forgetful)
 
     def _connect(self, one: MemoryTransport, other: MemoryTransport, forgetful: float = 0.0) -> None:
+        self._linked.clear()
         for source, target in dict.fromkeys([(one, other), (other, one)]):
             link = self.between(source, target)
             back, link.lost = link.lost, False
@@ -227,6 +248,7 @@ class MemoryNetwork:
                 link.pump()
 
     def _expire(self, *links: MemoryLink) -> None:
+        self._linked.clear()
         for link in links:
             link.lost = True
             if link.expiry is not None:
@@ -252,12 +274,15 @@ class MemoryTransport(Transport):
         self.after: tuple[str, Callable[[MemoryTransport], None]] | None = None
         self.declared: list[str] = []
         self.followed: list[MemoryPublisher] = []
-        self._queryables: list[tuple[str, Callable[[TransportQuery], None]]] = []
-        self._subscribers: list[tuple[str, OnSample]] = []
-        self._watchers: list[tuple[str, Callable[[str, bool], None]]] = []
+        self.queryables: _Declared[Callable[[TransportQuery], None]] = _Declared()
+        self.subscribers: _Declared[OnSample] = _Declared()
+        self._watchers: _Declared[Callable[[str, bool], None]] = _Declared()
         self._gets: dict[_Get, None] = {}
         self._alive: dict[MemoryTransport, list[str]] = {}
         """Tokens that are known here, by the process that declared them."""
+        self._lives: Counter[str] = Counter()
+        """How often each of them is known."""
+        self._id = f"{number:x}"
 
     def call(self, f: Callable[..., None], *args: Any) -> None:
         """Calls `f` as code of this process."""
@@ -270,16 +295,16 @@ class MemoryTransport(Transport):
         return "nobody" if self.process is None else self.process.name
 
     def declarations(self) -> list[object]:
-        return [*self._queryables, *self._subscribers, *self.declared]
+        return [*self.queryables.all, *self.subscribers.all, *self.declared]
 
     def now(self) -> Ns:
         return round(self.loop.time() * SECOND)
 
     def id(self) -> str:
-        return f"{self.number:x}"
+        return self._id
 
     def peers(self) -> list[str]:
-        return [node.id() for node in self._peers() if node is not self]
+        return [node.id() for node, _, _ in self._linked() if node is not self]
 
     def links(self) -> int:
         return len(self.peers())
@@ -289,8 +314,8 @@ class MemoryTransport(Transport):
 
     def leave(self) -> None:
         if not self.gone:
-            for node in self._peers():
-                self._to(node).send(node.disconnected, self)
+            for node, to, _ in self._linked():
+                to.send(node.disconnected, self)
             self.gone = True
             self.network.remove(self)
 
@@ -303,19 +328,19 @@ class MemoryTransport(Transport):
             raise MeshError(f"{key} can't be asked: {error}") from None
         get = _Get(self, timeout, to)
         queries = [
-            (node, _Query(get, node, key, payload), on_query)
-            for node in self._peers()
-            for declared, on_query in node._queryables
-            if intersects(declared, key) and (declared, on_query) not in self._from(node).hidden
+            (there, _Query(get, there.back, key, payload), one[1])
+            for there in self._linked()
+            for one in there.node.queryables.matching(key)
+            if one not in there.back.hidden
         ]
-        get.waiting = {query.id: node for node, query, _ in queries}
+        get.waiting = {query.id: there.node for there, query, _ in queries}
         get.check()
-        for node, query, on_query in queries:
-            if not self._to(node).send_message(kind_of(key), on_query, query, operation=query.operation):
+        for there, query, on_query in queries:
+            if not there.to.send_message(kind_of(key), on_query, query, operation=query.operation):
                 query.lose()
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
-        return _add(self._queryables, (key, on_query))
+        return self.queryables.add(key, on_query)
 
     def publisher(self, key: str, kind: type | None, quality: Quality) -> TransportPublisher:
         return MemoryPublisher(self, key, quality)
@@ -324,23 +349,23 @@ class MemoryTransport(Transport):
         self.publish(key, payload, None, Quality.CONTROL)
 
     def publish(self, key: str, payload: bytes, attachment: bytes | None, quality: Quality) -> None:
-        for node in self._peers():
-            link = self._to(node)
-            if not (link.blocked and quality is not Quality.CONTROL) and node.subscribes(key, self):
-                link.send_message(kind_of(key), node.on_put, self, key, payload, attachment)
+        kind = kind_of(key)
+        for node, to, back in self._linked():
+            if not (to.blocked and quality is not Quality.CONTROL) and node.subscribes(key, back):
+                to.send_message(kind, node.on_put, self, key, payload, attachment)
 
     def on_put(self, source: MemoryTransport, key: str, payload: bytes, attachment: bytes | None) -> None:
-        hidden = self._to(source).hidden
-        for one in tuple(self._subscribers):
-            if intersects(one[0], key) and one not in hidden:
+        hidden = self.network.between(self, source).hidden
+        for one in self.subscribers.matching(key):
+            if one not in hidden:
                 one[1](key, payload, attachment)
 
-    def subscribes(self, key: str, source: MemoryTransport) -> bool:
-        hidden = self._to(source).hidden
-        return any(intersects(one[0], key) and one not in hidden for one in self._subscribers)
+    def subscribes(self, key: str, to: MemoryLink) -> bool:
+        """Whether the process that this link leads to knows that."""
+        return any(one not in to.hidden for one in self.subscribers.matching(key))
 
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
-        remove = _add(self._subscribers, (key, on_sample))
+        remove = self.subscribers.add(key, on_sample)
         self.network.match()
 
         def undeclare() -> None:
@@ -355,7 +380,7 @@ class MemoryTransport(Transport):
         return (lambda: kept.popleft() if kept else None), undeclare
 
     def matching(self, key: str) -> bool:
-        return any(node.subscribes(key, self) for node in self._peers())
+        return any(node.subscribes(key, back) for node, _, back in self._linked())
 
     def token(self, key: str) -> Undeclare:
         self.declared.append(key)
@@ -375,7 +400,7 @@ class MemoryTransport(Transport):
     def token_subscriber(self, key: str, on_token: Callable[[str, bool], None]) -> Undeclare:
         for token in self._known(key):
             on_token(token, True)
-        return _add(self._watchers, (key, on_token))
+        return self._watchers.add(key, on_token)
 
     def tokens(self, key: str, timeout: float, to: Collector) -> None:
         for token in self._known(key):
@@ -383,16 +408,19 @@ class MemoryTransport(Transport):
         to.on_final()
 
     def on_token(self, source: MemoryTransport, token: str, alive: bool) -> None:
-        before = self._lives(token)
+        before = token in self._lives
         known = self._alive.setdefault(source, [])
         if alive:
             known.append(token)
+            self._lives[token] += 1
         elif token in known:
             known.remove(token)
-        if self._lives(token) != before:
-            for key, on_token in tuple(self._watchers):
-                if intersects(key, token):
-                    on_token(token, alive)
+            self._lives[token] -= 1
+            if not self._lives[token]:
+                del self._lives[token]
+        if (token in self._lives) != before:
+            for _, on_token in self._watchers.matching(token):
+                on_token(token, alive)
 
     def disconnected(self, peer: MemoryTransport) -> None:
         for token in tuple(self._alive.get(peer, ())):
@@ -404,22 +432,12 @@ class MemoryTransport(Transport):
         known = itertools.chain.from_iterable(self._alive.values())
         return dict.fromkeys(token for token in known if intersects(key, token))
 
-    def _lives(self, token: str) -> bool:
-        return any(token in tokens for tokens in self._alive.values())
-
     def _announce(self, token: str, alive: bool) -> None:
-        for node in self._peers():
-            self._to(node).send_message("alive", node.on_token, self, token, alive)
+        for node, to, _ in self._linked():
+            to.send_message("alive", node.on_token, self, token, alive)
 
-    def _peers(self) -> list[MemoryTransport]:
-        """The processes linked to this one, itself included."""
-        return [] if self.gone else [node for node in self.network.nodes if not self._to(node).lost]
-
-    def _to(self, node: MemoryTransport) -> MemoryLink:
-        return self.network.between(self, node)
-
-    def _from(self, node: MemoryTransport) -> MemoryLink:
-        return self.network.between(node, self)
+    def _linked(self) -> list[Neighbour]:
+        return [] if self.gone else self.network.linked(self)
 
 
 class MemoryPublisher(TransportPublisher):
@@ -485,10 +503,10 @@ class _Get:
 class _Query(TransportQuery):
     _ids: Final = itertools.count()
 
-    def __init__(self, get: _Get, node: MemoryTransport, key: str, payload: bytes | None) -> None:
+    def __init__(self, get: _Get, back: MemoryLink, key: str, payload: bytes | None) -> None:
         self.id = next(self._ids)
         self._get: _Get | None = get
-        self._back, self._kind = node.network.between(node, get.node), kind_of(key)
+        self._back, self._kind = back, kind_of(key)
         self._key, self._payload = key, payload
         self.operation = operation_of(payload)
 
@@ -532,6 +550,26 @@ def _call(method: weakref.WeakMethod[Callable[[str], None]], argument: str) -> N
         alive(argument)
 
 
-def _add(items: list[Any], item: Any) -> Undeclare:
-    items.append(item)
-    return lambda: items.remove(item)
+class _Declared(Generic[H]):
+    """Handlers of one kind that a session has declared, each with its key expression."""
+
+    def __init__(self) -> None:
+        self.all: list[tuple[str, H]] = []
+        self._matching: dict[str, list[tuple[str, H]]] = {}
+
+    def add(self, key: str, handler: H) -> Undeclare:
+        one = key, handler
+        self.all.append(one)
+        self._matching = {}
+
+        def remove() -> None:
+            self.all.remove(one)
+            self._matching = {}
+
+        return remove
+
+    def matching(self, key: str) -> list[tuple[str, H]]:
+        """Those whose key expression intersects `key`: a list that does not change."""
+        if (found := self._matching.get(key)) is None:
+            found = self._matching[key] = [one for one in self.all if intersects(one[0], key)]
+        return found

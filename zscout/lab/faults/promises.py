@@ -96,6 +96,8 @@ class Promises:
         """Since when each thing that may not last is so."""
         self._running: dict[Term, set[Grant]] = {}
         self._queued: dict[Term, dict[ArcId, Rank]] = {}
+        self._seen: dict[Term, int] = {}
+        """By term: how many instants its RCM had decided about as it was looked at."""
 
     def event(self, what: Mapping[str, Any]) -> None:
         """A line of `zscout.trace`: at every event, what an RC may not do whatever it hears."""
@@ -230,6 +232,9 @@ class Promises:
 
     def _in_order(self, rcm: Rcm) -> None:
         """Of two that wait, the better-ranked is granted first, if it needs no more than what the other got."""
+        if self._seen.get(rcm.term) == rcm.core.batches:
+            return
+        self._seen[rcm.term] = rcm.core.batches
         running, queued = self._running.get(rcm.term, set()), self._queued.get(rcm.term, {})
         status = rcm.core.status()
         granted = [arc for arc in status.running if arc.hold and arc.hold.grant not in running and arc.id in queued]

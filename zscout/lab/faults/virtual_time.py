@@ -22,6 +22,9 @@ from zscout.keyexpr import RANDOM
 
 T = TypeVar("T")
 
+MANY_TIMERS: Final = 100
+"""Above so many, those that are cancelled are looked for when they are half of them."""
+
 START = 1_000.0
 """The time at which a loop starts, in seconds: not zero, which often stands for "never"."""
 
@@ -119,7 +122,13 @@ class _TimerHandle(asyncio.TimerHandle):
 
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
     _ready: Any
-    _scheduled: list[asyncio.TimerHandle]
+    _timer_cancelled_count: int
+    _stopping: bool
+    _process_events: Callable[[Any], None]
+    _selector: selectors.BaseSelector
+    _clock_resolution: float
+    _scheduled: list[tuple[float, Any]]
+    """Not handles, as asyncio has it: pairs are compared without a line of Python, and in the same order."""
 
     def __init__(self) -> None:
         self._now = START
@@ -149,12 +158,44 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         self._now += seconds
         return True
 
+    def _run_once(self) -> None:
+        """Like asyncio's own, in the same order; but nothing outside is looked at where nothing there can wake it."""
+        self._forget_cancelled()
+        scheduled, ready = self._scheduled, self._ready
+        if not self.isolated or not (ready or self._stopping or scheduled):
+            timeout = 0.0 if ready or self._stopping else scheduled[0][0] - self._now if scheduled else None
+            self._process_events(self._selector.select(timeout))
+        elif not (ready or self._stopping):
+            self._now += max(0.0, scheduled[0][0] - self._now)
+        end = self._now + self._clock_resolution
+        while scheduled and scheduled[0][0] < end:
+            _, timer = heapq.heappop(scheduled)
+            timer._scheduled = False
+            ready.append(timer)
+        for _ in range(len(ready)):
+            handle = ready.popleft()
+            if not handle._cancelled:
+                handle._run()
+
+    def _forget_cancelled(self) -> None:
+        scheduled = self._scheduled
+        if len(scheduled) > MANY_TIMERS and self._timer_cancelled_count > len(scheduled) / 2:
+            for _, timer in scheduled:
+                timer._scheduled = not timer._cancelled
+            scheduled[:] = [one for one in scheduled if one[1]._scheduled]
+            heapq.heapify(scheduled)
+            self._timer_cancelled_count = 0
+        while scheduled and scheduled[0][1]._cancelled:
+            _, timer = heapq.heappop(scheduled)
+            timer._scheduled = False
+            self._timer_cancelled_count -= 1
+
     def call_at(  # type: ignore[override]  # like asyncio's own
         self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
     ) -> asyncio.TimerHandle:
         process = PROCESS.get() if context is None else context.get(PROCESS)
         timer = _TimerHandle(when if process is None else process.virtual(when), callback, args, self, context)
-        heapq.heappush(self._scheduled, timer)
+        heapq.heappush(self._scheduled, (timer._when, timer))  # type: ignore[attr-defined]
         timer._scheduled = True  # type: ignore[attr-defined]
         return timer
 
