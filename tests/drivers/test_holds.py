@@ -321,6 +321,14 @@ def test_a_hand_over_changes_grant_and_client_at_once() -> None:
     assert [refusal and refusal.code for refusal in codes] == ["ended", None]
 
 
+@pytest.mark.parametrize(("known_as", "interrupted"), [("id2", False), ("id3", True)])
+def test_what_goes_on_in_another_client_has_its_id_and_its_place(known_as: str, interrupted: bool) -> None:
+    """Taken back from a client that is gone it has a new id: the device is made safe in between."""
+    goes_on = replace(holder(3, "h/two", place=2), id=known_as)
+    change = holding(HELD).apply_grants(said(3, goes_on), NOW)
+    assert (change.interrupts, bool(change.removed_not_handed_over)) == (interrupted, interrupted)
+
+
 def test_a_grant_that_a_snapshot_names_is_not_refused_before_its_publication_comes() -> None:
     """A confirmation may overtake the publication: the snapshot read for it must not decide against it."""
     rc = holding(HELD)

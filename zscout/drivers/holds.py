@@ -23,7 +23,7 @@ from typing import Any
 from msgspec import structs
 
 from zscout.messages import EndedHold, Grants, Holder, Problem, RcmState, absurd
-from zscout.types import NO_TERM, SECOND, Grant, HostName, Ns, Term
+from zscout.types import NO_TERM, SECOND, Grant, HostName, Ns, Place, Term
 
 REMEMBERED = 64
 """Grants that ended lately, kept to say why a command under one of them is refused."""
@@ -62,14 +62,20 @@ class HoldChange:
 
     @property
     def removed_not_handed_over(self) -> list[Holder]:
-        """Of the removed, those that do not go on in another client: there the same ARC has the same place."""
-        after = {holder.place: holder.client for holder in self.began}
-        return [holder for holder in self.removed if after.get(holder.place, holder.client) == holder.client]
+        """Of the removed, those that do not go on in another client: there the same ARC has the same id and place.
+        (What was taken back from a client that is gone has its place only.)"""
+        after = {_arc(holder): holder.client for holder in self.began}
+        return [holder for holder in self.removed if after.get(_arc(holder), holder.client) == holder.client]
 
     @property
     def interrupts(self) -> bool:
         """Whether the device serves nobody between what was before and what is after."""
         return not self.stayed and self.removed_not_handed_over == self.removed
+
+
+def _arc(holder: Holder) -> tuple[str, Place]:
+    """What an ARC keeps, whichever client has it."""
+    return holder.id, holder.place
 
 
 class HoldTable:
@@ -142,7 +148,7 @@ class HoldTable:
             shared = {name: getattr(view, name) for name in Holder.__struct_fields__ if name not in own}
             holder = Holder(**shared, **own)
             # An ARC has one hold: its older one is over.
-            older = [grant for grant, held in self.held.items() if held.holder.place == holder.place]
+            older = [grant for grant, held in self.held.items() if _arc(held.holder) == _arc(holder)]
             others = [held.holder for grant, held in self.held.items() if grant not in older]
             if self.held and not carries([*others, holder]):
                 change.announce = True

@@ -19,6 +19,7 @@ from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.instances import Instances, InstanceState
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
+from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.terms import LastTerms
 from zscout.types import NO_TERM, SECOND, Ns, Term
@@ -37,7 +38,7 @@ REREADS = 4
 COMMAND_QUEUE = 64
 EARLY_PER_HOST = 16
 """Commands of one host that may be set aside."""
-LOOK_PERIOD = 1.0
+LOOK_PERIOD = 0.5
 """Seconds between two looks at whether leaders that are seen are heard, and ask."""
 FIGURES_PERIOD = 1.0
 """Seconds between two publications of changed figures."""
@@ -494,8 +495,9 @@ class ResourceController:
     async def _look_for_contradictions(self) -> None:
         """A leader that is seen and not heard, or heard and not seen, or heard and asks nothing: what is declared here,
         or there, is not known to the other. Where candidates are seen, one leads before long."""
+        silent = bool(self._leaders) and not self._hears
+        self.mesh.suspicions.suspect(f"{self.name}: an RCM is seen that does not publish", so=silent, patience=UNHEARD)
         signs = {
-            f"{self.name}: an RCM is seen that does not publish": bool(self._leaders) and not self._hears,
             f"{self.name}: the RCM publishes and is not seen": self._hears and not self._leaders,
             f"{self.name}: the RCM publishes and has not asked for its promise": self._hears
             and self.instances.state is not InstanceState.STANDS_BY

@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 PATIENCE: Final = 2.0
 """Seconds for which a contradiction must last."""
+UNHEARD: Final = 0.5
+"""Seconds for which an RCM must be seen and not heard, beyond half a hold lease: what is held is not to end for it."""
 LASTS: Final = 60.0
 """Seconds after which one that is not said again is forgotten."""
 OVERLAP: Final = 0.5

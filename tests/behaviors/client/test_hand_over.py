@@ -12,6 +12,7 @@ from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh
+from zscout.mesh.renewal import Suspicions
 from zscout.messages import ClientRequests, Grants, RcAsk
 from zscout.types import Grant, Place, Term
 
@@ -184,8 +185,43 @@ def test_a_promise_that_is_made_as_a_hand_over_is_answered_counts() -> None:
     run(test())
 
 
-def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_same() -> None:
+def test_what_an_rcm_that_was_replaced_has_handed_over_is_awaited_once_more() -> None:
+    """Its old client has promised the next one to have it, and hands it over there; the new one asks before that."""
+
+    async def test() -> None:
+        async with small_fleet("old", "new", "rival") as (fleet, (old, new, rival)):
+            await running(rival)
+            waits = await old.request("waits", {RC: {}}, min_runtime=3600)
+            leader, next_leader = fleet.leader(), fleet.candidate("h1").mesh
+            assert isinstance(next_leader, MemoryMesh)
+            await asyncio.sleep(2)
+            old.pause()
+            new.expect(old.open_requests())
+            for other in (leader, fleet.devices, new.mesh, rival.mesh):
+                fleet.network.cut(other, next_leader)
+                fleet.network.cut(next_leader, other)
+            await until(lambda: old.term.counter == 2)
+            moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
+            moved = await new.request("waits", {RC: {}}, min_runtime=3600)
+            told: list[tuple[str, int]] = []
+            new.watch(lambda arc: told.append((arc.state, arc.last[0].counter)))
+            granting = asyncio.create_task(new.granted(moved))
+            fleet.network.link(old.mesh, next_leader).delay = 0.2
+            fleet.network.heal()
+            await moving
+            await until(lambda: told[-1:] == [("queued", 2)])
+            assert "ended" not in dict(told)
+            assert (moved.id, moved.place) == (waits.id, waits.place)
+            await rival.close()
+            assert await granting is not None
+
+    run(test())
+
+
+def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """For the hold lease: that ends the hold, and its ARC is asked for again, by whoever has it."""
+    # It would hear the RCM again in another session.
+    monkeypatch.setattr(Suspicions, "suspect", lambda *_, **__: None)
 
     async def test() -> None:
         async with small_fleet("old", "new") as (fleet, (old, new)):

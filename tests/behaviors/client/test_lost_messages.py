@@ -85,7 +85,7 @@ def test_what_had_its_time_before_its_client_heard_of_it_is_asked_for_anew_at_it
     run(test())
 
 
-def test_a_client_that_hears_no_publication_of_an_rcm_that_answers_joins_the_mesh_anew(
+def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_the_mesh_anew(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async def test() -> None:
@@ -101,11 +101,41 @@ def test_a_client_that_hears_no_publication_of_an_rcm_that_answers_joins_the_mes
     with caplog.at_level(logging.WARNING, "zscout.mesh"):
         run(test())
     said = {record.message.partition(": this process")[0] for record in caplog.records}
-    assert "an RCM answers that does not publish" in said
+    assert "an RCM is seen that does not publish" in said
+
+
+@pytest.mark.parametrize("whose", ["client", "RC"])
+def test_a_hold_goes_on_under_a_leader_that_does_not_know_who_listens_to_it(whose: str) -> None:
+    """Links came back without the subscription of what RCMs publish, long before this one led."""
+
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            arc = await one.request("first", {RC: {}}, min_runtime=600)
+            grant = await one.granted(arc)
+            next_leader = fleet.candidate("h1").mesh
+            listening = one.mesh if whose == "client" else fleet.devices
+            assert isinstance(next_leader, MemoryMesh)
+            assert isinstance(listening, MemoryMesh)
+            await asyncio.sleep(2)
+            transport = listening._transport.current
+            assert isinstance(transport, MemoryTransport)
+            hidden = [known for known in transport.subscribers.all if known[0] == listening.keys.grants]
+            assert hidden
+            fleet.network.link(listening, next_leader).hidden = {*hidden}
+            fleet.network.kill(fleet.leader())
+            await fleet.candidates.pop("h0").stop()
+            states: list[str] = []
+            one.watch(lambda arc: states.append(arc.state))
+            await until(lambda: one.leader == "h1")
+            await asyncio.sleep(10)
+            assert (arc.grant, {*states}) == (grant, {"running"})
+
+    run(test())
 
 
 def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_anew() -> None:
-    """Links came back without its token, its subscription of notices and its `requests`: only what it asks arrives."""
+    """Links came back without its token, its subscription of notices and its `requests`: what it asks arrives, and it
+    hears what is published."""
 
     async def test() -> None:
         async with small_fleet("one", "two") as (fleet, (one, _)):
@@ -116,7 +146,8 @@ def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_anew() ->
             before, client = leader._transport.current, asking._transport.current
             assert isinstance(before, MemoryTransport)
             assert isinstance(client, MemoryTransport)
-            fleet.network.link(one.mesh, leader).hidden = {*client.declarations()}
+            heard = [known for known in client.subscribers.all if known[0] == one.mesh.keys.grants]
+            fleet.network.link(one.mesh, leader).hidden = {*client.declarations()} - {*heard}
             before.disconnected(client)
             await until(lambda: leader._transport.current is not before)
             await asyncio.sleep(FLEET.mesh.lease + 1)

@@ -44,6 +44,7 @@ class MovableClient:
         self._rcm = RcmLink(mesh, fleet, self._store, supervisor)
         self.expected_came = asyncio.Event()
         """Set at the first notice of an ARC that is expected: from then on it is this client's."""
+        self._store.on_awaited = lambda arc: supervisor.spawn(self._await_again(arc))
         self._unclaimed: dict[str, OpenArc] = {}
         """What is expected, come or not, and was not asked for yet."""
         self._may_end = asyncio.Event()
@@ -91,24 +92,36 @@ class MovableClient:
         return False
 
     async def _claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
-        """The ARC of this name and these needs that is expected, once it has come; None if there is none. What does not
-        come may have been handed over unheard: it is to be asked for, under its id, at its place."""
+        """The ARC of this name and these needs that is expected, once it has come; None if there is none."""
         unclaimed = self._unclaimed.values()
         arc = next((arc for arc in unclaimed if (arc.name, arc.needs) == (name, needs)), None)
         if arc is None:
             return None
         del self._unclaimed[arc.id]
         try:
-            async with asyncio.timeout(EXPECT_TIMEOUT):
-                while arc.id in self._store.expected:
-                    await self._store.changed(arc)
-        except TimeoutError:
-            log.warning("%s was handed over and nothing heard of it for %g s; it is asked for", name, EXPECT_TIMEOUT)
-            self._store.adopt(arc)
+            await self._come(arc)
         finally:
             if arc.id in self._store.expected:
                 self._store.forget(arc)
         return arc if arc.open else None
+
+    async def _come(self, arc: OpenArc) -> None:
+        """Waits for what is expected. What does not come may have been handed over unheard: it is to be asked for,
+        under its id, at its place."""
+        try:
+            async with asyncio.timeout(EXPECT_TIMEOUT):
+                while arc.id in self._store.expected:
+                    await self._store.changed(arc)
+        except TimeoutError:
+            log.warning(
+                "nothing was heard of %s for %g s, handed over to here; it is asked for", arc.name, EXPECT_TIMEOUT
+            )
+            self._store.adopt(arc)
+
+    async def _await_again(self, arc: OpenArc) -> None:
+        await self._come(arc)
+        if arc.open:
+            await self._ask_again(arc)
 
     async def _give_back_unwanted(self, arc: OpenArc) -> None:
         await asyncio.sleep(CLAIM_TIMEOUT)

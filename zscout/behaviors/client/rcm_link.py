@@ -15,6 +15,7 @@ from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStor
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
+from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
 from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd
@@ -127,7 +128,7 @@ class RcmLink:
 
     async def watch_lease(self) -> NoReturn:
         """Ends holds when no RCM published for the hold lease: their RCs have ended them as well."""
-        lease = self.fleet.timing.hold_lease
+        lease, suspect = self.fleet.timing.hold_lease, self.mesh.suspicions.suspect
         while True:
             await asyncio.sleep(lease / SECOND / CHECKS_PER_LEASE)
             now = self.mesh.now()
@@ -136,6 +137,9 @@ class RcmLink:
             if any(believed):
                 # It may have published right after the last check.
                 self._last_contact = now - lease // CHECKS_PER_LEASE
+            seen = self.leader is not None and not self._stall.fresh()
+            silent = now - self._last_contact >= lease // 2
+            suspect("an RCM is seen that does not publish", so=seen and silent, patience=UNHEARD)
             if now - self._last_contact < lease or self._stall.fresh():
                 continue
             for arc in self.store.open:

@@ -47,7 +47,8 @@ class OpenArc:
     """A request from its first asking to its end.
 
     `state` is `asking` until the first notice, then `queued`, `running`, `ended` or `refused`. One that
-    another client is to hand over is `expected` until the first notice; one that was handed over is `moved`.
+    another client is to hand over is `expected` until the first notice, and `awaited` where a later RCM knows it as
+    that client's still; one that was handed over is `moved`.
     """
 
     id: str
@@ -86,6 +87,8 @@ class OpenArc:
     shown: Term = NO_TERM
     """In which term its place was shown last, to an RCM that had given a worse one."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
+    came: Term | None = None
+    """In which term another client handed it over, until an RCM of a later one says whose it is."""
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
 
     @classmethod
@@ -101,7 +104,7 @@ class OpenArc:
 
     @property
     def open(self) -> bool:
-        return self.state in ("asking", "queued", "running")
+        return self.state in ("asking", "queued", "running", "awaited")
 
     def take(self, notice: Notice, now: Ns) -> bool:
         """Applies a newer notice of this request. False if it is an old one, a replaced RCM's, or reports a
@@ -111,6 +114,8 @@ class OpenArc:
         if (bound := self._binding(notice)) is None:
             return False
         self.last, self.unconfirmed = (notice.term, notice.step), None
+        if self.came is not None and self.came < notice.term:
+            self.came = None
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
         if notice.state != "running":
@@ -178,11 +183,22 @@ class OpenArc:
 
     def take_first(self, notice: Notice, now: Ns) -> bool:
         """Applies the first notice of an expected request. False if it is none: an old one, or not credible."""
-        self.state = "asking"
+        before, self.state = self.state, "asking"
         if notice.state != "ended" and self.take(notice, now):
+            self.came = notice.term
             return True
-        self.state = "expected"
+        self.state = before
         return False
+
+    def is_not_here_yet(self, notice: Notice) -> bool:
+        """Whether the notice says that it is another client's still, which had handed it over to this one at an RCM
+        that was replaced: it is to hand it over once more."""
+        return self.open and notice.outcome == "handed_over" and self.came is not None and self.came < notice.term
+
+    def await_again(self, notice: Notice, now: Ns) -> None:
+        """It is not here yet."""
+        self.lose("its old client is to hand it over once more", now)
+        self.state, self.came, self.last = "awaited", None, (notice.term, notice.step)
 
     def move(self, now: Ns) -> None:
         """It goes on in another client."""
@@ -250,6 +266,8 @@ class RequestStore:
         self.resumed.set()
         self.ask_again: Callable[[OpenArc], object] = lambda _: None
         """Called with what the RCM dropped because this client seemed gone, or has at a worse place than it had."""
+        self.on_awaited: Callable[[OpenArc], object] = lambda _: None
+        """Called with what came from another client, and is that one's still by the word of a later RCM."""
         self.watchers: list[Callable[[OpenArc], None]] = []
         """Each is called with whatever there is news of."""
 
@@ -275,7 +293,7 @@ class RequestStore:
     def adopt(self, arc: OpenArc) -> None:
         """What was expected is this client's: told so by a notice, or to be asked for."""
         if self.expected.pop(arc.id, None) is not None:
-            if arc.state == "expected":
+            if arc.state in ("expected", "awaited"):
                 arc.state = "asking"
             self.add(arc)
 
@@ -308,6 +326,12 @@ class RequestStore:
         if notice.outcome == "handed_over" and arc.id in self.reclaimed and arc.open:
             self.move(arc, notice)
             self.reclaim(arc)
+        elif arc.is_not_here_yet(notice):
+            arc.await_again(notice, self._now())
+            del self.arcs[arc.id]
+            self.expected[arc.id] = arc
+            self.notify(arc)
+            self.on_awaited(arc)
         elif arc.take(notice, self._now()):
             self.reclaimed.discard(arc.id)
             if not arc.open and arc.outcome == "client_lost":

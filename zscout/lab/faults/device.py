@@ -36,7 +36,8 @@ class Device:
         self.log(f"{self.name} begins for {holder.client} {holder.arc} {number(holder.grant)}")
         self._forget_dead()
         # The same ARC, in another client: it was handed over.
-        self.holders = {grant: held for grant, held in self.holders.items() if held[1].place != holder.place}
+        arc = holder.id, holder.place
+        self.holders = {grant: held for grant, held in self.holders.items() if (held[1].id, held[1].place) != arc}
         if self.capacity is None and self.holders:
             other = next(one for _, one in self.holders.values())
             self.broken(f"two holders of {self.name}: {other.client} and {holder.client}")
