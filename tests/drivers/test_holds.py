@@ -164,10 +164,13 @@ def test_read(read: RcmState, carries: bool, now_holds: list[int], presents: boo
     assert not change.removed
 
 
-def test_what_is_read_under_a_newer_grant_is_not_held_twice() -> None:
+@pytest.mark.parametrize(("known_as", "held", "over"), [("id2", [4], [2]), ("id4", [2, 4], [])])
+def test_what_is_read_under_a_newer_grant_is_not_held_twice(known_as: str, held: list[int], over: list[int]) -> None:
+    """Another ARC at its place is one that was taken back, and both clients live."""
     rc = holding(HELD)
-    change = rc.apply_snapshot(state(5, replace(view(4), place=Place(TERM, 2))), NOW, lambda holders: len(holders) == 1)
-    assert (grants(rc), [one.grant for one in change.removed]) == ([4], [Grant(TERM, 2)])
+    newer = state(5, replace(view(4), id=known_as, place=Place(TERM, 2)))
+    change = rc.apply_snapshot(newer, NOW, lambda holders: len(holders) == len(held))
+    assert (grants(rc), [one.grant for one in change.removed]) == (held, [Grant(TERM, seq) for seq in over])
 
 
 def test_what_is_read_of_a_free_rc_is_held_whole() -> None:
