@@ -67,7 +67,20 @@ def test_what_is_left_of_the_faults_of_a_failing_run_fails_alike() -> None:
 
 
 def test_runs_are_added_up_as_json() -> None:
-    program = "import sys; from zscout.cli.main import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "study", "faults", "--seed", "1-2", "--json"]
-    told = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=120).stdout)
+    done = study("1-2")
+    told = json.loads(done.stdout)
     assert (told["runs"], told["broken"], sum(told["faults"].values()) > 0) == (2, {}, True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_run_that_breaks_a_promise_is_told_with_its_seed() -> None:
+    done = study("1-2", "--without", "safe first")
+    assert done.returncode == 1
+    assert 1 in {seed for seeds in json.loads(done.stdout)["broken"].values() for seed in seeds}
+    assert done.stderr.startswith("seed 1 BROKEN ")
+
+
+def study(seeds: str, *more: str) -> subprocess.CompletedProcess[str]:
+    program = "import sys; from zscout.cli.main import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "study", "faults", "--seed", seeds, "--json", *more]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -267,7 +268,7 @@ def faults(seeds: range, runs: int | None, guard: str | None, processes: int | N
     if runs is not None:
         seeds = range(seeds[0], seeds[0] + runs)
     from zscout.lab.faults.guards import GUARDS, without
-    from zscout.lab.faults.runs import FaultStudy, print_report, run, shrink
+    from zscout.lab.faults.runs import FaultRun, FaultStudy, print_report, run, shrink
     from zscout.lab.faults.simulation import simulate
 
     if guard is not None and guard not in GUARDS:
@@ -286,7 +287,13 @@ def faults(seeds: range, runs: int | None, guard: str | None, processes: int | N
     from zscout.lab.study.process_pool import run_trials
 
     found = FaultStudy()
-    common.run(run_trials(partial(run, guard=guard), list(seeds), processes, found.add))
+
+    def take(one: FaultRun) -> None:
+        found.add(one)
+        for text in one.broken[:1]:  # at once: thousands of runs take an hour
+            terminal.print_line(f"seed {one.seed} BROKEN {text}", sys.stderr)
+
+    common.run(run_trials(partial(run, guard=guard), list(seeds), processes, take))
     # Not `asdict`: in Python 3.11 it takes counters apart.
     _show(vars(found), None, partial(print_report, found), as_json=as_json)
     return 1 if found.broken else 0
