@@ -301,6 +301,27 @@ def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> N
     kit.run(story())
 
 
+def test_a_client_that_stood_still_itself_gives_its_rcs_a_second_all_the_same() -> None:
+    async def story() -> None:
+        loop, still = asyncio.get_running_loop(), 0.0
+        client, known = Client(mesh(lambda: round((loop.time() + still) * SECOND)), default_fleet()), arc()
+        known.take(runs({}), client.mesh.now())
+
+        async def command(rc: str, *_: Any, **__: Any) -> None:
+            nonlocal still
+            if not still:
+                still = 2.0
+                raise CommandRefused(rc, Problem("unknown", "no answer"))
+            if loop.time() < wakes:
+                raise CommandRefused(rc, Problem("stale", "it stood still as well"))
+
+        wakes = loop.time() + 0.3
+        client.command = command  # type: ignore[assignment,method-assign]
+        assert await client.granted(known) == FIRST
+
+    kit.run(story())
+
+
 def test_who_shows_a_place_shows_the_term_as_well() -> None:
     async def story() -> None:
         mesh = SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)

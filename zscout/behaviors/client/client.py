@@ -217,17 +217,24 @@ class Client(MovableClient):
                 await self.changed(arc)
 
     async def _confirm(self, arc: OpenArc, grant: Grant) -> list[CommandRefused]:
-        """Asks all RCs of a grant, side by side, whether they know of it. Returns those that do not say so."""
-        deadline = self.mesh.now() + round(CONFIRM_TIMEOUT * SECOND)
+        """Asks all RCs of a grant, side by side, whether they know of it. Returns those that do not say so, within a
+        second in which this client did not stand still itself."""
+        second = round(CONFIRM_TIMEOUT * SECOND)
+        deadline = self.mesh.now() + second
 
         async def one(rc: str) -> CommandRefused | None:
+            nonlocal deadline
             pause = BACKOFF[0]
             while True:
                 left = (deadline - self.mesh.now()) / SECOND
                 try:
                     await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
                 except CommandRefused as refused:
-                    if arc.grant != grant or refused.code not in CONFIRM_AGAIN or left <= 0:
+                    if arc.grant != grant or refused.code not in CONFIRM_AGAIN:
+                        return refused
+                    if self._rcm.stood_still:
+                        deadline = self.mesh.now() + second
+                    elif left <= 0:
                         return refused
                 else:
                     return None

@@ -93,6 +93,11 @@ class RcmLink:
         self.term = max(self.term, term)
 
     @property
+    def stood_still(self) -> bool:
+        """Whether this process did, so lately that answers which came meanwhile may have been overlooked."""
+        return self._stall.fresh()
+
+    @property
     def _hears(self) -> bool:
         return self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease
 
@@ -137,10 +142,10 @@ class RcmLink:
             if any(believed):
                 # It may have published right after the last check.
                 self._last_contact = now - lease // CHECKS_PER_LEASE
-            seen = self.leader is not None and not self._stall.fresh()
+            seen = self.leader is not None and not self.stood_still
             silent = now - self._last_contact >= lease // 2
             suspect("an RCM is seen that does not publish", so=seen and silent, patience=UNHEARD)
-            if now - self._last_contact < lease or self._stall.fresh():
+            if now - self._last_contact < lease or self.stood_still:
                 continue
             for arc in self.store.open:
                 if arc.state == "running":
