@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from msgspec.structs import replace
 
+from tests.behaviors.client.small_fleet import RC, small_fleet
 from tests.mesh.kit import run
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.components.component import SafePointGate
@@ -14,7 +16,17 @@ from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import MemoryNetwork
-from zscout.messages import ComponentOperation, ComponentSpec, ComponentView, MoveComponent
+from zscout.mesh import IncomingQuery
+from zscout.messages import (
+    ComponentList,
+    ComponentOperation,
+    ComponentSpec,
+    ComponentView,
+    ListComponents,
+    MoveComponent,
+    Phase,
+    StopComponent,
+)
 from zscout.types import SECOND
 
 STANDS_BY = ComponentView("c", 2, "b", ComponentSpec("counter"), "standby")
@@ -36,6 +48,41 @@ def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
 
         asyncio.get_running_loop().call_later(1, serve)
         await move._give(b"", [])
+
+    run(test())
+
+
+def test_where_the_rcm_refuses_the_hand_over_the_other_one_is_stopped() -> None:
+    """An RCM that was replaced may have carried it out: both would act."""
+
+    async def test() -> None:
+        async with small_fleet("c.1") as (fleet, (client,)):
+            arc = await client.request("work", {RC: {}}, min_runtime=3600)
+            grant = await client.granted(arc)
+            node, gate = fleet.mesh("b", "node"), SafePointGate()
+            ordered: list[str] = []
+
+            def answer(query: IncomingQuery[ComponentOperation]) -> None:
+                order = query.message
+                ordered.append(type(order).__name__)
+                listed = isinstance(order, ListComponents)
+                phase: Phase = "ended" if isinstance(order, StopComponent) else "standby"
+                view = replace(STANDS_BY, phase=phase, ended="stopped" if phase == "ended" else None)
+                query.answer(ComponentList("b", [view]) if listed else view)
+
+            node.serve(node.keys.component("b"), ComponentOperation, answer)
+            token = node.alive(Token("b", Role.NODE, "node", "i"))
+            moving = asyncio.ensure_future(
+                OutgoingMove(client, Counter({}), gate, MoveComponent("c", 1, "b", 2)).carry_out()
+            )
+            while not moving.done():
+                await gate.come()
+                await asyncio.sleep(0.01)
+            with pytest.raises(NotMoved, match="refused the hand-over"):
+                await moving
+            assert ordered[-1] == "StopComponent"
+            assert (client.paused, arc.state, arc.grant) == (False, "running", grant)
+            token.close()
 
     run(test())
 

@@ -176,8 +176,9 @@ class MovableClient:
         """Hands all `open_requests` of this paused client to another one, which expects them, in one step. On
         return that is done, and they go on there.
 
-        Raises RequestRefused where nothing was handed over; with code `unknown` where no RCM could tell
-        within 10 s: call it again; or see to it that the other client is gone, and `take_back`."""
+        Raises RequestRefused where the RCM refuses it; with code `unknown` where none could tell within 10 s: call it
+        again; or see to it that the other client is gone, which an RCM before may have told all the same, and
+        `take_back`."""
         if not self.paused:
             raise RuntimeError("pause() the client before it hands over all: it would ask for it again")
         arcs = sorted(self._store.acknowledged, key=lambda arc: arc.grant is None)
@@ -187,8 +188,10 @@ class MovableClient:
         try:
             async with asyncio.timeout(HAND_OVER):
                 await self._hand_over(arcs, to)
-        except TimeoutError:
+        except (TimeoutError, RequestRefused) as error:
             self._store.undecided = {arc.id for arc in arcs if arc.open}
+            if isinstance(error, RequestRefused):
+                raise
             unknown = f"no RCM told within {HAND_OVER:g} s whether {to} has taken over; ask again"
             raise RequestRefused(Problem("unknown", unknown)) from None
 

@@ -92,17 +92,18 @@ class OutgoingMove:
             if not await self._confirmed():
                 raise NotMoved("move_failed", f"incarnation {self.incarnation} on {self.to} ended")
             return
+        words = f"incarnation {self.incarnation} on {self.to} ended; its ARCs are asked anew here"
         try:
             await self._client.hand_over_all(Sender(self.to, f"{self._name}.{self.incarnation}"))
         except RequestRefused as refused:
             if refused.code != "unknown":
-                raise NotMoved("move_failed", f"the RCM refused the hand-over: {refused}") from None
+                words = f"the RCM refused the hand-over: {refused}"
+            # One that it replaced may have carried it out.
             going_on = await self._stop_there()
         else:
             going_on = await self._confirmed()
         if not going_on:
             self._client.take_back()
-            words = f"incarnation {self.incarnation} on {self.to} ended; its ARCs are asked anew here"
             raise NotMoved("move_failed", words)
 
     async def _give(self, state: bytes, requests: list[OpenRequest]) -> None:
@@ -136,7 +137,7 @@ class OutgoingMove:
         return await self._until_known(messages.ActivateComponent(self._name, self.incarnation))
 
     async def _stop_there(self) -> bool:
-        """It is unknown whether the hand-over was carried out: whoever runs by now has the ARCs. False: the
+        """It is unknown whether an RCM carried out the hand-over: whoever runs by now has the ARCs. False: the
         other one did not, and will not."""
         reply = await self._ask(messages.ListComponents(self._name), messages.ComponentList, ASK_TIMEOUT)
         if isinstance(reply, messages.ComponentList) and any(
