@@ -417,6 +417,8 @@ class Simulation:
         failing = {one for fault in faults if fault.kind in ("freeze", "stall") for one in fault.whom}
         failing |= {self.killed[fault][0] for fault in faults if fault in self.killed}
         sound = {host for host in self.hosts if f"{host}/node" not in failing}
+        if sound.isdisjoint(self.candidates_at):
+            return True
         sides = [self._side(fault, hosts) for fault in faults if fault.kind in ("isolate", "part")]
         beside = {*self.hosts}.intersection(*sides) & sound
         return any(self._touches(fault, names, hosts, since, beside) for fault in faults)
