@@ -60,8 +60,8 @@ class RcAsk(Message, frozen=True):
 
     promise: Term | None = None
     above: str | None = None
-    """The host of the candidate that asks, where others were refused to it for a term far above: the jump is no reason
-    to refuse it then, if its token is seen."""
+    """The host of the candidate that asks, where it was refused for a term far above, or an RC that it sees obeys one:
+    the jump is no reason to refuse it then, if its token is seen."""
     instance: str | None = None
     """That of the RC whose token led to this question: another that answers is not meant, and may not be seen."""
 

@@ -327,6 +327,29 @@ def test_a_candidate_that_alone_believes_a_forged_term_leads_once_rcs_believe_it
     run(story())
 
 
+@pytest.mark.parametrize("has_token", [True, False])
+def test_a_candidate_that_rcs_misled_before_it_knew_better_tells_the_others_so(has_token: bool) -> None:
+    """It believed their term as it heard of no other: to those that did it is absurd."""
+
+    async def story() -> None:
+        fleet = FakeFleet("h1", "h3")
+        robot, first, misled = await a_robot(fleet), fleet.candidate("h1"), fleet.candidate("h3")
+        await until(lambda: robot.holds.term != NO_TERM)
+        misled.known = far = Term(10**9, "mad")
+        fleet.network.kill(first.mesh)
+        mad = fleet.rc("robot/b", term=far)
+        if not has_token:
+            mad.token.close()
+        await until(lambda: misled.rcm)
+        assert misled.rcm is not None
+        joined = {one.name for one in misled.rcm.core.status().rcs if one.present}
+        assert joined == ({"robot/a", "robot/b"} if has_token else {"robot/b"})
+        await first.stop()
+        await misled.stop()
+
+    run(story())
+
+
 def test_a_leader_without_rcs_steps_down_where_those_it_sees_do_not_believe_its_term() -> None:
     async def story() -> None:
         fleet = FakeFleet("h1", "h3")

@@ -189,6 +189,7 @@ class Candidate:
         if self.known > before:
             self.election.rivalled(self.mesh.now())
             return True
+        self._goes_above |= await self._divided([state for state, _ in states])
         host = self.mesh.me.host
         others = [bool(state.leader) for state, _ in states if state.host != host]
         own = [bool(state.leader) for state, _ in states if state.host == host]
@@ -198,6 +199,13 @@ class Candidate:
                 self.mesh.suspicions.suspect(UNSEEN, patience=WAITS)
             return True
         return False
+
+    async def _divided(self, states: list[RcState]) -> bool:
+        """Whether an RC that is seen obeys a term which is absurd to others: they are told why this one goes above."""
+        highest = max(states, key=lambda state: state.term, default=None)
+        if highest is None or not any(absurd(highest.term, state.term) for state in states):
+            return False
+        return bool(await self.mesh.living(self.mesh.keys.alive_rc(highest.rc), timeout=self._timeout))
 
     async def _take_over(self) -> bool:
         """One attempt. Where it finds a higher term promised, another candidate may be about to lead in it: the next
