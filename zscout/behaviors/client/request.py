@@ -87,7 +87,7 @@ class OpenArc:
     shown: Term = NO_TERM
     """In which term its place was shown last, to an RCM that had given a worse one."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
-    came: Term | None = None
+    _came: Term | None = field(default=None, init=False, repr=False)
     """In which term another client handed it over, until an RCM of a later one says whose it is."""
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
 
@@ -114,8 +114,8 @@ class OpenArc:
         if (bound := self._binding(notice)) is None:
             return False
         self.last, self.unconfirmed = (notice.term, notice.step), None
-        if self.came is not None and self.came < notice.term:
-            self.came = None
+        if self._came is not None and self._came < notice.term:
+            self._came = None
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
         if notice.state != "running":
@@ -185,7 +185,7 @@ class OpenArc:
         """Applies the first notice of an expected request. False if it is none: an old one, or not credible."""
         before, self.state = self.state, "asking"
         if notice.state != "ended" and self.take(notice, now):
-            self.came = notice.term
+            self._came = notice.term
             return True
         self.state = before
         return False
@@ -193,12 +193,12 @@ class OpenArc:
     def is_not_here_yet(self, notice: Notice) -> bool:
         """Whether the notice says that it is another client's still, which had handed it over to this one at an RCM
         that was replaced: it is to hand it over once more."""
-        return self.open and notice.outcome == "handed_over" and self.came is not None and self.came < notice.term
+        return self.open and notice.outcome == "handed_over" and self._came is not None and self._came < notice.term
 
     def await_again(self, notice: Notice, now: Ns) -> None:
         """It is not here yet."""
         self.lose("its old client is to hand it over once more", now)
-        self.state, self.came, self.last = "awaited", None, (notice.term, notice.step)
+        self.state, self._came, self.last = "awaited", None, (notice.term, notice.step)
 
     def move(self, now: Ns) -> None:
         """It goes on in another client."""

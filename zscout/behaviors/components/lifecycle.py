@@ -231,6 +231,8 @@ class ComponentLifecycle:
                 dead = await self._move.carry_out()
             except BaseException as error:
                 self._move = None
+                if self._left.is_set() and isinstance(error, Exception):
+                    return  # another one goes on: this one has left the mesh
                 if self._wanted is not None and self._story is not None:
                     self._story.cancel()
                 if isinstance(error, NotMoved) or not isinstance(error, Exception):
