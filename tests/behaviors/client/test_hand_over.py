@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from msgspec.structs import replace
 
 from tests.behaviors.client.small_fleet import ECHO, RC, SmallFleet, small_fleet
 from tests.mesh.kit import run, until
@@ -13,7 +14,7 @@ from zscout.behaviors.client.request import OpenArc
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh
 from zscout.mesh.renewal import Suspicions
-from zscout.messages import ClientRequests, Grants, RcAsk
+from zscout.messages import ClientRequests, Grants, Notice, RcAsk
 from zscout.types import Grant, Place, Term
 
 
@@ -214,6 +215,30 @@ def test_what_an_rcm_that_was_replaced_has_handed_over_is_awaited_once_more() ->
             assert (moved.id, moved.place) == (waits.id, waits.place)
             await rival.close()
             assert await granting is not None
+
+    run(test())
+
+
+def test_what_is_awaited_once_more_is_handed_on() -> None:
+    """The RCM of a later term has dropped the old client meanwhile."""
+
+    async def test() -> None:
+        async with small_fleet("one", "two") as (fleet, (one, two)):
+            arc = await one.request("work", {"robot/z": {}}, min_runtime=3600)
+            before = arc.id, arc.place
+            # As if it had come in an earlier term, and this RCM knew it as another client's.
+            fleet.candidate("h1")
+            await asyncio.sleep(2)
+            arc._came = arc.last[0]
+            told = Notice(arc.id, arc.name, "h/one", "ended", Term(arc.last[0].counter + 1, "later"), 1)
+            one._store.take(arc, replace(told, outcome="handed_over"))
+            assert (arc.state, one.open_requests()) == ("awaited", [])
+            one.pause()
+            two.expect(one.open_requests())
+            moving = asyncio.create_task(one.hand_over_all(two.mesh.me))
+            moved = await two.request("work", {"robot/z": {}}, min_runtime=3600)
+            await moving
+            assert (moved.id, moved.place) == before
 
     run(test())
 

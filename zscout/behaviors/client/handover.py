@@ -140,6 +140,10 @@ class MovableClient:
         self._store.resumed.clear()
         self._store.undecided.clear()
         self._store.reclaimed.clear()
+        for arc in [arc for arc in self._store.expected.values() if arc.open]:
+            # It may have to be handed on before it has come once more.
+            self._store.adopt(arc)
+            self._store.notify(arc)
 
     @property
     def paused(self) -> bool:
