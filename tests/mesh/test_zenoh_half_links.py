@@ -92,7 +92,7 @@ def test_what_was_declared_stays_unknown_where_one_end_alone_lost_the_link(stack
     relay.end_far_half()
     _until(lambda: a.info.links() == [] and len(b.info.links()) == 1)
     _open(stack, [], list(own.values()))
-    # Now a has made a link with b, for which it is one more of the two that it has with a. Each end lists it in its own time.
+    # Now a has made a link with b, which has two with a then. Each lists it in its own time.
     _until(lambda: (_links(a, b), _links(b, a)) == (1, 2))
     assert _tokens(a) == []
     del first

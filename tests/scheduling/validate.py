@@ -6,8 +6,9 @@ from collections import Counter
 
 from zscout.keyexpr import matcher
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcState
+from zscout.scheduling.model import Arc, ArcState
 from zscout.scheduling.state import QueueIndex, SchedulerState
+from zscout.types import Place
 
 QUEUED = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.WATCHING, ArcState.PARKED)
 
@@ -66,6 +67,17 @@ def _check_state(state: SchedulerState) -> None:
     assert known == state.queued.keys() | state.running.keys() | state.held_back.keys(), (
         "the clients' ARCs are not those known"
     )
+
+    at_place: dict[Place, list[Arc]] = {}
+    for arc in (*state.running.values(), *state.queued.values(), *state.held_back.values()):
+        at_place.setdefault(arc.place, []).append(arc)
+    for place, arcs in at_place.items():
+        first = state.at_place(place)
+        considered = [arc for arc in arcs if arc.state is not ArcState.HELD_BACK or arc.held_back is not None]
+        assert first in considered, f"of {arcs} nobody is considered"
+        assert all(arc is first or arc.state is ArcState.HELD_BACK for arc in arcs), f"{arcs} may run at once"
+        assert all(arc.reason is not None for arc in arcs if arc.hold is None), f"of {arcs} one waits without a reason"
+    assert at_place.keys() == state._at_place.keys(), "places of nobody"
 
 
 def _check_index(state: SchedulerState, index: QueueIndex) -> None:

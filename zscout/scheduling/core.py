@@ -78,6 +78,9 @@ class Core:
             self._apply(event)
         if self._state.queued:
             self.strategy.run_pass(self._state, self)
+        for arc in self._state.held_back.values():
+            if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
+                self.wait(arc, _claimed_by(other))
         self._set_wake()
         return self._effects
 
@@ -126,9 +129,9 @@ class Core:
 
     def at_place(self, place: Place) -> list[ArcId]:
         """The ARCs of this place: one, or more where clients claim the same after a takeover."""
-        state = self._state
-        arcs = (*state.running.values(), *state.queued.values(), *state.held_back.values())
-        return [arc.id for arc in arcs if arc.place == place]
+        first = self._state.at_place(place)
+        others = [arc.id for arc in self._state.held_back.values() if arc.place == place and arc is not first]
+        return others if first is None else [first.id, *others]
 
     def could_have_issued(self, place: Place) -> bool:
         """Whether this core may have given out `place`; True for other terms, of which it does not know."""
@@ -261,6 +264,7 @@ class Core:
         if arc is not None and arc.hold is None and place < arc.place:
             held_back = arc.held_back
             self._state.dequeue(arc)
+            self._state.leave_place(arc)
             arc.place = place
             arc.take(arc.request)
             self._state.enqueue(arc, arc.since)
@@ -330,7 +334,7 @@ class Core:
             self._forget(known)
             held = replace(held, place=min(known.place, held.place))
         arc = self._take_up(held)
-        if known is not None and self._state.queued.get(arc.id) is arc:
+        if known is not None and arc.hold is None and self._state.arc(arc.id) is arc:
             # As its client asked: of an RC that is absent the others of its gang know no parameters.
             self._state.dequeue(arc)
             self._forget(arc)
@@ -340,21 +344,28 @@ class Core:
         self._expire()
 
     def _take_up(self, held: model.RecoveredHold) -> Arc:
-        """A hold of an earlier term goes on, if all its RCs are there and free; else it ends, and its ARC is queued."""
+        """A hold of an earlier term goes on, if all its RCs are there and free, and no other ARC runs at its place;
+        else it ends, and its ARC is queued."""
         arc = self._new_arc(held.request, held.place)
         if arc.patterns:
             self._state.bind(arc, held.bound)
         hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc))
         absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
         taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
-        over = held.end <= self._state.now
-        if not over or not (absent or taken):
-            self._state.enqueue(arc, self._state.now)
+        other = self._state.at_place(arc.place)
+        broken: Reason | None = None
         if absent or taken:
-            code = ReasonCode.RC_LOST if absent else ReasonCode.SUPERSEDED
-            reason = Reason(code, (*absent, *taken)[:1])
+            broken = Reason(ReasonCode.RC_LOST if absent else ReasonCode.SUPERSEDED, (*absent, *taken)[:1])
+        elif other is not None and other.hold is not None:
+            broken = _claimed_by(other)
+        elif other is not None:
+            self._state.put_before(arc, other)
+        over = held.end <= self._state.now
+        if not over or not broken:
+            self._state.enqueue(arc, self._state.now)
+        if broken:
             outcome = Outcome.COMPLETED if over and not arc.request.keep else Outcome.LOST
-            self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=not over))
+            self._effects.append(self._revocation(arc, hold, outcome, broken, requeued=not over))
         else:
             self._state.start(arc, hold)
         return arc
@@ -446,3 +457,7 @@ class Core:
         if at != self._wake or self._run_again:
             self._wake = at
             self._effects.append(model.WakeAt(at))
+
+
+def _claimed_by(other: Arc) -> Reason:
+    return Reason(ReasonCode.CLAIMED, detail=other.request.client)

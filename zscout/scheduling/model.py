@@ -88,22 +88,23 @@ class ArcState(StrEnum):
     PARKED = "parked"
     """An RC that does not answer proposals keeps it out."""
     HELD_BACK = "held_back"
-    """An RC did not confirm its last hold: it is not considered for a while."""
+    """An RC did not confirm its last hold: it is not considered for a while. Or another ARC has its place."""
     RUNNING = "running"
     ENDED = "ended"
 
 
 _CHECKED: Final = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.WATCHING, ArcState.PARKED)
-_LEAVES: Final = (ArcState.RUNNING, ArcState.ENDED)
+_LEAVES: Final = (ArcState.HELD_BACK, ArcState.RUNNING, ArcState.ENDED)
+_WAITS: Final = (ArcState.READY, ArcState.HELD_BACK)
 TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
-    ArcState.NEW: (ArcState.READY,),
-    ArcState.READY: (*_CHECKED, ArcState.HELD_BACK, *_LEAVES),
+    ArcState.NEW: _WAITS,
+    ArcState.READY: (*_CHECKED, *_LEAVES),
     ArcState.VOTING: (*_CHECKED, *_LEAVES),
     ArcState.DEFERRED: (*_CHECKED, *_LEAVES),
     ArcState.WATCHING: (*_CHECKED, *_LEAVES),
     # It is made ready before it is checked.
     ArcState.PARKED: (ArcState.READY, *_LEAVES),
-    ArcState.HELD_BACK: (ArcState.READY, ArcState.ENDED),
+    ArcState.HELD_BACK: (*_WAITS, ArcState.ENDED),
     # Preempted, or an RC was lost: queued again.
     ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),
     ArcState.ENDED: (),
@@ -157,7 +158,7 @@ class Arc:
     unconfirmed: int = 0
     """How many of its holds in a row were not confirmed."""
     held_back: tuple[Ns, tuple[RcName, ...]] | None = None
-    """While it is HELD_BACK: until when, and for which RCs."""
+    """While it is HELD_BACK: until when, and for which RCs; None where another ARC has its place."""
     starving: bool = False
     """Whether it has waited for too long (`reservations.py`)."""
     bound: Mapping[Need, RcName] = field(default_factory=dict)

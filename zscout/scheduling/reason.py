@@ -24,6 +24,8 @@ class ReasonCode(StrEnum):
     """The RC refuses it beside those who hold it; `detail` in the RC's own words."""
     UNCONFIRMED = "unconfirmed"
     """`rcs` did not confirm a grant: it is not granted again for a while."""
+    CLAIMED = "claimed"
+    """The client `detail` has an ARC of the same place: one of the two may run."""
     SILENT = "silent"
     """`rcs` do not answer proposals."""
     RESERVED = "reserved"
@@ -103,6 +105,7 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ReasonCode.VETOED: lambda one: f"{one.rcs[0]} refuses" + (f": {one.detail}" if one.detail else ""),
     ReasonCode.SILENT: lambda one: f"{_listed(one)} does not answer",
     ReasonCode.UNCONFIRMED: lambda one: f"{_listed(one)} did not confirm the grant",
+    ReasonCode.CLAIMED: lambda one: f"{one.detail} claims it as well",
     ReasonCode.RESERVED: lambda one: (
         f"{one.rcs[0]} is kept for {one.by[0].name}, whose time to wait is over before this ends"
     ),

@@ -18,7 +18,7 @@ from zscout.keyexpr import matcher
 from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc, union
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
-from zscout.types import ArcId, ClientId, Need, Ns, Params, RcName
+from zscout.types import ArcId, ClientId, Need, Ns, Params, Place, RcName
 
 
 class QueueIndex:
@@ -128,7 +128,9 @@ class SchedulerState:
         self.queued: dict[ArcId, Arc] = {}
         self.running: dict[ArcId, Arc] = {}
         self.held_back: dict[ArcId, Arc] = {}
-        """ARCs that are queued, but not considered for a while."""
+        """ARCs that are queued, but not considered for a while, or as long as another has their place."""
+        self._at_place: dict[Place, Arc] = {}
+        """By place: who is considered, or runs. Two clients may claim one ARC, which has to run once."""
         self.present = 0
         """Bits of the RCs that are there."""
         self.sharable = 0
@@ -228,12 +230,16 @@ class SchedulerState:
     def enqueue(self, arc: Arc, since: Ns) -> None:
         arc.since, arc.entry = since, self._next_entry()
         arc.rcs = arc.rcs or tuple(self.rcs_in(arc.mask))
+        self._clients.setdefault(arc.request.client, {})[arc.id] = arc
+        if self._at_place.setdefault(arc.place, arc) is not arc:
+            arc.move_to(ArcState.HELD_BACK)
+            self.held_back[arc.id] = arc
+            return
         self.queued[arc.id] = arc
         if arc.patterns:
             self.by_pattern[arc.id] = arc
         self._count_demand(arc, 1)
         self.index.add(arc)
-        self._clients.setdefault(arc.request.client, {})[arc.id] = arc
 
     def dequeue(self, arc: Arc) -> None:
         """A queued ARC waits no more, and runs neither."""
@@ -258,6 +264,22 @@ class SchedulerState:
             if arc.held_back is not None and (arc.held_back[0] <= self.now or rc in arc.held_back[1]):
                 self.consider_again(arc)
 
+    def at_place(self, place: Place) -> Arc | None:
+        """Who is considered at this place, or runs."""
+        return self._at_place.get(place)
+
+    def put_before(self, arc: Arc, other: Arc) -> None:
+        """`arc`, which is new, has the place of `other`, which is queued and waits for its end now."""
+        self._at_place[arc.place] = arc
+        self.consider_again(other)
+
+    def leave_place(self, arc: Arc) -> None:
+        """`arc` is over, or gets another place: who claims this one as well is considered."""
+        if self._at_place.get(arc.place) is arc:
+            del self._at_place[arc.place]
+            for other in [one for one in self.held_back.values() if one.place == arc.place and one.held_back is None]:
+                self.consider_again(other)
+
     def consider_again(self, arc: Arc) -> None:
         self.dequeue(arc)
         self.enqueue(arc, arc.since)
@@ -266,6 +288,7 @@ class SchedulerState:
         """An ARC that neither waits nor runs is over for good."""
         arc.move_to(ArcState.ENDED)
         self._forget_client(arc)
+        self.leave_place(arc)
 
     def _forget_client(self, arc: Arc) -> None:
         arcs = self._clients[arc.request.client]

@@ -67,6 +67,15 @@ HELD = Holder(
     remaining=50.0,
 )
 """What robot/a and robot/b hold together since an earlier term."""
+OTHER = replace(
+    HELD,
+    id="other",
+    arc="other",
+    grant=HELD.grant._replace(seq=5),
+    place=HELD.place._replace(arrival=3),
+    rcs=["robot/c"],
+)
+"""What robot/c holds for the same client."""
 BELIEVED: dict[str, Any] = {"grant": HELD.grant, "rcs": HELD.rcs, "place": HELD.place}
 """What its client says of it when it asks again."""
 
@@ -103,15 +112,14 @@ def test_a_client_whose_rcs_come_back_one_after_the_other_has_a_lease_from_the_l
     async def story() -> None:
         fleet = FakeFleet()
         fleet.rcm(5)
-        other = replace(HELD, id="other", arc="other", grant=HELD.grant._replace(seq=5), rcs=["robot/c"])
-        first = fleet.rc("robot/c", term=HELD.grant.term, holders=[other])
+        first = fleet.rc("robot/c", term=HELD.grant.term, holders=[OTHER])
         await asyncio.sleep(0.7)
         robots = [holding(fleet, name) for name in HELD.rcs]
         await asyncio.sleep(0.7)
         client = fleet.client("one")
         client.open = [
             OpenRequest(one.arc, one.arc, {rc: {} for rc in one.rcs}, 0, Decimal(60), place=one.place, grant=one.grant)
-            for one in (HELD, other)
+            for one in (HELD, OTHER)
         ]
         await asyncio.sleep(3)
         assert [rc.holders for rc in (first, *robots)] == [[ANY], [ANY], [ANY]]
@@ -126,13 +134,11 @@ def test_what_somebody_asked_for_long_ago_is_waited_for_whoever_believes_to_hold
     async def story() -> None:
         fleet = FakeFleet()
         fleet.rcm(5)
-        later = replace(
-            HELD, id="later", arc="later", client="desk/two", grant=HELD.grant._replace(seq=5), rcs=["robot/c"]
-        )
+        later = replace(OTHER, client="desk/two")
         one, two = fleet.client("one"), fleet.client("two")
         first = asyncio.create_task(one.ask("tally", "robot/c", grant=HELD.grant, rcs=["robot/c"]))
         await asyncio.sleep(0.8)
-        asking = asyncio.create_task(two.ask("later", "robot/c", grant=later.grant, rcs=["robot/c"]))
+        asking = asyncio.create_task(two.ask("other", "robot/c", grant=later.grant, rcs=["robot/c"]))
         assert (await first).state == "queued"
         fleet.rc("robot/c", term=HELD.grant.term, holders=[later])
         assert (await asking).grant == later.grant
@@ -367,5 +373,22 @@ def test_an_answer_from_before_the_promise_is_none() -> None:
         await asyncio.sleep(2)
         assert len(rc.asked) > 1
         assert not [holder for grants in fleet.published for holder in grants.rcs.get("robot/a", [])]
+
+    run(story())
+
+
+def test_what_an_rc_holds_for_a_client_that_has_handed_it_over_waits_for_no_second_one() -> None:
+    """The new client asks for it at its place. It runs once: under its old client until that is dropped, then here."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm(5)
+        two = fleet.client("two")
+        assert (await two.ask("tally", "radio/r", place=HELD.place)).state == "queued"
+        rc = fleet.rc("radio/r", term=HELD.grant.term, holders=[replace(HELD, rcs=["radio/r"])])
+        await until(lambda: [holder.client for holder in rc.holders] == ["desk/two"])
+        held = [[holder.client for holder in grants.rcs.get("radio/r", [])] for grants in fleet.published]
+        assert max(map(len, held)) == 1
+        assert rcm.core.waiting == 0
 
     run(story())
