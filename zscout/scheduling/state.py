@@ -231,7 +231,7 @@ class SchedulerState:
         arc.since, arc.entry = since, self._next_entry()
         arc.rcs = arc.rcs or tuple(self.rcs_in(arc.mask))
         self._clients.setdefault(arc.request.client, {})[arc.id] = arc
-        if self._at_place.setdefault(arc.place, arc) is not arc:
+        if not self._is_first(arc):
             arc.move_to(ArcState.HELD_BACK)
             self.held_back[arc.id] = arc
             return
@@ -263,6 +263,10 @@ class SchedulerState:
         for arc in list(self.held_back.values()):
             if arc.held_back is not None and (arc.held_back[0] <= self.now or rc in arc.held_back[1]):
                 self.consider_again(arc)
+
+    def _is_first(self, arc: Arc) -> bool:
+        """Whether nobody else is considered at its place."""
+        return self._at_place.setdefault(arc.place, arc) is arc
 
     def at_place(self, place: Place) -> Arc | None:
         """Who is considered at this place, or runs."""

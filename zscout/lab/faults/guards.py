@@ -22,6 +22,7 @@ from zscout.drivers.instances import Instances
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import Problem
+from zscout.scheduling.state import SchedulerState
 from zscout.services.rcm import candidate, membership, recovery
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.membership import Membership
@@ -170,6 +171,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "away": Guard("a leader that was away itself drops nobody for it", {(Membership, "_is_away"): _no}),
         "reopen": Guard("who was dropped and lives goes on at its place", {(RequestRegistry, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
+        "claims": Guard("of the ARCs that claim one place one runs", {(SchedulerState, "_is_first"): _yes}),
         "unheard": Guard("what had its time unheard is asked for anew", {(RequestStore, "_ask_anew"): _nothing}),
         "notices": Guard("of two notices the newer counts", {(OpenArc, "take"): _take_any}),
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
