@@ -11,7 +11,7 @@ from tests.behaviors.client.small_fleet import RC, small_fleet
 from tests.mesh.kit import run
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.components.component import SafePointGate
-from zscout.behaviors.components.migration import RESTORE_TIMEOUT, NotMoved, OutgoingMove
+from zscout.behaviors.components.migration import GONE, RESTORE_TIMEOUT, NotMoved, OutgoingMove
 from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
@@ -109,5 +109,23 @@ def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
         assert dies
         assert (client.mesh.now() - began) / SECOND < 4
         token.close()
+
+    run(test())
+
+
+def test_a_successor_counts_as_gone_once_it_was_not_seen_for_longer_than_it_waits_itself() -> None:
+    """Behind a partition it runs a lease after it lost sight of this one, which is to go on after it."""
+
+    async def test() -> None:
+        network = MemoryNetwork()
+        client = Client(network.open("f", Sender("a", "c.1")), default_fleet())
+        token = network.open("f", Sender("b", "node")).alive(Token("b", Role.NODE, "node", "i"))
+        move = OutgoingMove(client, Counter({}), SafePointGate(), MoveComponent("c", 1, "b", 2))
+        confirming = asyncio.ensure_future(move._confirmed())
+        await asyncio.sleep(1)
+        token.close()
+        last_seen = client.mesh.now()
+        assert not await confirming
+        assert GONE <= client.mesh.now() - last_seen < 2 * GONE
 
     run(test())

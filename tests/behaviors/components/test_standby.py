@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
+
 from tests.behaviors.client.small_fleet import FLEET, RC, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.client import Client
@@ -22,8 +24,10 @@ from zscout.messages import ComponentSpec, RestoreComponent, StartComponent
 COUNTER = "zscout.behaviors.components.shipped:Counter"
 
 
-def test_what_is_handed_to_it_has_it_run_only_once_its_predecessor_is_not_seen() -> None:
-    """That one may have gone on: what was handed over to one behind a partition was taken back."""
+@pytest.mark.parametrize("late", [False, True])
+def test_what_is_handed_to_it_has_it_run_only_once_its_predecessor_is_not_seen(late: bool) -> None:
+    """That one may have gone on: what was handed over to one behind a partition was taken back. `late`: as that is
+    over, the link to it comes back after those to the others."""
 
     async def test() -> None:
         reports: list[ComponentReport] = []
@@ -46,7 +50,8 @@ def test_what_is_handed_to_it_has_it_run_only_once_its_predecessor_is_not_seen()
 
             arc = await old.request("work", {RC: {}}, min_runtime=3600)
             await old.granted(arc)
-            token = old.mesh.alive(Token("h", Role.COMPONENT, "c", "1-older"))
+            predecessor = Token("h", Role.COMPONENT, "c", "1-older")
+            token = None if late else old.mesh.alive(predecessor)
             start = StartComponent("c", 2, ComponentSpec("counter"), standby=True)
             standby = ComponentLifecycle(ComponentJob(start, COUNTER, "g", FLEET, "tag"), report, connect)
             story = asyncio.create_task(standby.run())
@@ -55,6 +60,9 @@ def test_what_is_handed_to_it_has_it_run_only_once_its_predecessor_is_not_seen()
             standby.order(Order(1, RestoreComponent("c", 2, b'{"count": 7}', old.open_requests())))
             await until(lambda: OrderAnswer(1) in reports)
             await old.hand_over_all(Sender("g", "c.2"))
+            if token is None:
+                await asyncio.sleep(0.9 * FLEET.mesh.lease)
+                token = old.mesh.alive(predecessor)
             await asyncio.sleep(2)
             assert (arc.state, phases()) == ("moved", ["standby"])
             token.close()

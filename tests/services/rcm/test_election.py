@@ -211,3 +211,40 @@ def test_who_may_be_cut_off_waits(others: list[bool], own: list[bool], lost: lis
     if not others:
         # Nobody else will tell: it is as long as a leader may be silent.
         assert not seen.must_wait(others, own, LATER + SILENCE, "a")
+
+
+def test_who_waited_alone_once_does_so_anew_after_a_leader_was_seen() -> None:
+    seen = election()
+    seen.candidate("c", alive=True, now=START)
+    seen.candidate("c", alive=False, now=LATER)
+    assert seen.must_wait([], [False], LATER, "a")
+    seen.leader("a", alive=True, now=LATER + SECOND)
+    seen.stood_still(LATER + 3 * SILENCE)
+    assert seen.must_wait([], [False], LATER + 3 * SILENCE, "a")
+
+
+@pytest.mark.parametrize(
+    ("happens", "returning"),
+    [
+        pytest.param([], False, id="nothing"),
+        pytest.param([lambda seen: seen.stood_still(LATER)], True, id="it stood still"),
+        pytest.param([lambda seen: seen.candidate("c", alive=False, now=LATER)], True, id="it lost another host"),
+        pytest.param(
+            [lambda seen: seen.candidate("a", alive=False, now=LATER)], False, id="the leader's host has gone"
+        ),
+        pytest.param(
+            [
+                lambda seen: seen.candidate("c", alive=False, now=START),
+                lambda seen: seen.candidate("c", alive=True, now=LATER),
+            ],
+            True,
+            id="another host is back",
+        ),
+    ],
+)
+def test_links_come_back_for_a_silence(happens: list[Sight], returning: bool) -> None:
+    seen = election()
+    for one in happens:
+        one(seen)
+    assert seen.links_return(LATER + SILENCE, "a") == returning
+    assert not seen.links_return(LATER + SILENCE + 1, "a")

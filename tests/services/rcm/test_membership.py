@@ -108,6 +108,35 @@ def test_rcs_that_join_one_after_the_other_keep_what_they_hold_together(apart: f
     run(story())
 
 
+def test_a_leader_whose_links_come_back_waits_for_the_rest_of_a_gang_that_it_has_recovered() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        first, other = holding(fleet, "robot/a"), fleet.rc("robot/c")
+        promised = [replace(one.state(), term=Term(5, "rcm")) for one in (first, other)]
+        client = fleet.client("one")
+        client.open = [OpenRequest("tally", "tally", {rc: {} for rc in HELD.rcs}, 0, Decimal(60), **BELIEVED)]
+        fleet.rcm(5, RecoveredState({"robot/c": promised[1]}, promised[:1], patient=True))
+        await asyncio.sleep(0.7)
+        await fleet.joined(first, holding(fleet, "robot/b"), other)
+        assert not [one.revoked for one in fleet.published if one.revoked]
+
+    run(story())
+
+
+def test_an_rc_that_has_not_joined_is_not_named_where_a_hold_of_it_ends() -> None:
+    """What else it holds is not known: it may be about to come."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm(5)
+        holding(fleet, "robot/a")
+        await until(lambda: any(one.revoked for one in fleet.published), within=5)
+        (told,) = [one for one in fleet.published if one.revoked]
+        assert (told.revoked[0].rcs, told.rcs) == (HELD.rcs, {"robot/a": []})
+
+    run(story())
+
+
 def test_a_client_whose_rcs_come_back_one_after_the_other_has_a_lease_from_the_last_to_show_itself() -> None:
     async def story() -> None:
         fleet = FakeFleet()

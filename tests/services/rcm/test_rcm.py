@@ -225,6 +225,24 @@ def test_a_client_that_is_gone_leaves_nothing() -> None:
     run(story())
 
 
+def test_a_client_has_a_lease_to_show_itself_and_longer_where_the_leader_stood_still_in_it() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm, robot = fleet.rcm(), fleet.rc("robot/a")
+        await fleet.joined(robot)
+        ghost, lease = FakeClient(fleet.mesh("desk", "ghost"), fleet.log), fleet.fleet.mesh.lease
+        await ghost.ask("first", "robot/a")
+        await until(lambda: robot.arcs == ["first"])
+        await asyncio.sleep(0.7 * lease)
+        stall = rcm.membership._absence._stall
+        stall.length, stall.ended = round(0.6 * lease * SECOND), rcm.mesh.now()
+        await asyncio.sleep(lease)
+        assert robot.arcs == ["first"]
+        await until(lambda: not robot.arcs, within=lease)
+
+    run(story())
+
+
 @pytest.mark.parametrize("alone", [False, True])
 @pytest.mark.parametrize("goes_first", [False, True])
 def test_a_client_that_goes_in_the_burst_of_its_request_leaves_nothing(goes_first: bool, alone: bool) -> None:

@@ -68,6 +68,8 @@ class ComponentLifecycle:
         self._alone = asyncio.Event()
         """None is."""
         self._alone.set()
+        self._accompanied = asyncio.Event()
+        """One is."""
         self._left = asyncio.Event()
         """It is over here, whatever run() does: another one goes on."""
         self._away: EndReport | None = None
@@ -266,6 +268,9 @@ class ComponentLifecycle:
     async def _see_handed(self, client: Client) -> None:
         await client.expected_came.wait()
         await self._alone.wait()
+        # After a partition the link to the older one may come back a little later than that to the RCM.
+        while await done_within(client.fleet.mesh.lease, self._accompanied.wait()):
+            await self._alone.wait()
         self._handed.set()
 
     def _on_component(self, token: Token, alive: bool) -> None:
@@ -278,6 +283,7 @@ class ComponentLifecycle:
         if incarnation < self._job.start.incarnation:
             (self._older.add if alive else self._older.discard)(token.instance)
             (self._alone.clear if self._older else self._alone.set)()
+            (self._accompanied.set if self._older else self._accompanied.clear)()
         if not alive:
             return
         if self._move is not None and incarnation == self._move.incarnation:

@@ -48,7 +48,7 @@ class Absence:
             self._gone.append((now, host))
         while self._gone and self._gone[0][0] < now - self._span:
             self._gone.popleft()
-        if (self._stall.fresh() and self._stall.length > self._span) or self._lost_several:
+        if (self._stall.fresh() and self.stood_still) or self._lost_several:
             self._until = now + self._lease
         elif not self.lasts and (asked := others()[:MAX_ASKED]):
             # Of several links that are lost, be it to one host, one is the first.
@@ -60,6 +60,12 @@ class Absence:
     def lasts(self) -> bool:
         """Whether what goes now is only unseen."""
         return self._mesh.now() < self._until
+
+    @property
+    def stood_still(self) -> bool:
+        """Whether this leader was away for that less than a lease ago."""
+        self._stall.check()
+        return self._stall.length > self._span and self._mesh.now() - self._stall.ended < self._lease
 
     @property
     def _lost_several(self) -> bool:

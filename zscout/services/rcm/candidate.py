@@ -264,6 +264,7 @@ class Candidate:
 
     def _lead(self, term: Term, states: list[RcState], open_requests: list[ClientRequests]) -> None:
         recovered = take_over(states, open_requests, self.mesh.now())
+        recovered.patient = self.election.links_return(self.mesh.now(), self._leader)
         self.known, self._goes_above = term, False
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)

@@ -44,13 +44,16 @@ class Election:
         self._yields_until: Ns = 0
         self._lost: dict[str, Ns] = {}
         """Hosts whose candidates were seen to go, and when."""
+        self._returned: Ns | None = None
+        """When one of them came back last."""
         self._stood_still: Ns | None = None
         self._alone_since: Ns | None = None
 
     def candidate(self, host: str, *, alive: bool, now: Ns) -> None:
         """A candidate's token came or went."""
         if alive:
-            self._lost.pop(host, None)
+            if self._lost.pop(host, None) is not None:
+                self._returned = now
         else:
             self._lost[host] = now
         self._candidates[host] += 1 if alive else -1
@@ -60,6 +63,7 @@ class Election:
         """A leader's token came or went."""
         if alive:
             self._leaders[instance] = self._heard = now
+            self._alone_since = None
         elif self._leaders.pop(instance, None) is not None and not self._leaders:
             # Who has seen a leader is on the mesh: there is nothing to settle any more.
             self._since = now
@@ -106,14 +110,22 @@ class Election:
         if self._deposed is not None and now < min(self._yields_until, self._deposed + ALONE * self.silence):
             # Who deposed this candidate goes on, though nobody who could say so is seen: the two would take turns.
             return True
-        missed = [at for host, at in self._lost.items() if host not in (leader, self.host)]
-        if self._stood_still is not None:
-            missed.append(self._stood_still)
-        cut_off = any(now - at <= self.silence for at in missed)
-        if sum(own) * 2 <= len(own) and not cut_off and self._alone_since is None:
+        if sum(own) * 2 <= len(own) and not self._was_away(now, leader) and self._alone_since is None:
             return False
         self._alone_since = now if self._alone_since is None else self._alone_since
         return now - self._alone_since < self.silence
+
+    def _was_away(self, now: Ns, leader: str | None) -> bool:
+        """Whether it may be this host that is cut off, or was until a silence ago."""
+        missed = [at for host, at in self._lost.items() if host not in (leader, self.host)]
+        if self._stood_still is not None:
+            missed.append(self._stood_still)
+        return any(now - at <= self.silence for at in missed)
+
+    def links_return(self, now: Ns, leader: str | None) -> bool:
+        """Whether links of this host may be coming back, one after the other."""
+        returned = self._returned is not None and now - self._returned <= self.silence
+        return returned or self._was_away(now, leader)
 
     def heard_within(self, span: Ns, now: Ns) -> bool:
         """Whether a leader that counts was seen or heard so lately."""

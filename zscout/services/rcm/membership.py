@@ -104,15 +104,16 @@ class Membership:
         self._departed: dict[RcName, RcState] = {}
         """RCs that went less than a hold lease ago: they may still let their holders command."""
 
-    def join(self, rcs: dict[RcName, RcState], pending: Iterable[RcState]) -> list[Event]:
-        """The RCs that promised to obey before the term began; those that are `pending` join later."""
+    def join(self, rcs: dict[RcName, RcState], pending: Iterable[RcState], *, patient: bool) -> list[Event]:
+        """The RCs that promised to obey before the term began; those that are `pending` join later. `patient`: for the
+        rest of their gangs they wait for a lease."""
         self._joined.update(rcs)
         states = (*rcs.values(), *pending)
         alone = all(state.host == self.mesh.me.host for state in states)
         for state in states:
             self._named[state.rc] = state.instance, state.host
         for state in pending:
-            self._hold_up(state, patient=alone)
+            self._hold_up(state, patient=patient or alone)
         # One that died before its token was watched would never be seen to go.
         self._supervisor.call_later(self._lease, self._drop_unseen)
         return [RcJoined(name, state.sharable) for name, state in rcs.items() if state.health == "ok"]
@@ -135,7 +136,12 @@ class Membership:
             self._unseen[client] = self._supervisor.call_later(self._lease, self._overdue, client)
 
     def _overdue(self, client: ClientId) -> None:
-        self._supervisor.spawn(self._ask_unseen(client, self._unseen[client]))
+        if self._absence.stood_still:
+            # It had less than a lease to show itself in.
+            self._no_longer_unseen(client)
+            self.expect(client)
+        else:
+            self._supervisor.spawn(self._ask_unseen(client, self._unseen[client]))
 
     async def _ask_unseen(self, client: ClientId, timer: asyncio.TimerHandle) -> None:
         keys, program = self.mesh.keys, client_of(client)
@@ -380,6 +386,10 @@ class Membership:
             self.on_named(gone.rc)
         for other in others:
             self._supervisor.spawn(self._join(other))
+
+    def has_joined(self, rc: RcName) -> bool:
+        """Whether this RC counts as there, or did until just now."""
+        return rc not in self._pending and (rc in self._joined or rc in self._departed)
 
     def named(self, rcs: Iterable[RcName]) -> dict[RcName, tuple[str, HostName]]:
         """The instance that is meant of each of these RCs, and its host."""

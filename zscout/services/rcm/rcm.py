@@ -108,7 +108,7 @@ class Rcm:
     def start(self, recovered: RecoveredState) -> None:
         """Begins to lead. Everything that is declared here is declared by the leader only."""
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
-        joined = self.membership.join(recovered.rcs, recovered.pending)
+        joined = self.membership.join(recovered.rcs, recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
             self.registry.give_up(arc, Outcome.RELEASED)
         requests = [*(hold.request for hold in recovered.holds), *(one.request for one in recovered.waiting)]
@@ -229,8 +229,8 @@ class Rcm:
     # Out: grants
 
     def _publish(self, effects: Iterable[Effect], rcs: Collection[RcName] | None = None) -> None:
-        """Publishes all holders of the RCs that were granted or revoked, if any were; with `rcs` in any case,
-        and those of `rcs` as well."""
+        """Publishes all holders of the RCs that were granted or revoked, if any were and as far as they have joined;
+        with `rcs` in any case, and those of `rcs` as well."""
         changed = [effect for effect in effects if isinstance(effect, (Granted, HoldEnded))]
         if not changed and rcs is None:
             return
@@ -239,7 +239,9 @@ class Rcm:
         ]
         now = self.mesh.now()
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
-        names = sorted({*(rcs or ()), *(rc for effect in changed for rc in effect.rcs)})
+        # One that has not joined holds what is not known here: to name it would end that.
+        concerned = filter(self.membership.has_joined, {rc for effect in changed for rc in effect.rcs})
+        names = sorted({*(rcs or ()), *concerned})
         self._named |= dict.fromkeys(names, number)
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
         instances = {rc: instance for rc, (instance, _) in self.membership.named(names).items()}

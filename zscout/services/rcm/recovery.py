@@ -31,6 +31,8 @@ class RecoveredState:
     rcs: dict[str, RcState] = field(default_factory=dict)
     pending: list[RcState] = field(default_factory=list)
     """What those RCs hold they hold together with others that have not answered, which may come a little later."""
+    patient: bool = False
+    """Whether links may be coming back, so that those others have a lease to answer, seen or not."""
     given_up: set[ArcId] = field(default_factory=set)
     """Of that, what its client does not ask for any more."""
     holds: list[RecoveredHold] = field(default_factory=list)
