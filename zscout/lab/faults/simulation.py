@@ -459,7 +459,10 @@ class Simulation:
                 left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and led - there
                 # A candidate that is left alone waits for as long as a hold lasts: it may be cut off itself.
                 alone = len(beside) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
-                return just_over or parted or bool(left) or alone or since > fault.at
+                # Nor can one tell it that begins to lead just then.
+                over = START + fault.at + fault.lasts
+                began = any(abs(at - over) < 2 * AT_ONCE for at in self.promises.terms.values())
+                return just_over or began or parted or bool(left) or alone or since > fault.at
             case _:
                 return True
 
