@@ -118,7 +118,8 @@ class Worker(Component):
                             with suppress(CommandRefused):
                                 await client.command(rc, grant, {"name": "echo", "value": self.done})
                         await asyncio.sleep(RANDOM.get().uniform(STEP, 1.0))
-                if arc.open:
+                # What is being handed over may come back.
+                if arc.open or client.paused:
                     await client.end(arc)
                 del deeds.busy[_here()]
         except (RequestRefused, CommandRefused) as refused:
