@@ -417,14 +417,15 @@ class Simulation:
         failing = {one for fault in faults if fault.kind in ("freeze", "stall") for one in fault.whom}
         failing |= {self.killed[fault][0] for fault in faults if fault in self.killed}
         sound = {host for host in self.hosts if f"{host}/node" not in failing}
-        left = sound.intersection(self.candidates_at)
-        # A leader that hangs is given up after a silence: where the next candidate fails just then, holds may be over.
-        silence = max(4 * self.fleet.timing.heartbeat / SECOND, self.fleet.mesh.lease)
-        hung = any(fault.kind == "stall" and fault.lasts > silence for fault in faults)
-        if not left or (hung and len(left) < len(self.candidates_at) - 1):
+        if sound.isdisjoint(self.candidates_at):
             return True
         sides = [self._side(fault, hosts) for fault in faults if fault.kind in ("isolate", "part")]
         beside = {*self.hosts}.intersection(*sides) & sound
+        # A leader that hangs is given up after a silence: where the next candidate fails just then, holds may be over.
+        silence = max(4 * self.fleet.timing.heartbeat / SECOND, self.fleet.mesh.lease)
+        hung = any(fault.kind == "stall" and fault.lasts > silence for fault in faults)
+        if hung and len(beside.intersection(self.candidates_at)) < len(self.candidates_at) - 1:
+            return True
         return any(self._touches(fault, names, hosts, since, beside) for fault in faults)
 
     def _side(self, fault: Fault, hosts: set[str]) -> set[str]:
