@@ -11,7 +11,7 @@ from tests.behaviors.client.small_fleet import RC, small_fleet
 from tests.mesh.kit import run
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.components.component import SafePointGate
-from zscout.behaviors.components.migration import GONE, RESTORE_TIMEOUT, NotMoved, OutgoingMove
+from zscout.behaviors.components.migration import RESTORE_TIMEOUT, NotMoved, OutgoingMove
 from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
@@ -113,12 +113,14 @@ def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
     run(test())
 
 
-def test_a_successor_counts_as_gone_once_it_was_not_seen_for_longer_than_it_waits_itself() -> None:
+@pytest.mark.parametrize("lease", [1.0, 3.0])
+def test_a_successor_counts_as_gone_once_it_was_not_seen_for_longer_than_it_waits_itself(lease: float) -> None:
     """Behind a partition it runs a lease after it lost sight of this one, which is to go on after it."""
 
     async def test() -> None:
         network = MemoryNetwork()
-        client = Client(network.open("f", Sender("a", "c.1")), default_fleet())
+        fleet = default_fleet()
+        client = Client(network.open("f", Sender("a", "c.1")), replace(fleet, mesh=replace(fleet.mesh, lease=lease)))
         token = network.open("f", Sender("b", "node")).alive(Token("b", Role.NODE, "node", "i"))
         move = OutgoingMove(client, Counter({}), SafePointGate(), MoveComponent("c", 1, "b", 2))
         confirming = asyncio.ensure_future(move._confirmed())
@@ -126,6 +128,6 @@ def test_a_successor_counts_as_gone_once_it_was_not_seen_for_longer_than_it_wait
         token.close()
         last_seen = client.mesh.now()
         assert not await confirming
-        assert GONE <= client.mesh.now() - last_seen < 2 * GONE
+        assert 2 * lease <= (client.mesh.now() - last_seen) / SECOND < 4 * lease
 
     run(test())

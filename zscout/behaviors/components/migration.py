@@ -148,6 +148,8 @@ class OutgoingMove:
 
     async def _until_known(self, operation: messages.ActivateComponent | messages.StopComponent) -> bool:
         (pause, longest), began = PAUSES, self._client.mesh.now()
+        # Cut off, the other one runs a lease after it lost sight of this one: it is to be the first of the two.
+        gone = max(GONE, round(2 * self._client.fleet.mesh.lease * SECOND))
         while not self.successor_runs.is_set():
             match await self._ask(operation, ComponentView, ASK_TIMEOUT):
                 case ComponentView(phase="running"):
@@ -159,8 +161,7 @@ class OutgoingMove:
                     return False
                 case Problem(code="old_incarnation"):
                     return True  # one that is higher still was started there: this one is over in any case
-                # Cut off, the other one runs a lease after it lost sight of this one: it is to be the first of the two.
-                case None if not await self._lives() and self._client.mesh.now() - max(self._seen or 0, began) > GONE:
+                case None if not await self._lives() and self._client.mesh.now() - max(self._seen or 0, began) > gone:
                     return False
             if not await done_within(pause, self.successor_runs.wait()):
                 pause = min(longest, 2 * pause)
