@@ -214,6 +214,7 @@ class Membership:
 
     async def _ask_requests(self, client: ClientId) -> None:
         key, ask = self.mesh.keys.requests(client_of(client)), RcAsk(promise=self.term)
+        unheard = f"{client} is seen and does not answer"
         while client in self.clients or client in self._unseen:
             reply = await self.mesh.ask_one(key, ask, ClientRequests, timeout=self._timeout)
             if reply is not None and reply.problem is not None and reply.problem.term is not None:
@@ -221,7 +222,9 @@ class Membership:
             if reply is not None and reply.message is not None:
                 self.on_requests(client, {request.id for request in reply.message.requests})
                 break
+            self.mesh.suspicions.suspect(unheard, so=client in self.clients)
             await asyncio.sleep(self._timeout)
+        self.mesh.suspicions.suspect(unheard, so=False)
         self._asked.discard(client)
 
     def _judge_client(self, client: ClientId, token: Token) -> None:
