@@ -130,7 +130,8 @@ class Checker:
             if grant in instance.ended:
                 self.broken(at, "6 no second beginning", f"{rc} begins {grant} again")
             owner = self._owner.get(grant, "")
-            if at - self._given_up.get(owner, at) > CALM:
+            # A leader that was cut off may grant once more as its links come back, before it hears the one that knows.
+            if at - self._given_up.get(owner, at) > CALM and not self.touched(HOSTS, at, CALM):
                 self.broken(at, "15 nothing for who gave up", f"{rc} begins {grant} for {owner}")
             self._began.setdefault((rc, grant), at)
         for grant in instance.holds - holds:

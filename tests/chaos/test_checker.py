@@ -134,6 +134,13 @@ def test_an_older_command_is_found_from_what_its_senders_saw() -> None:
     assert held_against([*LIFE, commanded(3, NEW, 2.9), commanded(4, OLD, 2.95)]) == []
 
 
+def test_what_was_given_up_may_be_granted_once_more_as_links_come_back() -> None:
+    fault = Fault("cut", "cut", 3, ("x1",), isolated("x1"), began=3 * SECOND, at=3 * SECOND, mended=6 * SECOND)
+    again = BROKEN["15 nothing for who gave up"]
+    assert [one.promise for one in held_against([*LIFE, *again])] == ["15 nothing for who gave up"]
+    assert held_against([*LIFE, *again], fault) == []
+
+
 def test_an_rc_that_heard_nobody_must_not_hold() -> None:
     fault = Fault("cut", "cut", 5, ("x1",), isolated("x1"), began=3 * SECOND, at=3 * SECOND, mended=8 * SECOND)
     held = [publish(2.5, [NEW], [Q]), rc(2.6, "hear", [NEW], seq=3), rc(9, "hear", [], seq=4)]
