@@ -222,7 +222,7 @@ class Membership:
             if reply is not None and reply.message is not None:
                 self.on_requests(client, {request.id for request in reply.message.requests})
                 break
-            self.mesh.suspicions.suspect(unheard, so=client in self.clients)
+            self.mesh.suspicions.suspect(unheard, so=reply is None and client in self.clients)
             await asyncio.sleep(self._timeout)
         self.mesh.suspicions.suspect(unheard, so=False)
         self._asked.discard(client)
