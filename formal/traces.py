@@ -168,7 +168,11 @@ class Behaviour:
 
     def _promise(self, event: Mapping[str, Any]) -> None:
         term, (name, rc) = _term(event["term"]), self._rc(event)
-        if event["instance"] in self._reigns[term].table:
+        table = self._reigns[term].table
+        if table.get(event["instance"]) is not None:
+            # Its leader, which was away, asks it again, and lets its hold go on.
+            return
+        if event["instance"] in table:
             # Its leader asks it again: it had lost sight of it.
             self._lose(term, event["instance"])
         if rc.holds not in rc.answers[term] or rc.heard[0] != term:

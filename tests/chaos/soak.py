@@ -12,7 +12,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections import deque
+from collections import Counter, OrderedDict, defaultdict, deque
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -31,6 +31,7 @@ ROOM: Final = {"links": 0, "descriptors": 4, "memory_mb": 12, "latency_ms": 5, "
 """How much more there may be at the end than in the beginning, besides a tenth."""
 FAULTS_PER_HOUR: Final = 60
 COLLECT_EVERY: Final = 20.0
+CONTAINERS: Final = {list, dict, set, tuple, deque, OrderedDict, defaultdict, Counter}
 
 
 def live(hours: float, folder: Path) -> tuple[list[dict[str, Figures]], list[str]]:
@@ -89,8 +90,26 @@ class Soaked(Simulation):
             gc.collect()
             if (due := due - COLLECT_EVERY) <= 0:
                 due += every
-                memory = round(psutil.Process().memory_info().rss / 1e6, 1)
-                Soaked.looks.append({"simulated fleet": {"memory_mb": memory, "objects": len(gc.get_objects())}})
+                Soaked.looks.append({"simulated fleet": {"objects": product_objects()}})
+
+
+def product_objects() -> int:
+    """Objects of zscout, and what their containers hold; not those of the simulator, whose checker remembers all that
+    has ever been promised."""
+    own = [one for one in gc.get_objects() if _is_product(one)]
+    seen, count = set(map(id, own)), 0
+    while own:
+        count += 1
+        for one in gc.get_referents(own.pop()):
+            if id(one) not in seen and (_is_product(one) or type(one) in CONTAINERS):
+                seen.add(id(one))
+                own.append(one)
+    return count
+
+
+def _is_product(one: object) -> bool:
+    module = type(one).__module__
+    return module.startswith("zscout.") and not module.startswith("zscout.lab.") and not isinstance(one, type)
 
 
 def virtual(hours: float) -> tuple[list[dict[str, Figures]], Result]:

@@ -158,6 +158,45 @@ def test_a_client_whose_rcs_come_back_one_after_the_other_has_a_lease_from_the_l
     run(story())
 
 
+def test_an_rc_with_several_gangs_has_its_lease_though_that_of_another_of_them_is_over() -> None:
+    """`radio/r` answers as the wait of `robot/a`, with which it shares a gang, is over; `robot/c` comes after that."""
+
+    async def story() -> None:
+        fleet, term = FakeFleet(), HELD.grant.term
+        fleet.rcm(5)
+        first, second = replace(HELD, rcs=["radio/r", "robot/a"]), replace(OTHER, rcs=["radio/r", "robot/c"])
+        client = fleet.client("one")
+        client.open = [
+            OpenRequest(one.arc, one.arc, {rc: {} for rc in one.rcs}, 0, Decimal(60), place=one.place, grant=one.grant)
+            for one in (first, second)
+        ]
+        robot = fleet.rc("robot/a", term=term, holders=[first])
+        await asyncio.sleep(0.9)
+        radio = fleet.rc("radio/r", term=term, holders=[first, second])
+        await asyncio.sleep(0.6)
+        other = fleet.rc("robot/c", term=term, holders=[second])
+        await asyncio.sleep(3)
+        assert not [revoked for grants in fleet.published for revoked in grants.revoked]
+        assert [len(rc.holders) for rc in (robot, radio, other)] == [1, 2, 1]
+
+    run(story())
+
+
+def test_one_that_goes_on_coming_and_going_keeps_nobody_waiting_for_ever() -> None:
+    async def story() -> None:
+        fleet, term = FakeFleet(), HELD.grant.term
+        fleet.rcm(5)
+        first, second = replace(HELD, rcs=["radio/r", "robot/a"]), replace(OTHER, rcs=["radio/r", "robot/c"])
+        robot = fleet.rc("robot/a", term=term, holders=[first])
+        for life in range(5):
+            radio = fleet.rc("radio/r", instance=f"i{life}", term=term, holders=[first, second])
+            await asyncio.sleep(0.8)
+            await radio.mesh.close()
+        assert robot.holders == []
+
+    run(story())
+
+
 def test_what_somebody_asked_for_long_ago_is_waited_for_whoever_believes_to_hold_it_now() -> None:
     """As on a host that was cut off and led alone: its own client asked first, and nobody else was there."""
 

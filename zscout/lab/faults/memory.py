@@ -33,6 +33,10 @@ def intersects(one: str, other: str) -> bool:
     return one == other or zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other))
 
 
+MAX_KNOWN_KEYS: Final = 1_000
+"""That a session knows its handlers for."""
+
+
 class MemoryMesh(Mesh):
     """One process's place on a MemoryNetwork; `network.open(...)` makes it."""
 
@@ -318,6 +322,8 @@ class MemoryTransport(Transport):
                 to.send(node.disconnected, self)
             self.gone = True
             self.network.remove(self)
+            self._alive.clear()
+            self._lives.clear()
 
     def get(self, key: str, payload: bytes | None, kind: type | None, timeout: float, to: Collector) -> None:
         try:
@@ -408,6 +414,8 @@ class MemoryTransport(Transport):
         to.on_final()
 
     def on_token(self, source: MemoryTransport, token: str, alive: bool) -> None:
+        if self.gone:
+            return
         before = token in self._lives
         known = self._alive.setdefault(source, [])
         if alive:
@@ -418,6 +426,8 @@ class MemoryTransport(Transport):
             self._lives[token] -= 1
             if not self._lives[token]:
                 del self._lives[token]
+        if source.gone and not known:
+            del self._alive[source]
         if (token in self._lives) != before:
             for _, on_token in self._watchers.matching(token):
                 on_token(token, alive)
@@ -571,5 +581,7 @@ class _Declared(Generic[H]):
     def matching(self, key: str) -> list[tuple[str, H]]:
         """Those whose key expression intersects `key`: a list that does not change."""
         if (found := self._matching.get(key)) is None:
+            if len(self._matching) >= MAX_KNOWN_KEYS:  # of programs that are gone, most of them
+                self._matching.clear()
             found = self._matching[key] = [one for one in self.all if intersects(one[0], key)]
         return found

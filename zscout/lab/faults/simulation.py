@@ -208,7 +208,7 @@ class Simulation:
         for task in (look, done, failed):
             task.cancel()
         self.result.digest = self._digest.hexdigest()
-        for process, mesh in self.running.values():
+        for process, mesh in tuple(self.running.values()):
             process.kill()
             self.network.kill(mesh)
         return self.result
@@ -305,11 +305,13 @@ class Simulation:
 
     def end_process(self, name: str, reached: MemoryTransport | None = None) -> None:
         """Nothing of it runs any more, and of what it has just said nothing arrives but at `reached`, or some."""
-        process, mesh = self.running[name]
+        process, mesh = self.running.get(name, (None, None))
         self.busy.pop(name, None)
-        if not process.dead:
+        if process is not None and mesh is not None and not process.dead:
             process.kill()
             self.network.kill(mesh, reached)
+        if "." in name:  # a component's: no other has its name
+            self.running.pop(name, None)
 
     def _start(self, process: Process, name: str, mesh: MemoryMesh) -> None:
         host, program = name.split("/")

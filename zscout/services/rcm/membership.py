@@ -33,6 +33,8 @@ MAX_SOUGHT: Final = 256
 """How often who went without a token is asked, and of whom so many at a time."""
 DYING: Final = 0.003
 """Seconds within which all tokens of one link go."""
+LEASES_AT_MOST: Final = 3
+"""For which a pending RC waits, whoever of its gangs goes on answering."""
 NEAR_END: Ns = SECOND // 20
 """A hold with less than this left may have ended at its RC already: clocks differ a little."""
 
@@ -432,7 +434,7 @@ class Membership:
 
     def _hold_up(self, state: RcState, *, patient: bool) -> None:
         pending = self._pending[state.rc] = _Pending(state, self.mesh.now(), patient)
-        for wait in (self._timeout, self._lease):
+        for wait in (self._timeout, self._lease, LEASES_AT_MOST * self._lease):
             self._supervisor.call_later(wait, self._wait_over, pending, wait)
 
     def _wait_over(self, pending: _Pending, wait: float) -> None:
@@ -440,15 +442,20 @@ class Membership:
         self._settle()
 
     def _settle(self) -> None:
-        """Lets in the pending RCs whose gangs have answered. Others wait for a lease; where nothing shows that one of
-        the gang lives, and all links of this leader stood as it began, only as long as for an answer."""
+        """Lets in the pending RCs whose gangs have answered. Others wait for a lease, from when the last RC of their
+        gangs answered; where nothing shows that one of the gang lives, and all links of this leader stood as it began,
+        only as long as for an answer."""
         for rc in list(self._pending):
             if (pending := self._pending.get(rc)) is None:
                 continue
             gangs = gangs_of(rc, {one: pending.state for one, pending in self._pending.items()})
             missing = gangs - self._joined.keys() - self._pending.keys()
-            patient = pending.patient or any(one in self._rc_tokens for one in missing)
-            if not missing or pending.waited >= (self._lease if patient else self._timeout):
+            together = [self._pending[one] for one in gangs & self._pending.keys()]
+            patient = any(one.patient for one in together) or any(one in self._rc_tokens for one in missing)
+            # They are let in together: the last of them may be the first whose links came back.
+            waited = min(one.waited for one in together)
+            over = waited >= (self._lease if patient else self._timeout)
+            if not missing or over or pending.waited >= LEASES_AT_MOST * self._lease:
                 let_in, now = [self._pending.pop(one) for one in sorted(gangs & self._pending.keys())], self.mesh.now()
                 self._admit([aged(one.state, now - one.since) for one in let_in])
 
