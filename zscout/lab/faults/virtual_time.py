@@ -83,6 +83,9 @@ class Process:
             coro = task.get_coro()
             if coro is not None:
                 self.run(_close, coro)
+        loop = asyncio.get_running_loop()
+        if isinstance(loop, VirtualTimeLoop):
+            loop.forget(self)
 
     def park(self, handle: asyncio.Handle) -> bool:
         """Keeps what is due for later, or for never; False: it is to be done."""
@@ -190,6 +193,12 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
             timer._scheduled = False
             self._timer_cancelled_count -= 1
 
+    def forget(self, process: Process) -> None:
+        """Timers of one that is dead, which would do nothing, keep their places, and nothing else of it."""
+        for _, timer in self._scheduled:
+            if timer._context.get(PROCESS) is process and not timer._cancelled:
+                timer._callback, timer._args = _nothing, ()
+
     def call_at(  # type: ignore[override]  # like asyncio's own
         self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
     ) -> asyncio.TimerHandle:
@@ -228,6 +237,10 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     async def shutdown_default_executor(self, *args: Any) -> None:
         self._threads.add(self)
         await super().shutdown_default_executor(*args)
+
+
+def _nothing() -> None:
+    """What a dead process does."""
 
 
 def _begin(loop: asyncio.AbstractEventLoop, coro: Any, **how: Any) -> asyncio.Task[Any]:
