@@ -23,12 +23,13 @@ from tests.chaos.run import Fleet, NotServed
 from tests.chaos.work import NODES, OWN_CLIENTS
 from zscout.lab.faults import simulation
 from zscout.lab.faults.simulation import Result, Simulation, Size, simulate
+from zscout.services.rcm.registry import MAX_LINES
 
 Figures: TypeAlias = dict[str, float]
 LOOKS: Final = 60
 """Of a live run; the beginning, the middle and the end are the medians of a tenth of them."""
-ROOM: Final = {"links": 0, "descriptors": 4, "memory_mb": 12, "latency_ms": 5, "objects": 4_000}
-"""How much more there may be at the end than in the beginning, besides a tenth."""
+ROOM: Final = {"links": 0, "descriptors": 4, "memory_mb": 12, "latency_ms": 5, "objects": MAX_LINES}
+"""How much more there may be at the end than in the beginning, besides a tenth: the leader's history fills up."""
 FAULTS_PER_HOUR: Final = 60
 COLLECT_EVERY: Final = 20.0
 CONTAINERS: Final = {list, dict, set, tuple, deque, OrderedDict, defaultdict, Counter}
