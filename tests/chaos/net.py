@@ -145,6 +145,10 @@ def _remove(mark: str) -> None:
         command = ["ip", *words]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMMAND_TIMEOUT).stdout
 
+    # A namespace that goes takes its end of a pair away some time later; a pair that is deleted is gone at once.
+    for line in run("-brief", "link").splitlines():
+        if line.startswith(f"{mark}p"):
+            run("link", "del", line.split("@")[0])
     for line in run("netns", "list").splitlines():
         if line.split() and line.split()[0].startswith(f"{mark}-"):
             run("netns", "del", line.split()[0])
