@@ -53,6 +53,10 @@ class Ask(_Wanted, frozen=True, tag_field="op", tag="request"):
     place."""
     reachable: bool = False
     """One of those has shown itself to the client anew: what was held back for them need wait no more."""
+    direct: bool = False
+    """Its program touches devices past their RCs, which settle when its hold ends."""
+    unserved: bool = False
+    """The time of `grant` went by while RCs of it settled: nobody made use of it."""
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -166,6 +170,8 @@ class Holder(_ArcParty, frozen=True):
     keep: bool = False
     params: Amounts = {}
     bound: dict[str, str] = {}
+    direct: bool = False
+    """As asked: its RCs settle when it ends."""
 
 
 class Revocation(_ArcParty, frozen=True):
@@ -177,6 +183,8 @@ class Revocation(_ArcParty, frozen=True):
     reason: str
     by: str | None = None
     why: ReasonInfo | None = None
+    own: bool = False
+    """Whether its own client gave it back: its program is gone."""
 
 
 class Grants(Message, frozen=True):
@@ -217,6 +225,7 @@ class HoldView(_ArcParty, frozen=True):
     remaining: Seconds
     keep: bool = False
     bound: dict[str, str] = {}
+    direct: bool = False
 
 
 class WaitView(_ArcParty, frozen=True):
@@ -272,6 +281,7 @@ class OpenRequest(_Wanted, frozen=True):
     grant: Grant | None = None
     rcs: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
     """The RCs of `grant`."""
+    direct: bool = False
 
 
 class ClientRequests(Message, frozen=True):

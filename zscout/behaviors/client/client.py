@@ -12,6 +12,7 @@ from decimal import Decimal
 from typing import Any, Final, Generic, Self, TypeVar
 
 from zscout import messages
+from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN
 from zscout.behaviors.client.request import CommandRefused, Needs, OpenArc, RequestRefused, amounts
@@ -31,6 +32,12 @@ UNREACHED = 10.0
 """Seconds for which an RC may be granted that this client neither sees nor reaches."""
 CONFIRM_TIMEOUT = 1.0
 """Seconds within which all RCs of a grant must have confirmed it."""
+SETTLING: Final = "settling"
+"""What an RC answers while the program of its last holder may still touch its device."""
+LAST_WORD: Final = 0.5
+"""Seconds at most for which a client that closes tells RCs that its programs are gone."""
+LOOK_AGAIN: Final = 0.1
+"""Seconds between two questions whether it has settled."""
 CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
 """Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
 NOT_HELD = frozenset({"ended", "free", "not_holder"})
@@ -58,6 +65,9 @@ class Client(MovableClient):
         """When the present token was declared."""
         self._denied: set[Grant] = set()
         """Grants that an RC says are over, and no notice yet."""
+        self._direct: dict[Grant, DirectHold] = {}
+        """Holds of direct requests, until their programs are gone."""
+        self._store.watchers.append(self._look_at_direct)
 
     @classmethod
     def connect(
@@ -114,6 +124,8 @@ class Client(MovableClient):
                 self._may_end.set()
                 await self._supervisor.close()
                 await asyncio.gather(*(self.end(arc) for arc in self._store.open))
+                if telling := [task for direct in self._direct.values() for task in direct.telling]:
+                    await asyncio.wait(telling, timeout=LAST_WORD)
         finally:
             await self.leave()
 
@@ -129,6 +141,8 @@ class Client(MovableClient):
         try:
             await self._supervisor.close()
         finally:
+            for telling in [task for direct in self._direct.values() for task in direct.telling]:
+                telling.cancel()
             for declared in (*filter(None, [self._token]), *reversed(self._declared)):
                 declared.close()
             await self.mesh.close()
@@ -161,19 +175,20 @@ class Client(MovableClient):
         min_runtime: float | Decimal = 1.0,
         keep: bool = False,
         estimate: bool = False,
+        direct: bool = False,
     ) -> OpenArc:
         """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
 
         A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
-        more. With `estimate` its notices say when it will start. Raises RequestRefused where the request
-        can't be taken as it is.
+        more. With `estimate` its notices say when it will start. `direct`: its program touches devices past their RCs;
+        see `direct_hold`. Raises RequestRefused where the request can't be taken as it is.
 
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)
         arc = await self._claim(check_name(name, "arc"), wanted)
         if arc is None:
             seconds, now = Decimal(str(min_runtime)), self.mesh.now()
-            arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, since=now)
+            arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
             self._store.add(arc)
         try:
             await self._rcm.submit(arc)
@@ -190,7 +205,8 @@ class Client(MovableClient):
         await self._store.changed(arc)
 
     async def granted(self, arc: OpenArc) -> Grant | None:
-        """Waits until `arc` is granted and all its RCs have confirmed it; None if it ended instead.
+        """Waits until `arc` is granted and all its RCs have confirmed it, which they do once they have settled; None if
+        it ended instead.
 
         Nothing is entered while the client is paused, nor is what it hands over reported as ended."""
         while True:
@@ -200,52 +216,123 @@ class Client(MovableClient):
             if arc.state == "running" and arc.grant is not None:
                 grant = arc.grant
                 refusals = await self._confirm(arc, grant)
-                if arc.grant != grant:
-                    continue
-                if not refusals:
+                if arc.grant == grant and not refusals:
+                    arc.settling = None
+                    if grant in self._direct:
+                        self._direct[grant].keep_confirming(self._on_unsure)
                     return grant
-                log.warning("the grant of %s is given back: %s", arc.name, refusals[0])
-                if other := [refused for refused in refusals if refused.code not in NOT_CONFIRMED]:
-                    await self.end(arc)
-                    raise other[0]
-                rcs = [refused.rc for refused in refusals]
-                arc.not_confirmed(rcs, str(refusals[0]), self.mesh.now())
-                self._store.notify(arc)
-                self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
-                await self._rcm.submit(arc)
+                self._leave_unentered(grant)
+                if arc.grant == grant:
+                    await self._give_back(arc, grant, refusals)
             else:
                 await self.changed(arc)
 
+    def direct_hold(self, grant: Grant) -> DirectHold | None:
+        """For who runs the program of a direct request: how long its hold may be relied on, and what is to be told when
+        the program is gone. None where the request was not direct, or that has been told."""
+        return self._direct.get(grant)
+
+    async def _give_back(self, arc: OpenArc, grant: Grant, refusals: list[CommandRefused]) -> None:
+        """It is not entered. Raises CommandRefused where that is not for the RCM to mend."""
+        if other := [refused for refused in refusals if refused.code not in NOT_CONFIRMED | {SETTLING}]:
+            log.warning("the grant of %s is given back: %s", arc.name, other[0])
+            await self.end(arc)
+            raise other[0]
+        rcs = [refused.rc for refused in refusals if refused.code != SETTLING]
+        if rcs:
+            log.warning("the grant of %s is given back: %s", arc.name, refusals[0])
+            arc.not_confirmed(rcs, str(refusals[0]), self.mesh.now())
+            self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
+        else:
+            arc.not_served(grant, self.mesh.now())
+        self._store.notify(arc)
+        await self._rcm.submit(arc)
+
     async def _confirm(self, arc: OpenArc, grant: Grant) -> list[CommandRefused]:
-        """Asks all RCs of a grant, side by side, whether they know of it. Returns those that do not say so, within a
-        second in which this client did not stand still itself."""
+        """Asks all RCs of a grant, side by side, whether they know of it. Returns those that do not say so within a
+        second in which this client did not stand still itself, or that settle until its time is over."""
+        direct = self._open_direct(arc, grant) if arc.direct else None
+        asked = arc.rcs
+        while True:
+            refusals = await asyncio.gather(*(self._confirm_one(arc, grant, rc, direct) for rc in asked))
+            for rc, refused in zip(asked, refusals, strict=True):
+                await self._look_at_silence(rc, silent=refused is not None and refused.code == "unknown")
+            # What one has confirmed is old by now if another had to settle.
+            asked = [] if direct is None else direct.unanswered(self.mesh.now() - self.fleet.timing.hold_lease // 2)
+            refused_by = [refused for refused in refusals if refused is not None]
+            if refused_by or arc.grant != grant or not asked:
+                return refused_by
+
+    async def _confirm_one(
+        self, arc: OpenArc, grant: Grant, rc: str, direct: DirectHold | None
+    ) -> CommandRefused | None:
         second = round(CONFIRM_TIMEOUT * SECOND)
         deadline = self.mesh.now() + second
-
-        async def one(rc: str) -> CommandRefused | None:
-            nonlocal deadline
-            pause = BACKOFF[0]
-            while True:
-                left = (deadline - self.mesh.now()) / SECOND
-                try:
-                    await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
-                except CommandRefused as refused:
-                    if arc.grant != grant or refused.code not in CONFIRM_AGAIN:
+        pause = BACKOFF[0]
+        while True:
+            sent = self.mesh.now()
+            left = (deadline - sent) / SECOND
+            try:
+                done = await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
+            except CommandRefused as refused:
+                if arc.grant != grant or refused.code not in CONFIRM_AGAIN | {SETTLING}:
+                    return refused
+                if refused.code == SETTLING:
+                    # Neither a refusal nor silence.
+                    arc.settling = grant
+                    if not arc.keep and self.mesh.now() >= arc.end:
                         return refused
-                    if self._rcm.stood_still:
-                        deadline = self.mesh.now() + second
-                    elif left <= 0:
-                        return refused
-                else:
-                    return None
-                # The last time when all is over: a link to the RC may take that long.
-                await asyncio.sleep(max(0.0, min(pause, (deadline - self.mesh.now()) / SECOND)))
-                pause *= 2
+                    deadline, pause = self.mesh.now() + second, BACKOFF[0]
+                    await asyncio.sleep(min(LOOK_AGAIN, refused.left if refused.left is not None else LOOK_AGAIN))
+                    continue
+                if self._rcm.stood_still:
+                    deadline = self.mesh.now() + second
+                elif left <= 0:
+                    return refused
+            else:
+                if direct is not None:
+                    direct.confirmed(rc, sent, done)
+                return None
+            # The last time when all is over: a link to the RC may take that long.
+            await asyncio.sleep(max(0.0, min(pause, (deadline - self.mesh.now()) / SECOND)))
+            pause *= 2
 
-        refusals = await asyncio.gather(*(one(rc) for rc in arc.rcs))
-        for rc, refused in zip(arc.rcs, refusals, strict=True):
-            await self._look_at_silence(rc, silent=refused is not None and refused.code == "unknown")
-        return [refused for refused in refusals if refused is not None]
+    # Direct holds
+
+    def _open_direct(self, arc: OpenArc, grant: Grant) -> DirectHold:
+        if grant not in self._direct:
+            lease, spawn = self.fleet.timing.hold_lease, self._supervisor.spawn
+            self._direct[grant] = DirectHold(arc, grant, self.command, self.mesh.now, spawn, hold_lease=lease)
+        return self._direct[grant]
+
+    def _look_at_direct(self, arc: OpenArc) -> None:
+        """There is news of `arc`: its holds before the present one are over."""
+        for direct in self._direct_of(arc):
+            if direct.grant != arc.grant:
+                direct.end()
+
+    def _direct_of(self, arc: OpenArc) -> list[DirectHold]:
+        self._direct = {grant: one for grant, one in self._direct.items() if not one.gone or one.telling}
+        return [direct for direct in self._direct.values() if direct.arc is arc]
+
+    def _program_is_gone(self, arc: OpenArc) -> None:
+        for direct in self._direct_of(arc):
+            direct.end(released=True)
+
+    def _leave_unentered(self, grant: Grant) -> None:
+        """Some RCs may have confirmed what was not entered."""
+        if (direct := self._direct.get(grant)) is not None:
+            direct.end(released=True)
+
+    def _on_unsure(self, direct: DirectHold) -> None:
+        """An RC has not confirmed it for a hold lease: it is over, whatever RCMs say."""
+        arc, rcs = direct.arc, direct.unanswered(self.mesh.now() - self.fleet.timing.hold_lease)
+        direct.end()
+        if arc.grant == direct.grant:
+            arc.not_confirmed(rcs, f"{', '.join(rcs)} did not confirm it for the hold lease", self.mesh.now())
+            self._store.notify(arc)
+            self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
+            self._supervisor.spawn(self._ask_again(arc))
 
     async def _ask_when_reachable(self, arc: OpenArc, rcs: list[str]) -> None:
         """Where tokens of RCs that did not confirm go, or have gone, and come back, links are back: `arc` is held back
@@ -279,17 +366,20 @@ class Client(MovableClient):
 
     async def end(self, arc: OpenArc) -> None:
         """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed
-        over then. Tried a few times; the RCM sees our token die otherwise."""
+        over then. The program of a direct one is gone by then. Tried a few times; the RCM sees our token die
+        otherwise."""
         await self._may_end.wait()
         if self._leaving is not None:
             return
         if arc.state == "moved":
             self._store.forget(arc)
             return
+        self._program_is_gone(arc)
         await self._rcm.end(arc)
 
     def complete(self, arc: OpenArc) -> None:
-        """An ARC has had its time by this host's clock; RCs and RCM end it by theirs."""
+        """An ARC has had its time by this host's clock, and its body has returned; RCs and RCM end it by theirs."""
+        self._program_is_gone(arc)
         arc.finish("completed", "its minimum runtime is over", self.mesh.now())
         self._store.notify(arc)
         self._store.forget(arc)
