@@ -282,7 +282,6 @@ async def child(
     process = await asyncio.create_subprocess_exec(
         *LAUNCH,
         str(os.getpid()),
-        "-1",
         *command,
         stdin=pipe if job is not None else asyncio.subprocess.DEVNULL,
         stdout=pipe if job is not None else asyncio.subprocess.DEVNULL,

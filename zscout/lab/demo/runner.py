@@ -114,7 +114,7 @@ class DemoRunner(ABC):
             file = self.folder / f"{host}.toml"
             file.write_text(text + extra.get(host, ""))
             # The launcher has the kernel end the node with this process, however that may end.
-            node = [*LAUNCH[1:], str(os.getpid()), "-1", sys.executable, "-m", "zscout.node", str(file)]
+            node = [*LAUNCH[1:], str(os.getpid()), sys.executable, "-m", "zscout.node", str(file)]
             await self.start(f"node {host}", node)
 
     async def start(self, name: str, arguments: Sequence[str], *, piped: bool = False) -> asyncio.subprocess.Process:
