@@ -142,18 +142,18 @@ def test_a_stubborn_one_is_told_first_and_killed_after_the_grace(tmp_path: Path)
     with guarded(*shell(tmp_path, script), grace=0.3) as command:
         command.out.readline()
         before = now()
-        command.say("end")
+        command.say(f"end {now()}")
         assert command.out.readline() == "told\n"
-        assert command.hears_rest()[1:] == ["exited -9", "gone"]
+        assert command.hears_rest()[1:] == ["ending client", "exited -9", "gone"]
         assert now() - before >= 0.3 * SECOND
 
 
 def test_who_may_not_wait_kills_at_once(tmp_path: Path) -> None:
     with guarded(*shell(tmp_path, "trap '' TERM; echo ready; while :; do sleep 0.02; done"), grace=HANG) as command:
         command.out.readline()
-        command.say("end")
+        command.say(f"end {now()}")
         command.say("kill")
-        assert command.hears_rest()[1:] == ["exited -9", "gone"]
+        assert command.hears_rest()[1:] == ["ending client", "exited -9", "gone"]
 
 
 def test_it_is_ended_at_the_deadline_that_was_given_last_though_the_client_says_nothing(tmp_path: Path) -> None:
@@ -163,13 +163,13 @@ def test_it_is_ended_at_the_deadline_that_was_given_last_though_the_client_says_
         command.out.readline()
         begin = now()
         command.say(f"until {begin + SECOND}")
-        assert command.hears_rest()[1:] == ["overdue", "exited -9", "gone"]
+        assert command.hears_rest()[1:] == ["ending deadline", "exited -9", "gone"]
         assert now() - begin >= 1.2 * SECOND
 
 
 def test_nothing_is_started_after_the_deadline(tmp_path: Path) -> None:
     with guarded("touch", str(tmp_path / "ran"), until=now() - 1) as command:
-        assert command.hears_rest() == ["overdue", "gone"]
+        assert command.hears_rest() == ["ending deadline", "gone"]
     assert not (tmp_path / "ran").exists()
 
 
@@ -177,14 +177,14 @@ def test_a_stopped_one_hears_of_its_end(tmp_path: Path) -> None:
     script = (
         f"{OWN_SESSION.replace(' TERM', ' HUP')} while [ ! -s $0/grandchild ]; do sleep 0.01; done; echo ready; wait"
     )
-    with guarded(*shell(tmp_path, script)) as command:
+    with guarded(*shell(tmp_path, script), grace=HANG) as command:
         pid = int(command.hears().split()[1])
         command.out.readline()
         for one in (pid, pid_in(tmp_path / "grandchild")):
             os.kill(one, signal.SIGSTOP)
         assert command.hears() == f"stopped {signal.SIGSTOP.value}"
-        command.say("end")
-        assert command.hears_rest() == ["exited -15", "gone"]
+        command.say(f"end {now()}")
+        assert command.hears_rest() == ["ending client", "exited -15", "gone"]
 
 
 def test_the_command_dies_with_its_guardian() -> None:

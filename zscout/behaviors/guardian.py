@@ -9,9 +9,9 @@ client says so or is gone (CHANNEL, a socket, has ended), at the deadline that i
 when COMMAND itself has ended. `gone` is said when the last process of the tree is no more.
 
 Words on CHANNEL are lines. From the client: `until NS` (the deadline, by the clock of `now`; the first stands there
-before the guardian starts), `end`, `kill` (without grace), `continue`. To it: `started PID`, `stopped SIGNAL`,
-`overdue` (the deadline has come), `exited CODE` (of COMMAND alone; negative: by that signal), `stuck PID` (it runs as
-another user, and can't be ended), `gone`.
+before the guardian starts), `end NS` (the grace counts from then), `kill` (without grace), `continue`. To it:
+`started PID`, `stopped SIGNAL`, `ending WHY` (`deadline`, `client`, `signal`: sent to the guardian), `exited CODE` (of
+COMMAND alone; negative: by that signal), `stuck PID` (it runs as another user, and can't be ended), `gone`.
 
 It imports nothing of zscout, to start quickly.
 """
@@ -68,7 +68,7 @@ class Ending:
         return not self.begun and self._until is not None and at >= self._until
 
     def begin(self, at: int) -> None:
-        """SIGTERM is sent: SIGKILL follows after the grace, from the deadline on if that was earlier."""
+        """SIGTERM is sent, or should have been then: SIGKILL follows after the grace."""
         if self._kill is None:
             self._kill = (at if self._until is None else min(at, self._until)) + self._grace
 
@@ -186,8 +186,9 @@ class Guardian:
         self._channel: socket.socket | None = channel
         self._ending = Ending(grace)
         self._received = b""
-        self._asked = False
-        """Somebody wants this process to end."""
+        self._why = ""
+        """Why all of it is to end, once it is."""
+        self._since, self._told = 0, False
         self._group = ControlGroup()
         self._leader = 0
         """The command, until it was waited for; from then on its number may be another's."""
@@ -199,8 +200,8 @@ class Guardian:
         """Returns when nothing of the command is left, or where it was too late to start it."""
         self._receive()
         if self._ending.due(now()):
-            self._say("overdue")
-        elif self._channel is not None and not self._asked and not self._ending.begun:
+            self._say("ending deadline")
+        elif self._channel is not None and not self._why and not self._ending.begun:
             be_subreaper()
             self._start(tty, command)
             self._watch()
@@ -241,7 +242,7 @@ class Guardian:
             os.close(tty)
         self._say(f"started {self._leader}")
 
-    def _become(self, tty: int, command: list[str], mask: set[signal.Signals]) -> None:
+    def _become(self, tty: int, command: list[str], mask: set[int | signal.Signals]) -> None:
         """The child becomes the command. Raises OSError."""
         os.setpgid(0, 0)
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
@@ -269,9 +270,8 @@ class Guardian:
         poll.register(listened, select.POLLIN)
         while self._reap():
             if self._ending.due(now()):
-                self._say("overdue")
-                self._end()
-            if self._asked or self._channel is None or self._leader == 0:
+                self._ask("deadline")
+            if (self._why or self._leader == 0) and not self._told:
                 self._end()
             at = now()
             if self._ending.kills(at) and at >= self._round:
@@ -306,9 +306,10 @@ class Guardian:
 
     def _end(self) -> None:
         """SIGTERM, once, to all that there are."""
-        if self._ending.begun:
-            return
-        self._ending.begin(now())
+        self._told = True
+        self._ending.begin(self._since or now())
+        if self._why:
+            self._say(f"ending {self._why}")
         # To a group at once: a shell that sees its command die must have been told itself.
         self._to_group(signal.SIGTERM)
         rest = [one for one in descendants(os.getpid()) if one.group != self._leader]
@@ -335,8 +336,13 @@ class Guardian:
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self._leader, number)
 
+    def _ask(self, why: str, since: int = 0) -> None:
+        """All of it is to end; the first reason counts."""
+        if not self._why:
+            self._why, self._since = why, since or now()
+
     def _on_signal(self, *_: object) -> None:
-        self._asked = True
+        self._ask("signal")
 
     # The channel
 
@@ -357,6 +363,7 @@ class Guardian:
             if not text:
                 self._channel.close()
                 self._channel = None
+                self._ask("client")
             *lines, self._received = (self._received + text).split(b"\n")
             for line in lines:
                 self._obey(*line.decode().split())
@@ -365,8 +372,9 @@ class Guardian:
         if word == "until":
             self._ending.renew(int(number))
         elif word == "end":
-            self._asked = True
+            self._ask("client", int(number))
         elif word == "kill":
+            self._ask("client")
             self._ending.hurry(now())
         elif word == "continue":
             self._to_group(signal.SIGCONT)

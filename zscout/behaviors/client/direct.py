@@ -74,11 +74,16 @@ class DirectHold:
         return min(self._settles.values(), default=DEFAULT_SETTLE)
 
     @property
+    def grace(self) -> Ns:
+        """The longest time from SIGTERM to SIGKILL for its program."""
+        return self.settle - self.settle // MARGIN
+
+    @property
     def gone_by(self) -> Ns:
         """By then the program must have been killed, whatever happens to this client. It grows as `sure_until` does
         while the hold is in force, and is less from its end on."""
         end = self.sure_until if self.ended_at is None else min(self.ended_at, self.sure_until)
-        return end + self.settle - self.settle // MARGIN
+        return end + self.grace
 
     @property
     def over(self) -> bool:

@@ -143,7 +143,7 @@ class HoldOptions:
     min_runtime: Decimal
     keep: bool
     timeout: float | None
-    grace: Decimal
+    grace: Decimal | None
     command: tuple[str, ...]
     again: bool
     as_json: bool
@@ -162,8 +162,8 @@ def hold_options(command: F) -> F:
         click.option(
             "--grace",
             type=Parsed("duration", partial(parse_duration, zero=True)),
-            default="5",
-            help="Between SIGTERM and SIGKILL to the command.",
+            help="Between SIGTERM and SIGKILL to the command: at most, and by default, nine tenths of what its devices "
+            "settle (`settle`, 5 s).",
         ),
         timeout_option("Wait at most so long for a grant, then exit with 1."),
         click.option(

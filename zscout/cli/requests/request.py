@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import Client, CommandRefused
+from zscout.behaviors.client.direct import DEFAULT_SETTLE, DirectHold
 from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common
 from zscout.cli.common import Failed
@@ -51,8 +52,9 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
     begins so; twice the same is two of them. Quote it for the shell.
 
     With a COMMAND, they are held while it runs, for the minimum runtime at most (--keep: for longer), and given back as
-    soon as it ends. When its time is over or the grant is taken away, the command's process group gets SIGTERM, and
-    SIGKILL after the grace. Without one, they are held until Ctrl-C or until the minimum runtime is over.
+    soon as nothing of it is left. When its time is over or the grant is taken away, the command and all that it started
+    get SIGTERM, and SIGKILL after the grace; so they do when this program dies or hangs. The next holder waits until
+    nothing is left. Without a COMMAND, they are held until Ctrl-C or until the minimum runtime is over.
 
     \b
     The command finds in its environment:
@@ -114,7 +116,9 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
     try:
         async with report.telling(report.follow_wait()), asyncio.timeout(wanted.timeout):
             if arc is None:
-                arc = await client.request(wanted.name, wanted.needs, **wanted.terms(), estimate=True)
+                arc = await client.request(
+                    wanted.name, wanted.needs, **wanted.terms(), estimate=True, direct=bool(wanted.command)
+                )
             grant = await client.granted(arc)
     except (TimeoutError, asyncio.CancelledError) as error:
         why = arc.reason if arc is not None else ""
@@ -169,17 +173,48 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
     """Runs the command until it ends (its code), or until the hold is over and it has been ended (None)."""
-    async with RunningCommand(wanted.command, environment(held, client), float(wanted.grace)) as command:
-        _, ended = await common.first_of(held.over(), command.wait())
-        if ended:
-            if held.active:
-                # At once: what it left running is ended afterwards, and may take its time.
-                await client.end(held.arc)
-            return await command.wait()
-        why = "its time is over" if held.active else _ending(held.arc).reason or "the grant is gone"
-        report.event("stopping", f"{wanted.command[0]} is stopped: {why}", reason=why)
-        await command.end()
+    direct, program = client.direct_hold(held.grant), wanted.command[0]
+    until = direct.sure_until if direct is not None else None
+    command = RunningCommand(wanted.command, environment(held, client), _grace(wanted, report, direct), until)
+
+    def follow(hold: DirectHold) -> None:
+        command.hold_until(hold.sure_until)
+        if hold.ended_at is not None:
+            command.terminate(hold.ended_at)
+
+    try:
+        async with command:
+            if direct is not None:
+                direct.watch(follow)
+                follow(direct)
+            _, ended = await common.first_of(held.over(), command.wait())
+            if ended and command.why_ended not in ("client", "deadline"):
+                if held.active:
+                    await client.end(held.arc)
+                return await command.wait()
+            why = "its time is over" if held.active else _ending(held.arc).reason or "the grant is gone"
+            report.event("stopping", f"{program} is stopped: {why}", reason=why)
+    finally:
+        if direct is not None and command.gone:
+            direct.returned()
+    if command.why_ended == "deadline" and held.active and not held.completed:
+        # This process stood still then, and has not looked at its hold since.
+        await common.until(lambda: not held.active, report.changed, LAST_WORD)
+        if held.active:
+            await client.end(held.arc)
     return None
+
+
+def _grace(wanted: HoldOptions, report: Report, direct: DirectHold | None) -> float:
+    """Seconds from SIGTERM to SIGKILL: no more than the RCs wait."""
+    most = float((direct.grace if direct is not None else DEFAULT_SETTLE) / SECOND)
+    if wanted.grace is None:
+        return most
+    asked = float(wanted.grace)
+    if asked > most:
+        text = f"--grace {span(asked)} is more than the devices allow: SIGKILL follows {span(most)} after SIGTERM"
+        report.event("grace", text, asked=asked, grace=most)
+    return min(asked, most)
 
 
 async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:

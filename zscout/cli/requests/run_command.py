@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
 
-from zscout.behaviors.guardian import GUARD, NOT_EXECUTABLE, NOT_FOUND, ROUND, SLOWEST, be_subreaper, descendants
-from zscout.cli.common import Failed, fleet_file
+from zscout.behaviors.guardian import GUARD, NOT_EXECUTABLE, NOT_FOUND, ROUND, SLOWEST, be_subreaper, descendants, now
+from zscout.cli.common import Failed, first_of, fleet_file
 from zscout.terminal import print_line
 from zscout.types import SECOND, Ns
 
@@ -79,12 +79,13 @@ class RunningCommand:
         self._timer: asyncio.TimerHandle | None = None
         self._channel, self._theirs = socket.socketpair()
         self._received = b""
-        self._noted = False
+        self._noted = self._told = self._exited = False
         self._code = KILLED
+        self._stuck = asyncio.Event()
         self.pid = 0
         """Of the command, and of its process group."""
-        self.overdue = False
-        """It was ended because the deadline had come."""
+        self.why_ended = ""
+        """Why the guardian ended it: `deadline`, `client`, `signal`; empty: it ended by itself."""
         if until is not None:
             self.hold_until(until)
 
@@ -121,19 +122,33 @@ class RunningCommand:
     async def wait(self) -> int:
         """Waits until nothing of the command is left: what it left running is ended with it. Its own exit code,
         128 + n where signal n ended it."""
-        await asyncio.shield(self._gone)
+        await self._wait_until_gone()
         return self._code if self._code >= 0 else 128 - self._code
+
+    @property
+    def gone(self) -> bool:
+        """Whether nothing of it is left."""
+        return self._gone.done()
+
+    def terminate(self, at: Ns) -> None:
+        """SIGTERM to all of it; SIGKILL follows a grace after `at`. Once, however often it is called."""
+        if not self._told:
+            self._told = True
+            self._say(f"end {at}")
 
     async def end(self) -> None:
         """Ends all of it, and returns when it has ended: SIGTERM, and SIGKILL after the grace or where this is
-        cancelled."""
-        self._say("end")
+        cancelled. What runs as another user and can't be ended is named, and left."""
+        self.terminate(now())
         try:
-            await asyncio.shield(self._gone)
+            await first_of(self._wait_until_gone(), self._stuck.wait())
         except asyncio.CancelledError:
             self._say("kill")
-            await asyncio.shield(self._gone)
+            await first_of(self._wait_until_gone(), self._stuck.wait())
             raise
+
+    async def _wait_until_gone(self) -> None:
+        await asyncio.shield(self._gone)
 
     def _close(self) -> None:
         self._loop.remove_reader(self._channel)
@@ -174,13 +189,14 @@ class RunningCommand:
                 self.pid = int(number)
             case "stopped":
                 self._stopped(int(number))
-            case "overdue":
-                self.overdue = True
             case "exited":
                 self._code = int(number)
+                self._exited = True
+            case "ending" if not self._exited:
+                self.why_ended = number
             case "stuck":
                 print_line(f"zscout: process {number} of {self._command[0]} {CANT_END}", sys.stderr)
-                self._over()
+                self._stuck.set()
             case "gone":
                 self._over()
 
