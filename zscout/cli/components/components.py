@@ -82,6 +82,8 @@ class Listing:
             found = [self.fleet_view.hosts.get(host or "") for host in hosts]
             return all(host is not None and (host.load or not host.has(Role.LOAD)) for host in found)
 
+        if hosts:
+            await self.fleet_view.ask_loads()
         await common.until(reported, self.fleet_view.changed, FIND_LOADS)
         await self.find_ages()
 
