@@ -21,7 +21,7 @@ from zscout.config.devices import RobotRc
 from zscout.config.node import Node, default_node, load_node
 from zscout.config.strict import BadInput
 from zscout.drivers.lock import only_here
-from zscout.drivers.registry import driver_for
+from zscout.drivers.registry import driver_for, driver_name
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError, ZenohMesh
@@ -51,8 +51,10 @@ async def run_node(node: Node, stop: asyncio.Event) -> None:
 
 async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
     """The services of a node, until `stop` or until one fails. The recorder, the load reporter and the
-    candidate start again by themselves; an RC and the component host end the node, and all in order."""
+    candidate start again by themselves; an RC and the component host end the node, and all in order. Raises BadInput
+    before anything begins where an RC's driver can't be had."""
     me, failures = mesh.me, list[Exception]()
+    drivers = {spec.name: driver_for(spec) for spec in node.rcs}
 
     def fail(error: Exception) -> None:
         failures.append(error)
@@ -72,10 +74,11 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
             stack.enter_context(only_here(node.fleet.name, me.host, spec.name))
-            rc = ResourceController(mesh, spec.name, driver_for(spec), hold_lease=lease, stall=stall, on_failure=fail)
+            driver = drivers[spec.name]
+            rc = ResourceController(mesh, spec.name, driver, hold_lease=lease, stall=stall, on_failure=fail)
             await rc.start()
             stack.push_async_callback(rc.stop)
-            log.info("runs %s (%s)", spec.name, type(spec).__struct_config__.tag)
+            log.info("runs %s (%s)", spec.name, driver_name(spec))
         components = ComponentHost(mesh, node.fleet, node.components, fail)
         if node.load:
             reporter = LoadReporter(mesh, node.labels, components.running, tree=node.load == "tree")

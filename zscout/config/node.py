@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, Struct, structs
 
-from zscout.config.devices import RcConfig, check_rc
+from zscout.config.devices import RcConfig, read_rc
 from zscout.config.fleet import Endpoints, Fleet, check_links, default_fleet, ip_of, load_fleet
 from zscout.config.strict import Where, check_name, check_names, check_unique, key, quoted, read_toml
 from zscout.keyexpr import valid_name
@@ -102,7 +102,8 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
 
     node: NodeTable = NodeTable()
     mesh: NodeMeshTable = NodeMeshTable()
-    rc: Annotated[tuple[RcConfig, ...], Meta(max_length=MAX_RCS)] = ()
+    rc: Annotated[tuple[dict[str, Any], ...], Meta(max_length=MAX_RCS)] = ()
+    """Each is read by itself: which keys it may have is its driver's."""
     recorder: RecorderTable | None = None
     components: ComponentsConfig = ComponentsConfig()
 
@@ -129,15 +130,14 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     check_names(file.node.labels, top / "node" / "labels")
     for number, kind in enumerate(file.components.kinds or ()):
         check_name(kind, (top / "components" / "kinds").item(number))
-    check_unique((rc.name for rc in file.rc), top / "rc", "name")
-    for number, rc in enumerate(file.rc):
-        check_rc(rc, (top / "rc").item(number, rc.name))
+    rcs = tuple(read_rc(table, (top / "rc").item(number, table.get("name"))) for number, table in enumerate(file.rc))
+    check_unique((rc.name for rc in rcs), top / "rc", "name")
     return Node(
         host=host,
         fleet=structs.replace(fleet, mesh=mesh),
         candidate=file.node.candidate,
         load=file.node.load,
-        rcs=file.rc,
+        rcs=rcs,
         recorder=None if file.recorder is None else _recorder(file.recorder, folder, top / "recorder"),
         labels=file.node.labels,
         components=file.components,

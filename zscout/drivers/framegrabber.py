@@ -15,13 +15,14 @@ import threading
 from collections import Counter, deque
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import cv2
 import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from zscout.config.devices import FramegrabberRc
 from zscout.drivers.airtime import Bucket
 from zscout.drivers.capture import Capture, CapturedFrame, seconds
 from zscout.drivers.driver import Driver, RcHandle
@@ -61,6 +62,8 @@ class FramegrabberDriver(Driver):
 
     Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state)."""
 
+    Options = FramegrabberRc
+
     def __init__(self, sources: Mapping[str, str], *, rate: float, quality: int) -> None:
         if not sources or not 0 < rate < math.inf or not 1 <= quality <= 100:
             raise ValueError("a framegrabber has a source, a rate above 0 and a quality of 1 to 100")
@@ -81,6 +84,10 @@ class FramegrabberDriver(Driver):
         self._lost = False
         self._before: Counter[str] = Counter()
         """What the captures have counted that were let go."""
+
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(options.by_video, rate=options.rate, quality=options.quality)
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc

@@ -5,18 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any
+from typing import Any, ClassVar, Self
 
+from zscout.config.devices import CapacityRc, ExclusiveRc, VideoRc
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.messages import Amounts, Figures, Holder, ProposedHolder, exact, exact_amounts
 from zscout.scheduling.capacity import excess
+from zscout.types import SECOND
 
 
 class ExclusiveDriver(Driver):
     """A device that is held, and nothing more."""
 
+    Options: ClassVar[type] = ExclusiveRc
+
     def __init__(self, *, activation: float = 0.0) -> None:
         self.activation = activation
+
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(activation=options.activation / SECOND)
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
         """Knows `echo`, which returns its `value`."""
@@ -28,11 +36,16 @@ class ExclusiveDriver(Driver):
 class CapacityDriver(ExclusiveDriver):
     """A sharable device that carries holders as long as no bandwidth parameter's sum exceeds its bound."""
 
+    Options = CapacityRc
     sharable = True
 
     def __init__(self, capacity: Mapping[str, Fraction], *, activation: float = 0.0) -> None:
         super().__init__(activation=activation)
         self._capacity = dict(capacity)
+
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(exact_amounts(options.capacity), activation=options.activation / SECOND)
 
     def vote(self, holders: list[ProposedHolder]) -> str:
         return excess(self._capacity, ((holder.id, exact_amounts(holder.params)) for holder in holders))
@@ -45,6 +58,7 @@ class VideoDriver(Driver):
     """A video channel, which is a frequency: any number may listen, one may transmit. Bandwidth parameter:
     `transmitters`, 1 unless given; 0 only listens."""
 
+    Options = VideoRc
     sharable = True
 
     async def open(self, rc: RcHandle) -> None:

@@ -11,8 +11,9 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any, Final
+from typing import Any, Final, Self
 
+from zscout.config.devices import RadioRc
 from zscout.drivers.airtime import RESERVE, Share, line_rate, objection, share_of
 from zscout.drivers.commands import RadioHalt, RadioStop, radio_command
 from zscout.drivers.driver import Driver, RcHandle
@@ -35,6 +36,7 @@ LONGEST_SLEEP: Final = 60.0
 class RadioDriver(Driver):
     """The RC of a radio. It carries stops and halts for the node of any robot, the rest for its holders."""
 
+    Options = RadioRc
     sharable = True
     relays = True
 
@@ -57,6 +59,10 @@ class RadioDriver(Driver):
         self._losses = 0
         self._counts = Counter(packets=0, bytes=0, repeats=0, halts=0)
         self._waits: deque[Fraction] = deque(maxlen=RECENT)
+
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(options.port, baud=options.baud, bound=options.bound / SECOND)
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc
