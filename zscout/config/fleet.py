@@ -18,6 +18,8 @@ FLEET_VARIABLE: Final = "ZSCOUT_FLEET"
 """Environment variable with the path of the fleet file, for the CLI."""
 MAX_CANDIDATES: Final = 1_000
 MAX_ENDPOINTS: Final = 256
+MIN_RUNTIME: Final[Ns] = 60 * SECOND
+"""Default, in ns."""
 
 _ENDPOINT: Final = re.compile(
     r"(?P<protocol>[a-z]+)/(?P<host>\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9_.-]+):(?P<port>[0-9]{1,5})"
@@ -49,6 +51,9 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
     max_payload: Annotated[int, key("Of one request.", 1_024, 16_777_216, unit="bytes")] = 65_536
     max_running_per_host: Annotated[
         int, key("Running ARCs of all clients of one host, but for an operator's; 0: any number.", 0, 100_000)
+    ] = 0
+    max_runtime: Annotated[
+        Ns, seconds("0", "31622400", "After this long every hold ends as completed, whoever's it is; 0: never.")
     ] = 0
 
 
@@ -105,6 +110,8 @@ class Fleet(Struct, frozen=True):
     limits: RcmLimits
     timing: Timing
     placement: PlacementPolicy = DEFAULT_PLACEMENT
+    min_runtime: Ns = MIN_RUNTIME
+    """For how long a hold is protected where its program says nothing."""
 
     @property
     def operator_priority(self) -> int:
@@ -134,6 +141,9 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     promise: Annotated[
         Promise, key("Whom an ARC that is due goes before: equal and lower priority, or all but operators.")
     ] = DEFAULT.promise
+    min_runtime: Annotated[
+        Ns, seconds("0.001", "31622400", "For how long a hold is protected where its program says nothing.")
+    ] = MIN_RUNTIME
 
 
 class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
@@ -183,8 +193,19 @@ def _fleet(file: FleetFile, top: Where) -> Fleet:
         patience=table.patience or None,
         promise=table.promise,
         max_running_per_host=file.limits.max_running_per_host or None,
+        max_runtime=file.limits.max_runtime or None,
     )
-    return Fleet(table.name, table.candidates, table.strategy, policy, mesh, file.limits, file.timing, file.placement)
+    return Fleet(
+        name=table.name,
+        candidates=table.candidates,
+        strategy=table.strategy,
+        scheduling=policy,
+        mesh=mesh,
+        limits=file.limits,
+        timing=file.timing,
+        placement=file.placement,
+        min_runtime=min(table.min_runtime, policy.max_runtime or table.min_runtime),
+    )
 
 
 def _check_timing(timing: Timing, lease: float, at: Where) -> None:

@@ -40,6 +40,13 @@ _AT: Final = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document
 _PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _DEEP_KEY: Final = re.compile(rf"""(?<![\w"'\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MAX_DEPTH}}}""")
 """A dotted key that is longer than any here. tomllib takes hours over one that fills the file."""
+_NUMBER: Final = r"([0-9]{1,19}(?:\.[0-9]{1,18})?|\.[0-9]{1,18})"
+_DURATION: Final = re.compile(
+    f"{_NUMBER}|(?:{_NUMBER}d)?(?:{_NUMBER}h)?(?:{_NUMBER}m(?!s))?(?:{_NUMBER}s)?(?:{_NUMBER}ms)?"
+)
+_UNITS: Final = tuple(map(Decimal, ("1", "86400", "3600", "60", "1", "0.001")))
+DURATIONS: Final = "a number of seconds, or with units: 1.5, 300ms, 90s, 5m, 2h, 1d12h"
+"""How people write durations."""
 _NAME_RULE: Final = f'1 to {MAX_NAME} letters A to Z, digits, "_", "." or "-"'
 
 
@@ -212,8 +219,16 @@ def key(
     return Meta(**bounds, description=description, examples=examples, extra=extra or None)
 
 
+def parse_duration(text: str) -> Decimal | None:
+    """Seconds from `5`, `1.5`, `90s`, `300ms`, `5m`, `2h` or `1d12h`; None for what is no duration."""
+    found = _DURATION.fullmatch(text)
+    if found is None or not any(found.groups()):
+        return None
+    return sum((Decimal(part) * unit for part, unit in zip(found.groups(), _UNITS, strict=True) if part), Decimal(0))
+
+
 def seconds(low: str, high: str, description: str) -> Meta:
-    """The same for a duration: written in seconds, held as whole nanoseconds."""
+    """The same for a duration: written in seconds or as `parse_duration` has it, held as whole nanoseconds."""
     return Meta(description=description, extra={"unit": "s", "low": Decimal(low), "high": Decimal(high)})
 
 
@@ -247,8 +262,11 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
     """`value`, as TOML gave it, with durations in ns. Raises BadInput where it is not of this kind."""
     match kind:
         case inspect.Metadata(extra={"low": low, "high": high}):
+            value = _seconds(value, where)
             _check_leaf(inspect.DecimalType(), value, where)
             return seconds_to_ns(Decimal(str(value)), where, low=low, high=high)
+        case inspect.Metadata(type=inspect.FloatType() as of, extra={"unit": "s"}):
+            return _checked(of, _seconds(value, where), where)
         case inspect.Metadata(type=of):
             return _checked(of, value, where)
         case inspect.LiteralType(values=values):
@@ -283,6 +301,16 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
         case _:
             _check_leaf(kind, value, where)
     return value
+
+
+def _seconds(value: object, where: Where) -> object:
+    """A duration that is written as a text, in seconds; all else as it is."""
+    if not isinstance(value, str):
+        return value
+    found = parse_duration(value)
+    if found is None:
+        raise where.bad(f"{quoted(value)} is not a duration", f"write {DURATIONS}")
+    return found
 
 
 def _tagged(structs: Iterable[inspect.Type], table: Mapping[str, object], where: Where) -> inspect.StructType:

@@ -71,6 +71,8 @@ class Hold:
     end: Ns
     protected_below: int | None = None
     """Below this priority nobody preempts it before `end`; None: any higher priority does."""
+    last: Ns | None = None
+    """When it ends though it is kept; None: nothing ends it but others and its client."""
 
 
 class ArcState(StrEnum):
@@ -196,8 +198,11 @@ class Arc:
 
     def known_end(self, other: Arc | None = None) -> float:
         """When its hold ends, or `other` may preempt it, by what is known now; infinite for what it keeps."""
+        if self.hold is None:
+            return math.inf
         kept = self.request.keep and (other is None or self.priority > other.priority)
-        return math.inf if self.hold is None or kept else self.hold.end
+        last = math.inf if self.hold.last is None else self.hold.last
+        return last if kept else min(self.hold.end, last)
 
     def past_min_runtime(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may preempt it then."""

@@ -39,6 +39,8 @@ class ReasonCode(StrEnum):
     # A hold, or a wait, ended:
     EXPIRED = "expired"
     """Its minimum runtime is over."""
+    LIMIT = "limit"
+    """It had the longest time that the fleet gives a hold."""
     PREEMPTED = "preempted"
     """By `by`."""
     DISPLACED = "displaced"
@@ -113,6 +115,7 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ReasonCode.VOTING: lambda _: "votes are out",
     ReasonCode.SEARCHING: lambda _: "a better schedule is sought",
     ReasonCode.EXPIRED: lambda _: "its minimum runtime is over",
+    ReasonCode.LIMIT: lambda _: "it had the longest time that this fleet gives a hold (max_runtime)",
     ReasonCode.PREEMPTED: lambda one: f"preempted by {one.by[0]}",
     ReasonCode.DISPLACED: lambda one: f"its minimum runtime is over and {one.by[0]}, needs its RCs",
     ReasonCode.CANCELLED: lambda one: f"cancelled by {one.detail}",

@@ -6,6 +6,7 @@ Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an
 from __future__ import annotations
 
 import heapq
+import math
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -123,7 +124,7 @@ class SchedulerState:
         """The instant of the latest batch of events."""
         self.votes = Votes()
         self._ends: list[tuple[Ns, ArcId]] = []
-        """A heap of the ends of minimum runtimes. Those of holds that ended otherwise are skipped."""
+        """A heap of the ends of minimum runtimes and longest times. Those of holds that ended otherwise are skipped."""
         self.rcs: dict[RcName, Rc] = {}
         self.queued: dict[ArcId, Arc] = {}
         self.running: dict[ArcId, Arc] = {}
@@ -314,8 +315,9 @@ class SchedulerState:
         self._rename(arc, to, renamed)
         arc.entry = self._next_entry()
         self._add_running(arc)
-        if arc.hold.end > self.now:
-            heapq.heappush(self._ends, (arc.hold.end, arc.id))
+        for end in (arc.hold.end, arc.hold.last):
+            if end is not None and end > self.now:
+                heapq.heappush(self._ends, (end, arc.id))
         self._clients.setdefault(to, {})[arc.id] = arc
 
     def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
@@ -328,6 +330,8 @@ class SchedulerState:
         arc.hold, arc.reason, arc.since, arc.entry = hold, None, self.now, self._next_entry()
         self._add_running(arc)
         heapq.heappush(self._ends, (hold.end, arc.id))
+        if hold.last is not None:
+            heapq.heappush(self._ends, (hold.last, arc.id))
         self.index.touched |= arc.mask
         self.busy |= arc.mask & ~self.sharable
 
@@ -342,18 +346,20 @@ class SchedulerState:
         return hold
 
     def expired_arcs(self) -> Iterator[Arc]:
-        """The running ARCs whose minimum runtime is over by now, each once; the caller may end others meanwhile."""
+        """The running ARCs whose minimum runtime or longest time is over by now, each time once; the caller may end
+        others meanwhile."""
         while self._ends and self._ends[0][0] <= self.now:
-            arc = self.running.get(heapq.heappop(self._ends)[1])
-            if arc is not None and arc.hold is not None and arc.hold.end <= self.now:
+            at, arc_id = heapq.heappop(self._ends)
+            arc = self.running.get(arc_id)
+            if arc is not None and arc.hold is not None and at in (arc.hold.end, arc.hold.last):
                 yield arc
 
     def next_end(self) -> Ns | None:
-        """When the next minimum runtime is over."""
+        """When the next minimum runtime or longest time is over."""
         while self._ends:
             at, arc_id = self._ends[0]
             arc = self.running.get(arc_id)
-            if arc is not None and arc.hold is not None and arc.hold.end == at:
+            if arc is not None and arc.hold is not None and at in (arc.hold.end, arc.hold.last):
                 return at
             heapq.heappop(self._ends)
         return None
@@ -371,6 +377,17 @@ class SchedulerState:
         """The band of a priority: ARCs whose priorities share a band respect each other's reservations."""
         alone = self.policy.promise == "equals" or self.operator(priority)
         return priority if alone else self.policy.operator_priority - 1
+
+    def longest(self, start: Ns) -> Ns | None:
+        """When a hold from `start` on ends at the latest."""
+        limit = self.policy.max_runtime
+        return None if limit is None else start + limit
+
+    def over_by(self, arc: Arc, other: Arc) -> float:
+        """When `other` could take what `arc` would hold from now on; infinite where it may keep it."""
+        if arc.request.keep and arc.priority > other.priority:
+            return math.inf if (last := self.longest(self.now)) is None else last
+        return self.now + arc.request.min_runtime
 
     def protected_below(self, arc: Arc) -> int | None:
         """Below which priority nobody takes a hold that `arc` is granted now, before its minimum runtime is

@@ -15,7 +15,6 @@ from zscout.lab.building.plan_file import MAX_SEED, RANDOM, known_buildings, pla
 
 BUILDING: Final = common.Parsed("building", lambda text, _: text)
 MAX_FRAMEGRABBERS: Final = 16
-MAX_SECONDS: Final = 1e9
 _ADDRESS: Final = re.compile(r"(?:(?P<host>\[[0-9a-fA-F:.]+\]|[^:\[\]]+):)?(?P<port>[0-9]{1,5})")
 
 
@@ -89,9 +88,8 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
 @click.option(
     "--for",
     "seconds",
-    metavar="SECONDS",
-    type=click.FloatRange(0, MAX_SECONDS, min_open=True),
-    help="End after so many seconds of the building. Default: at Ctrl-C.",
+    type=SECONDS,
+    help="End after so long in the building: 90s, 5m. Default: at Ctrl-C.",
 )
 @common.json_option("Print how to reach everything as one JSON object.")
 def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **options: Any) -> None:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from zscout.cli.operator.picture_recording import WatchRecording
     from zscout.cli.operator.watch_source import LiveSource, VideoFile
 
-MAX_SECONDS: Final = 1e9
 DRAWN: Final = 0.1
 """Seconds from one live line to the next."""
 
@@ -56,9 +55,8 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
 )
 @click.option(
     "--limit",
-    metavar="SECONDS",
-    type=click.FloatRange(0, MAX_SECONDS, min_open=True),
-    help="End after so many seconds of the source. Default: at its end, or at Ctrl-C.",
+    type=SECONDS,
+    help="End after so long in the source: 90s, 5m. Default: at its end, or at Ctrl-C.",
 )
 def watch(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
     """Tell when something moves: one line for each event, as soon as it is over.

@@ -15,7 +15,8 @@ import click
 from zscout import messages
 from zscout.cli.common import F, Parsed, json_option
 from zscout.cli.requests.run_command import check_command
-from zscout.config.strict import BadInput, quoted
+from zscout.config import strict
+from zscout.config.strict import DURATIONS, BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
 from zscout.messages import MAX_NEEDS, MAX_PARAMS
 from zscout.scheduling.model import check_patterns
@@ -25,30 +26,41 @@ Needs = dict[str, dict[str, Decimal]]
 MAX_ARC_NAME: Final = 200
 """Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 _NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
-_UNITS: Final = {"": Decimal(1), "s": Decimal(1), "ms": Decimal("0.001"), "m": Decimal(60), "h": Decimal(3600)}
 
 
 def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
-    """Seconds from `5`, `1.5`, `300ms`, `2m` or `1h`. Raises BadInput."""
-    remedy = "write a number of seconds, or with a unit: 1.5, 300ms, 2m, 1h"
-    number = text.rstrip("hms")
-    unit = text[len(number) :]
-    if _NUMBER.fullmatch(number) is None or unit not in _UNITS:
-        raise BadInput(f"{what}: {quoted(text)} is not a duration; {remedy}")
-    seconds = Decimal(number) * _UNITS[unit]
+    """Seconds from `5`, `1.5`, `300ms`, `90s`, `5m`, `2h` or `1d12h`. Raises BadInput."""
+    seconds = strict.parse_duration(text)
+    if seconds is None:
+        raise BadInput(f"{what}: {quoted(text)} is not a duration; write {DURATIONS}")
     if zero and seconds == 0:
         return seconds
     try:
         messages.duration(seconds, what)
     except ValueError as error:
-        raise BadInput(f"{error}; {remedy}") from None
+        raise BadInput(f"{error}; write {DURATIONS}") from None
     return seconds
 
 
 def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
     """`--timeout`, in seconds."""
-    seconds = Parsed("duration", lambda text, option: float(parse_duration(text, option)))
-    return click.option("--timeout", type=seconds, help=help)
+    return click.option("--timeout", type=SECONDS, help=help)
+
+
+def seconds_within(low: float, high: float) -> Parsed[float]:
+    """An option's duration, in seconds."""
+
+    def parse(text: str, option: str) -> float:
+        seconds = float(parse_duration(text, option))
+        if not low <= seconds <= high:
+            raise BadInput(f"{option}: {seconds:g} s is not from {low:g} to {high:g} s; write {DURATIONS}")
+        return seconds
+
+    return Parsed("duration", parse)
+
+
+SECONDS: Final = Parsed("duration", lambda text, option: float(parse_duration(text, option)))
+"""An option's duration of any length, in seconds."""
 
 
 def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
@@ -170,7 +182,8 @@ def hold_options(command: F) -> F:
             "--min-runtime",
             type=Parsed("duration", parse_duration),
             default="60",
-            help="For how long, from the grant: 5, 1.5, 300ms, 2m, 1h.",
+            help="For how long, from the grant, nobody of equal priority takes it: 90s, 5m, 2h, 1d12h. Default: the "
+            "fleet's, 60 s.",
         ),
         click.option(
             "--name", help="What the ARC is called. Default: the command's name, else request (take: operator)."
