@@ -1,13 +1,15 @@
 """An ARC in a few lines: a context manager that waits for the grant and ends its body when it is over.
 
     async with Client.connect() as client:
-        async with hold(client, "survey", {"robot/scout33": {}}, min_runtime=5) as held:
+        async with hold(client, "survey", {"robot/scout33": {}}) as held:
             await held.command("robot/scout33", {"name": "echo", "value": 1})
 
-The body is cancelled when the hold is taken away (`Revoked` comes out of the `async with`), and when its
-minimum runtime is over (nothing comes out: it had its time). `holds` goes again when it is granted again:
+A hold is protected for its minimum runtime (the fleet's, 60 s), and goes on until somebody of equal or higher
+priority waits for what it holds; with `keep=False` it ends when its minimum runtime is over. The body is cancelled when
+the hold is taken away before that (`Revoked` comes out of the `async with`), and when its time is over (nothing comes
+out, and `held.completed` is true). `holds` asks again, and goes again when it is granted again:
 
-    async for attempt in holds(client, "survey", {"robot/scout33": {}}, min_runtime=5):
+    async for attempt in holds(client, "survey", {"robot/scout33": {}}):
         async with attempt as held:
             ...
 
@@ -78,7 +80,7 @@ class Held:
 
     @property
     def completed(self) -> bool:
-        """Whether the hold is over because it had its minimum runtime."""
+        """Whether the hold is over because it had its time: its minimum runtime, and with `keep` somebody waited."""
         if self.active:
             return not self.arc.keep and self.remaining <= 0
         return self.arc.outcome == "completed"
@@ -105,23 +107,39 @@ class Held:
 
 class Attempt:
     """One entry into an ARC's body, or one after the other: `again` lets a hold that was taken away be waited for
-    once more."""
+    once more, and one that was kept and had its time be asked for anew. `timeout` in seconds, for each wait."""
 
-    def __init__(self, client: Client, ask: dict[str, Any], *, again: bool) -> None:
-        self._client, self._ask, self._again = client, ask, again
+    def __init__(
+        self, client: Client, ask: dict[str, Any], *, again: bool = False, timeout: float | None = None
+    ) -> None:
+        self._client, self._ask, self._again, self._timeout = client, ask, again, timeout
         self.arc: OpenArc | None = None
+        self._anew = False
+        """Whether what was kept is to be asked for anew."""
         self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None]] | None = None
         """The hold, its body, and what cancels the body when the hold is over."""
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether its ARC is to be waited for once more."""
+        return self._anew or (self.arc is not None and self.arc.open)
+
     async def granted(self) -> Held:
-        """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused."""
-        if self.arc is None:
-            self.arc = await self._client.request(**self._ask)
+        """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused, TimeoutError."""
+        if self._anew:
+            self.arc, self._anew = None, False
         try:
-            grant = await self._client.granted(self.arc)
-        except asyncio.CancelledError:
-            await self._client.end(self.arc)
-            raise
+            async with asyncio.timeout(self._timeout):
+                if self.arc is None:
+                    self.arc = await self._client.request(**self._ask)
+                grant = await self._client.granted(self.arc)
+        except (asyncio.CancelledError, TimeoutError) as error:
+            why = self.arc.reason if self.arc is not None else "no RCM has answered"
+            if self.arc is not None:
+                await self._client.end(self.arc)
+            if isinstance(error, asyncio.CancelledError):
+                raise
+            raise TimeoutError(f"{self._ask['name']} was not granted within {self._timeout:g} s: {why}") from None
         if grant is None:
             raise Revoked(self.arc)
         return Held(self._client, self.arc, grant)
@@ -146,6 +164,9 @@ class Attempt:
         # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
         interrupted = interrupted and body.uncancel() == 0 and kind is asyncio.CancelledError
         if held.completed:
+            # What somebody released is not to be had again.
+            by_hand = arc.why is not None and arc.why.code == "released"
+            self._anew = self._again and interrupted and arc.keep and not by_hand
             self._client.complete(arc)
             return interrupted
         if held.active or (kind is not None and not interrupted):
@@ -166,12 +187,15 @@ def hold(
     needs: Needs,
     *,
     priority: int = 0,
-    min_runtime: float | Decimal = 1.0,
-    keep: bool = False,
+    min_runtime: float | Decimal | None = None,
+    keep: bool = True,
+    timeout: float | None = None,
 ) -> Attempt:
-    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds."""
+    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's.
+
+    Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
     ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
-    return Attempt(client, ask, again=False)
+    return Attempt(client, ask, timeout=timeout)
 
 
 async def holds(
@@ -180,13 +204,13 @@ async def holds(
     needs: Needs,
     *,
     priority: int = 0,
-    min_runtime: float | Decimal = 1.0,
-    keep: bool = False,
+    min_runtime: float | Decimal | None = None,
+    keep: bool = True,
 ) -> AsyncIterator[Attempt]:
-    """The same, entered again whenever it was taken away and is granted again, until a body ends by itself
-    or has had its time."""
+    """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
+    without `keep` has had its time."""
     ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
     attempt = Attempt(client, ask, again=True)
     yield attempt
-    while attempt.arc is not None and attempt.arc.open:
+    while attempt.goes_on:
         yield attempt

@@ -172,12 +172,15 @@ class Client(MovableClient):
         needs: Needs,
         *,
         priority: int = 0,
-        min_runtime: float | Decimal = 1.0,
-        keep: bool = False,
+        min_runtime: float | Decimal | None = None,
+        keep: bool = True,
         estimate: bool = False,
         direct: bool = False,
     ) -> OpenArc:
         """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
+
+        Once granted it is protected for `min_runtime` seconds (default: the fleet's, 60), and held until somebody of
+        equal or higher priority waits for what it holds; without `keep`, it ends when they are over.
 
         A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
         more. With `estimate` its notices say when it will start. `direct`: its program touches devices past their RCs;
@@ -187,7 +190,7 @@ class Client(MovableClient):
         wanted = amounts(needs)
         arc = await self._claim(check_name(name, "arc"), wanted)
         if arc is None:
-            seconds, now = Decimal(str(min_runtime)), self.mesh.now()
+            seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
             self._store.add(arc)
         try:
@@ -199,6 +202,10 @@ class Client(MovableClient):
                 self._supervisor.spawn(self._rcm.give_back(messages.Cancel(id=arc.id)))
             raise
         return arc
+
+    def _protected(self, min_runtime: float | Decimal | None) -> Decimal:
+        """In seconds; what nobody gave is the fleet's."""
+        return Decimal(self.fleet.min_runtime) / SECOND if min_runtime is None else Decimal(str(min_runtime))
 
     async def changed(self, arc: OpenArc) -> None:
         """Waits until there is news of `arc`."""
@@ -407,10 +414,17 @@ class Client(MovableClient):
         return reply.message if reply is not None else None
 
     async def foresee(
-        self, name: str, needs: Needs, *, priority: int, min_runtime: Decimal, keep: bool = False
+        self,
+        name: str,
+        needs: Needs,
+        *,
+        priority: int = 0,
+        min_runtime: float | Decimal | None = None,
+        keep: bool = True,
     ) -> Foresight | None:
         """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
-        asked = messages.Foresee(new_instance(), name, amounts(needs), priority, min_runtime, keep)
+        seconds = self._protected(min_runtime)
+        asked = messages.Foresee(new_instance(), name, amounts(needs), priority, seconds, keep)
         reply = await self.mesh.ask_one(self._rcm.key, asked, Foresight, timeout=QUERY_TIMEOUT)
         if reply is not None and reply.problem is not None:
             raise RequestRefused(reply.problem)

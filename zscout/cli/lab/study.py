@@ -22,6 +22,7 @@ from zscout.cli.lab.options import (
     seed_option,
     seeds_option,
 )
+from zscout.cli.requests.options import seconds_within
 from zscout.config.strict import BadInput, quoted
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.trial import STRATEGIES, SchedulingJob, run_timed

@@ -24,7 +24,7 @@ MAX_ANSWER = 4_096
 
 @click.command(cls=CommandAfterDashes)
 @click.option("-y", "--yes", is_flag=True, help="Don't ask.")
-@click.option("--no-keep", is_flag=True, help="Give back when the minimum runtime is over.")
+@click.option("--no-keep", is_flag=True, hidden=True, help="--min-runtime is what --release-after is.")
 @hold_options
 @common.runs
 async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any) -> int:
@@ -38,7 +38,7 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: A
     Examples:
       zscout take robot/scout33
       zscout take robot/scout33 radio/rf0:command_rate=5 --yes -- ./drive.py
-      zscout take 'robot/*' 'framegrabber/*' --no-keep --min-runtime 2m
+      zscout take 'robot/*' 'framegrabber/*' --release-after 2m
     """
     priority = common.the_fleet().operator_priority
     wanted = gather(needs, name, "operator", priority=priority, keep=not no_keep, **rest)

@@ -16,6 +16,7 @@ from click.shell_completion import CompletionItem
 
 from zscout import terminal
 from zscout.cli import common
+from zscout.cli.requests.options import SECONDS
 from zscout.config.strict import BadInput
 from zscout.mesh import clock
 from zscout.terminal import LiveLine, many, span
@@ -54,9 +55,7 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
     help="Write pictures, boxes and events as a Rerun recording; look at it with `zscout view FILE`.",
 )
 @click.option(
-    "--limit",
-    type=SECONDS,
-    help="End after so long in the source: 90s, 5m. Default: at its end, or at Ctrl-C.",
+    "--limit", type=SECONDS, help="End after so long in the source: 90s, 5m. Default: at its end, or at Ctrl-C."
 )
 def watch(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
     """Tell when something moves: one line for each event, as soon as it is over.

@@ -152,7 +152,8 @@ class HoldOptions:
     name: str
     needs: Needs
     priority: int
-    min_runtime: Decimal
+    min_runtime: Decimal | None
+    """None: the fleet's."""
     keep: bool
     timeout: float | None
     grace: Decimal | None
@@ -170,7 +171,14 @@ def hold_options(command: F) -> F:
     for option in (
         click.argument("needs", nargs=-1, required=True, type=Parsed("need", parse_need), metavar="NEED..."),
         json_option("Print JSON lines, one for each event."),
-        click.option("--again", is_flag=True, help="Wait and run the command again after a preemption."),
+        click.option(
+            "--again", is_flag=True, help="Ask again and run the command again, when it was ended for others."
+        ),
+        click.option(
+            "--release-after",
+            type=Parsed("duration", parse_duration),
+            help="Give back after so long, though nobody waits; instead of --min-runtime.",
+        ),
         click.option(
             "--grace",
             type=Parsed("duration", partial(parse_duration, zero=True)),
@@ -181,8 +189,7 @@ def hold_options(command: F) -> F:
         click.option(
             "--min-runtime",
             type=Parsed("duration", parse_duration),
-            default="60",
-            help="For how long, from the grant, nobody of equal priority takes it: 90s, 5m, 2h, 1d12h. Default: the "
+            help="For how long it is yours against all of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
             "fleet's, 60 s.",
         ),
         click.option(
@@ -193,8 +200,14 @@ def hold_options(command: F) -> F:
     return command
 
 
-def gather(needs: Any, name: str | None, default_name: str = "request", **rest: Any) -> HoldOptions:
+def gather(
+    needs: Any, name: str | None, default_name: str = "request", *, keep: bool, release_after: Any, **rest: Any
+) -> HoldOptions:
     """Checks what can be checked before anybody is asked. Raises BadInput, BadName, Failed."""
+    if release_after is not None:
+        if rest["min_runtime"] is not None:
+            raise BadInput("--release-after and --min-runtime are two times for one hold; give one of them")
+        keep, rest["min_runtime"] = False, release_after
     command: tuple[str, ...] = click.get_current_context().meta["command"]
     if command:
         check_command(command)
@@ -202,7 +215,7 @@ def gather(needs: Any, name: str | None, default_name: str = "request", **rest: 
     if rest["again"] and not command:
         raise BadInput("--again runs a command again; add one after --")
     return HoldOptions(
-        name=check_name(name or default_name, "--name"), needs=gather_needs(needs), command=command, **rest
+        name=check_name(name or default_name, "--name"), needs=gather_needs(needs), command=command, keep=keep, **rest
     )
 
 

@@ -20,6 +20,7 @@ from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
+from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState
 from zscout.terminal import LiveLine, clean, print_json, print_line, span
@@ -28,10 +29,11 @@ from zscout.types import SECOND, Ns
 TAKEN_AWAY: Final = 75
 """EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""
 TIME_OVER: Final = 124
-"""As `timeout` has it: the command was ended because its time was over."""
+"""As `timeout` has it: the command was ended because its time was over, and with a kept hold somebody waited."""
 MAX_PRIORITY: Final = 1_000_000
 LAST_WORD: Final = 0.5
 """Seconds in which the RCM's word about a hold whose time is over arrives."""
+UNTIL: Final = "until somebody waits for it"
 REFRESH: Final = 1.0
 """Seconds between two looks at who holds what, at least; and where somebody watches, between two pictures."""
 
@@ -40,7 +42,7 @@ REFRESH: Final = 1.0
 @click.option(
     "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Higher ones preempt lower ones."
 )
-@click.option("--keep", is_flag=True, help="Go on past the minimum runtime, until something else needs it.")
+@click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
 @click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
 @hold_options
 @common.runs
@@ -51,10 +53,13 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
     met by any one device whose name matches: 'framegrabber/*' is any framegrabber, 'robot/scout$*' any robot whose name
     begins so; twice the same is two of them. Quote it for the shell.
 
-    With a COMMAND, they are held while it runs, for the minimum runtime at most (--keep: for longer), and given back as
-    soon as nothing of it is left. When its time is over or the grant is taken away, the command and all that it started
-    get SIGTERM, and SIGKILL after the grace; so they do when this program dies or hangs. The next holder waits until
-    nothing is left. Without a COMMAND, they are held until Ctrl-C or until the minimum runtime is over.
+    They are yours for the minimum runtime, in which only a higher priority takes them, and after it until somebody of
+    the same or a higher priority waits for one of them. --release-after gives them back though nobody waits.
+
+    With a COMMAND, they are held while it runs, and given back as soon as nothing of it is left. When its time is over
+    or the grant is taken away, the command and all that it started get SIGTERM, and SIGKILL after the grace; so they do
+    when this program dies or hangs. The next holder waits until nothing is left. --again asks anew then, and runs it
+    again. Without a COMMAND, they are held until Ctrl-C or until their time is over.
 
     \b
     The command finds in its environment:
@@ -69,7 +74,8 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
 
     \b
     Exit code: the command's own (128 + n: ended by signal n), or
-      75   the grant was taken away       124  its time was over
+      75   the grant was taken away before its time
+      124  its time was over: somebody waited after the minimum runtime, or --release-after
       126  it can't be executed           127  there is no such command
       1    not granted; without a command also: taken away    3  no RCM
 
@@ -77,14 +83,17 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
 
     \b
     Examples:
-      zscout request robot/scout33 --min-runtime 2m
-      zscout request robot/scout33 radio/rf0:command_rate=5 --keep -- ./survey.py --fast
+      zscout request robot/scout33 --min-runtime 2h -- ./night.sh
+      zscout request robot/scout33 --release-after 5m
+      zscout request robot/scout33 radio/rf0:command_rate=5 -- ./survey.py --fast
       zscout request framegrabber/fgrab1 --timeout 30 --again -- ./record.sh
       zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- ./stereo.py
       zscout request robot/scout33 --json | jq .event
       zscout request robot/scout33 --priority 5 --dry-run
     """
-    wanted = gather(needs, name, priority=priority, keep=keep, **rest)
+    if keep and rest["release_after"] is not None:
+        raise BadInput("--keep and --release-after contradict each other; give one of them")
+    wanted = gather(needs, name, priority=priority, keep=True, **rest)
     async with common.connected("request") as client:
         return await (_foresee(client, wanted) if dry_run else carry_out(client, wanted))
 
@@ -97,7 +106,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
         arc: OpenArc | None = None
         while True:
             try:
-                arc = await _wait(client, wanted, report, arc)
+                arc = await _wait(client, wanted, report, arc if arc is not None and arc.open else None)
                 code = await _use(client, wanted, report, arc)
             except CommandRefused as refused:
                 # A device did not know of the grant: the client has given it back.
@@ -143,9 +152,9 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         return await _taken(client, wanted, report, arc)
     held = Held(client, arc, grant)
     rcs, left = _held_text(held), held.remaining
-    length = "until it is needed elsewhere" if arc.keep else f"for {span(left)}"
     details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
-    report.event("granted", f"{arc.name} holds {rcs} {length}", **details, grant=grant, remaining=round(left, 3))
+    details |= {"grant": grant, "remaining": round(left, 3)}
+    report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left)}", **details)
     try:
         code = None
         if wanted.command:
@@ -164,9 +173,17 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     if held.active:
         # By our clock its time is over; the RCM's own word is on its way.
         await common.until(lambda: not held.active, report.changed, LAST_WORD)
-    if held.active or _ending(arc).outcome == "completed":
-        arc.finish("completed", "its time is over", client.mesh.now())
-        report.event("ended", f"the time of {arc.name} is over", outcome="completed")
+    ending = _ending(arc)
+    if held.active or ending.outcome == "completed":
+        why = ending.reason if arc.keep else "its time is over"
+        ended_by_hand = arc.why is not None and arc.why.code == "released"
+        again = wanted.again and arc.keep and not ended_by_hand
+        line = f"the time of {arc.name} is over" + (f": {why}" if arc.keep else "")
+        details = {"outcome": "completed", "reason": why, "by": ending.by, "again": again}
+        arc.finish("completed", why, client.mesh.now())
+        report.event("ended", f"{line}; asking anew" if again else line, **details)
+        if again:
+            return None
         return TIME_OVER if wanted.command else 0
     return await _taken(client, wanted, report, arc)
 
@@ -219,7 +236,9 @@ def _grace(wanted: HoldOptions, report: Report, direct: DirectHold | None) -> fl
 
 async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
     """The grant was taken away. Raises Failed where there is no command and no second try."""
-    ending, again = _ending(arc), wanted.again and arc.open
+    ending = _ending(arc)
+    # What lost an RC after its minimum runtime is not queued again.
+    again = wanted.again and (arc.open or ending.outcome == "lost")
     line = f"{arc.name} lost its grant: {ending.reason or ending.outcome}"
     details = {"outcome": ending.outcome, "reason": ending.reason, "by": ending.by, "again": again}
     if again:
@@ -231,6 +250,11 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
     if wanted.command:
         return TAKEN_AWAY
     raise Failed(f"{line}; ask again, or with a higher priority")
+
+
+def _yours(arc: OpenArc, left: float) -> str:
+    """For how long a hold goes on, of which so many seconds are protected."""
+    return f"yours for {span(left)}, then {UNTIL if arc.keep else 'given back'}"
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
@@ -326,7 +350,7 @@ class Report(LiveLine):
         while True:
             self.changed.clear()
             left = (arc.end - self._mesh.now()) / SECOND
-            rest = f"held for {span(self._since(arc))}, kept" if arc.keep else f"{span(left)} left"
+            rest = _yours(arc, left) if left > 0 or not arc.keep else f"for {span(self._since(arc))}, {UNTIL}"
             self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}; Ctrl-C gives back")
             await done_within(REFRESH if self.watched else None, self.changed.wait())
 

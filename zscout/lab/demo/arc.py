@@ -10,7 +10,7 @@ import asyncio
 import os
 import sys
 from decimal import Decimal
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import msgspec
 
@@ -76,7 +76,8 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
 
         client.watch(on_state)
         needs: dict[str, dict[str, Decimal]] = {rc: {} for rc in spec.needs}
-        asking = holds(client, spec.arc, needs, priority=spec.priority, min_runtime=spec.min_runtime)
+        how: dict[str, Any] = {"priority": spec.priority, "min_runtime": spec.min_runtime, "keep": False}
+        asking = holds(client, spec.arc, needs, **how)
         async for attempt in asking:
             async with attempt:
                 report("entered")
