@@ -80,7 +80,7 @@ def test_every_refusal(tmp_path: Path) -> None:
                 await lab.held_by(client, "robot/bench")
                 assert await answer(echo(grant)) == "ended"
                 await until(lambda: bench.calls == ["begin one", "safe"])
-                _, brief = await running(client, "brief", "robot/bench", min_runtime=0.2)
+                _, brief = await running(client, "brief", "robot/bench", min_runtime=0.2, keep=False)
                 await until(lambda: not rc.holds.held)
                 assert await answer(echo(brief)) == "ended"
                 assert warm.calls == ["begin warm"]

@@ -122,11 +122,11 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
             both = {"robot/a": {}, "robot/b": {}, "radio/a": {"rate": 4}}
             survey = await client.request("survey", both, min_runtime=60)
             listen = await client.request("listen", {"radio/a": {"rate": 5}}, min_runtime=60)
-            later = await client.request("later", {"robot/b": {}}, min_runtime=0.3)
+            later = await client.request("later", {"robot/b": {}}, min_runtime=0.3, keep=False)
             # On a busy machine a vote may be overdue at first.
             await until(lambda: (survey.state, listen.state, later.state) == ("running", "running", "queued"))
             await told_why.wait()
-            async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=0.5):
+            async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=0.5, keep=False):
                 await lab.state(client, lambda state: {wait.arc for wait in state.queue} == {"survey"})
                 await asyncio.Event().wait()
             await lab.state(client, lambda state: "survey" in {held.arc for held in state.holds})

@@ -27,7 +27,7 @@ def test_a_gang_over_two_nodes_is_granted_commanded_and_preempted(tmp_path: Path
             operator: asyncio.Task[None] | None = None
 
             async def take() -> None:
-                async with hold(client, "operator", {"robot/b": {}}, priority=10, min_runtime=0.2):
+                async with hold(client, "operator", {"robot/b": {}}, priority=10, min_runtime=0.2, keep=False):
                     await asyncio.Event().wait()
 
             async def survey() -> None:

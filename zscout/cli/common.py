@@ -10,7 +10,7 @@ import difflib
 import os
 import signal
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
-from contextlib import ExitStack, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from decimal import Decimal
 from functools import wraps
 from pathlib import Path
@@ -20,7 +20,7 @@ import click
 
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
 from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import Role, Token, check_name, new_instance
+from zscout.keyexpr import check_name, new_instance
 from zscout.messages import RcmState
 
 if TYPE_CHECKING:
@@ -139,31 +139,12 @@ async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = T
 
 async def see_rcm(client: Client) -> None:
     """Returns as soon as an RCM is seen. Raises NobodyThere."""
-    mesh, seen = client.mesh, asyncio.Event()
-    candidates: set[Token] = set()
+    from zscout.behaviors.client.client import NoRcm
 
-    def on_token(token: Token, alive: bool) -> None:
-        if token.role == Role.CANDIDATE:
-            (candidates.add if alive else candidates.discard)(token)
-        elif alive:
-            seen.set()
-
-    with ExitStack() as stack:
-        for role in (Role.RCM, Role.CANDIDATE):
-            stack.callback(mesh.watch(mesh.keys.alive_any(role), on_token).close)
-        if await until(seen.is_set, seen, LOOK_FOR_RCM):
-            return
-        if candidates and await until(seen.is_set, seen, LOOK_FOR_TAKEOVER - LOOK_FOR_RCM):
-            return
-    nobody = f"no RCM is on the mesh of fleet {client.fleet.name}"
-    if candidates:
-        names = ", ".join(sorted(token.host for token in candidates)[:5])
-        raise NobodyThere(f"{nobody}, though {names} could lead; see the log of zscout-node")
-    who = f"{mesh.links()} links to other programs" if mesh.links() else "no other program either"
-    raise NobodyThere(
-        f"{nobody} ({who}); start zscout-node on a host, or check the fleet's name, `interface` and `connect` in its "
-        "file (--fleet)"
-    )
+    try:
+        await client.see_rcm(LOOK_FOR_RCM, LOOK_FOR_TAKEOVER)
+    except NoRcm as nobody:
+        raise NobodyThere(str(nobody)) from None
 
 
 async def state_of(client: Client, arc: str | None = None, *, forecast: bool = False) -> RcmState:

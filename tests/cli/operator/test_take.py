@@ -28,7 +28,7 @@ def test_a_yes_at_the_terminal_takes_and_ctrl_c_gives_back(fleet: CliFleet) -> N
         assert "operator preempts survey (priority 3, " in shown
         assert ": robot/a, robot/b" in shown
         terminal.press("y\n")
-        terminal.until("operator holds robot/a until it is needed elsewhere")
+        terminal.until("operator holds robot/a: yours for 1 min, then until somebody waits for it")
         state = fleet.state(lambda state: bool(state.holds))
         assert [(hold.arc, hold.priority, hold.keep) for hold in state.holds] == [("operator", 10, True)]
         terminal.press("\x03")

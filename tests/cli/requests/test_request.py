@@ -41,7 +41,7 @@ def test_a_command_gets_its_grant_and_gives_its_exit_code(fleet: CliFleet) -> No
     assert grant.startswith("[[")
     assert "/request-" in client
     assert 50 < float(remaining) <= 60
-    assert "survey holds radio/rf0, robot/a for 1 min" in done.stderr
+    assert "survey holds radio/rf0, robot/a: yours for 1 min, then until somebody waits for it" in done.stderr
     assert fleet.idle("robot/a", "radio/rf0")
 
 
@@ -50,7 +50,7 @@ def test_a_command_ended_by_a_signal_gives_128_and_its_number(fleet: CliFleet) -
 
 
 def test_without_a_command_it_holds_for_its_time(fleet: CliFleet) -> None:
-    done = fleet.zscout("request", "robot/a", "--min-runtime", "2s", "--json")
+    done = fleet.zscout("request", "robot/a", "--release-after", "2s", "--json")
     assert done.returncode == 0
     granted, ended = events(done.stdout)
     assert (granted["event"], granted["rcs"], granted["keep"]) == ("granted", ["robot/a"], False)
@@ -129,10 +129,60 @@ def test_a_command_is_ended_when_its_grant_is_taken(fleet: CliFleet) -> None:
 
 
 def test_a_command_whose_time_is_over_is_ended(fleet: CliFleet) -> None:
-    done = fleet.zscout("request", "robot/a", "--min-runtime", "300ms", "--json", "--", "sleep", "1000")
+    done = fleet.zscout("request", "robot/a", "--release-after", "300ms", "--json", "--", "sleep", "1000")
     assert (done.returncode, done.stdout) == (124, "")
     assert [event["event"] for event in events(done.stderr)] == ["granted", "stopping", "ended"]
     assert fleet.idle("robot/a")
+
+
+def test_a_command_goes_on_past_its_minimum_runtime_until_an_equal_waits(fleet: CliFleet) -> None:
+    script = "trap 'echo told; exit 3' TERM; echo pid $$; while :; do sleep 0.05; done"
+    kept = fleet.start("request", "robot/a", "--name", "kept", "--min-runtime", "300ms", "--", "sh", "-c", script)
+    first = read_until(kept, "pid")
+    assert re.fullmatch(r"kept holds robot/a: yours for 0\.\d s, then until somebody waits for it", first[0])
+    fleet.state(lambda state: [hold.remaining < -0.5 for hold in state.holds] == [True])
+    assert kept.poll() is None
+    # Lower priority does not end it.
+    assert fleet.zscout("request", "robot/a", "--priority", "-1", "--timeout", "300ms").returncode == 1
+    assert kept.poll() is None
+    assert fleet.zscout("request", "robot/a", "--name", "next", "--", "true").returncode == 0
+    lines = out_of(kept).read()
+    assert kept.wait(HANG) == 124
+    assert "told" in lines
+    why = "its minimum runtime is over and next, priority 0, needs its RCs"
+    assert f"the time of kept is over: {why}\n" in lines
+    assert fleet.idle("robot/a")
+
+
+def test_again_asks_anew_for_what_was_kept_and_ended_for_another(fleet: CliFleet, tmp_path: Path) -> None:
+    script = f"echo run $$; if mkdir {tmp_path}/first; then sleep 1000; fi; exit 4"
+    options = ["--again", "--name", "kept", "--min-runtime", "300ms"]
+    kept = fleet.start("request", "robot/b", *options, "--", "sh", "-c", script)
+    first = read_until(kept, "run")[-1]
+    assert fleet.zscout("request", "robot/b", "--", "true").returncode == 0
+    lines = read_until(kept, "run")
+    assert any(line.endswith("; asking anew") for line in lines)
+    assert lines[-1] != first
+    assert kept.wait(HANG) == 4
+
+
+def test_what_an_operator_releases_is_not_asked_for_again(fleet: CliFleet) -> None:
+    options = ["--again", "--name", "kept", "--min-runtime", "100ms"]
+    kept = fleet.start("request", "robot/b", *options, "--", "sh", "-c", "echo run; sleep 1000")
+    read_until(kept, "run")
+    fleet.state(lambda state: [hold.remaining < 0 for hold in state.holds] == [True])
+    assert fleet.zscout("release", "kept").returncode == 0
+    assert kept.wait(HANG) == 124
+    assert "run\n" not in out_of(kept).read()
+
+
+def test_without_a_command_what_is_kept_ends_in_order(fleet: CliFleet) -> None:
+    kept = fleet.start("request", "robot/b", "--name", "kept", "--min-runtime", "100ms", "--json")
+    read_until(kept, '"granted"')
+    assert fleet.zscout("request", "robot/b", "--", "true").returncode == 0
+    (ended,) = events(out_of(kept).read())
+    assert (ended["event"], ended["outcome"], ended["again"]) == ("ended", "completed", False)
+    assert kept.wait(HANG) == 0
 
 
 def test_what_ignores_sigterm_is_killed_after_the_grace_with_its_children(fleet: CliFleet) -> None:

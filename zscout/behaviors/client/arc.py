@@ -35,8 +35,8 @@ from zscout.types import SECOND, Grant, Ns
 class Revoked(Exception):
     """The hold was taken away; `outcome` is the protocol's word, the message the reason."""
 
-    def __init__(self, arc: OpenArc) -> None:
-        ending = arc.ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
+    def __init__(self, arc: OpenArc, ending: HoldEnd | None = None) -> None:
+        ending = ending or arc.ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
         super().__init__(ending.reason or ending.outcome)
         self.outcome = ending.outcome
         self.by = ending.by

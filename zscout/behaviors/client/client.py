@@ -15,8 +15,8 @@ from zscout import messages
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN
-from zscout.behaviors.client.request import CommandRefused, Needs, OpenArc, RequestRefused, amounts
-from zscout.config.fleet import Fleet, fleet_from_env
+from zscout.behaviors.client.request import CommandRefused, Needs, NoRcm, OpenArc, RequestRefused, amounts
+from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
 from zscout.mesh.renewal import PATIENCE
@@ -24,10 +24,15 @@ from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import Done, Foresight, Notice, Problem, RcmState
 from zscout.types import SECOND, Grant, Ns, Term
 
-__all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "RequestRefused"]
+__all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "NoRcm", "RequestRefused"]
 
 log = logging.getLogger(__name__)
 
+LOOK_FOR_RCM: Final = 3.0
+"""Seconds in which a mesh that has an RCM shows it."""
+LOOK_FOR_TAKEOVER: Final = 5.0
+"""The same where a candidate is seen."""
+MAX_NAMED: Final = 5
 UNREACHED = 10.0
 """Seconds for which an RC may be granted that this client neither sees nor reaches."""
 CONFIRM_TIMEOUT = 1.0
@@ -163,6 +168,35 @@ class Client(MovableClient):
     def leader(self) -> str | None:
         """The host whose node leads, or None where no RCM is seen."""
         return self._rcm.leader
+
+    async def see_rcm(self, seconds: float = LOOK_FOR_RCM, takeover: float = LOOK_FOR_TAKEOVER) -> None:
+        """Returns as soon as an RCM is seen. Raises NoRcm where none is within `seconds`, or within `takeover` where a
+        candidate is seen, which may be about to take the lead."""
+        seen, candidates = asyncio.Event(), set[Token]()
+
+        def on_token(token: Token, alive: bool) -> None:
+            if token.role == Role.CANDIDATE:
+                (candidates.add if alive else candidates.discard)(token)
+            elif alive:
+                seen.set()
+
+        with ExitStack() as stack:
+            for role in (Role.RCM, Role.CANDIDATE):
+                stack.enter_context(closing(self.mesh.watch(self.mesh.keys.alive_any(role), on_token)))
+            if await done_within(seconds, seen.wait()):
+                return
+            if candidates and await done_within(max(0.0, takeover - seconds), seen.wait()):
+                return
+        nobody = f"no RCM is on the mesh of fleet {self.fleet.name}"
+        if candidates:
+            names = ", ".join(sorted(token.host for token in candidates)[:MAX_NAMED])
+            raise NoRcm(f"{nobody}, though {names} could lead; see the log of zscout-node there")
+        links = self.mesh.links()
+        who = f"{links} links to other programs" if links else "no other program either"
+        raise NoRcm(
+            f"{nobody} ({who}); start zscout-node on a host, or check the fleet's name, `interface` and `connect` in "
+            f"its file (--fleet, ${FLEET_VARIABLE})"
+        )
 
     # Requests
 

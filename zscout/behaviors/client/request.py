@@ -26,6 +26,10 @@ class RequestRefused(Exception):
         self.code = problem.code
 
 
+class NoRcm(Exception):
+    """No RCM is on the mesh; the message says what to look at."""
+
+
 class CommandRefused(Exception):
     """An RC did not obey; `code` is the protocol's, or `unknown` where no answer came."""
 

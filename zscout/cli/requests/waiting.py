@@ -83,7 +83,7 @@ def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> lis
 
 def hold_text(hold: HoldView) -> str:
     """Whose hold it is and since when, in words."""
-    left = "kept" if hold.keep else f"{span(hold.remaining)} left"
+    left = "kept" if hold.keep and hold.remaining <= 0 else f"{span(hold.remaining)} left"
     return clean(f"{hold.arc} (priority {hold.priority}, {hold.client}) for {span(hold.held)}, {left}")
 
 
