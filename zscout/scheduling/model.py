@@ -47,6 +47,8 @@ class ArcRequest:
     keep: bool = False
     label: str = ""
     """What people call it; the core only prints it."""
+    direct: bool = False
+    """Whether its program touches devices past their RCs; the core only keeps it."""
 
     def __post_init__(self) -> None:
         if not self.needs:

@@ -117,8 +117,8 @@ class DirectHold:
         self._notify()
 
     def unanswered(self, since: Ns) -> list[RcName]:
-        """The RCs that have answered no confirmation sent since then."""
-        return [rc for rc in self.rcs if self._confirmed.get(rc, -1) < since]
+        """The RCs that have answered no confirmation sent after that."""
+        return [rc for rc in self.rcs if self._confirmed.get(rc, since) <= since]
 
     def keep_confirming(self, on_unsure: Callable[[DirectHold], object]) -> None:
         """From now on it is confirmed again and again. `on_unsure(self)`: an RC has not answered for a hold lease."""

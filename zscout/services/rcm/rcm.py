@@ -235,7 +235,9 @@ class Rcm:
         if not changed and rcs is None:
             return
         revoked = [
-            _revocation(effect, self.registry.name(effect.arc)) for effect in changed if isinstance(effect, HoldEnded)
+            _revocation(effect, self.registry.name(effect.arc), own=self._is_own(effect))
+            for effect in changed
+            if isinstance(effect, HoldEnded)
         ]
         now = self.mesh.now()
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
@@ -246,6 +248,10 @@ class Rcm:
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
         instances = {rc: instance for rc, (instance, _) in self.membership.named(names).items()}
         self._put(number, holders, revoked, instances)
+
+    def _is_own(self, effect: HoldEnded) -> bool:
+        """Whether its own client has given this hold back, in the burst that is being decided."""
+        return effect.outcome in (Outcome.RELEASED, Outcome.CANCELLED) and effect.arc in self.requests.given_up
 
     async def _send_heartbeats(self) -> None:
         """Repeats the last number whenever nothing was published for a while."""
@@ -354,13 +360,14 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Hol
             keep=arc.request.keep,
             params=messages.decimals(arc.needs[rc]),
             bound=dict(arc.bound),
+            direct=arc.request.direct,
         )
         for arc in arcs
         if arc.hold is not None
     ]
 
 
-def _revocation(effect: HoldEnded, name: str) -> messages.Revocation:
+def _revocation(effect: HoldEnded, name: str, *, own: bool) -> messages.Revocation:
     return messages.Revocation(
         id=request_id(effect.arc),
         arc=name,
@@ -371,6 +378,7 @@ def _revocation(effect: HoldEnded, name: str) -> messages.Revocation:
         reason=str(effect.reason),
         by=effect.by,
         why=reason_info(effect.reason),
+        own=own,
     )
 
 
@@ -383,6 +391,7 @@ def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> messages.HoldView:
         remaining=(hold.end - now) / SECOND,
         keep=arc.request.keep,
         bound=dict(arc.bound),
+        direct=arc.request.direct,
     )
 
 

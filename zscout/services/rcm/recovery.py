@@ -141,7 +141,8 @@ def _recover_hold(
     if asked is not None:
         needs |= {need: params for need, params in asked[1].needs.items() if need in needs}
     needs |= {patterns.get(name, name): holder.params for name, holder in held.items()}
-    request = _request(arc, some.client, needs, some)
+    direct = any(holder.direct for holder in held.values()) or (asked is not None and asked[1].direct)
+    request = _request(arc, some.client, needs, replace(some, direct=direct))
     # The core ends a gang with an absent RC, and names what was lost; a present RC without it breaks it.
     if all(name in held or name not in result.rcs for name in some.rcs):
         end = now + round(min(holder.remaining for holder in held.values()) * SECOND)
@@ -177,6 +178,7 @@ def _request(arc: str, client: str, needs: dict[str, Amounts], source: OpenReque
         min_runtime=duration(Decimal(source.min_runtime), "min_runtime"),
         keep=source.keep,
         label=source.arc,
+        direct=source.direct,
     )
 
 

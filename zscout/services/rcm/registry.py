@@ -100,13 +100,19 @@ class RequestRegistry:
     def ended(self, arc: ArcId) -> bool:
         return arc in self._ended
 
-    def reopens(self, arc: ArcId) -> bool:
-        """Whether `arc` ended only because its client seemed gone, and may be asked for again: from now on it has not
-        ended."""
-        if arc in self._ended and self._ended[arc][1].outcome == Outcome.CLIENT_LOST:
-            del self._ended[arc]
-            return True
-        return False
+    def reopens(self, arc: ArcId, unserved: Grant | None = None) -> bool:
+        """Whether `arc` ended only because its client seemed gone, or had its time under the grant `unserved` while RCs
+        of it settled, and may be asked for again: from now on it has not ended."""
+        if arc not in self._ended:
+            return False
+        _, notice = self._ended[arc]
+        completed = notice.outcome == Outcome.COMPLETED and notice.grant is not None and notice.grant == unserved
+        if not completed and notice.outcome != Outcome.CLIENT_LOST:
+            return False
+        if completed and trace.enabled():
+            trace.write(self._mesh.now(), "reopened", term=self._term, arc=arc)
+        del self._ended[arc]
+        return True
 
     def give_up(self, arc: ArcId, outcome: Outcome) -> None:
         """Its client wants no more of `arc`, which has ended or is unknown: it is not reopened."""
@@ -114,6 +120,9 @@ class RequestRegistry:
         notice = known[1] if known is not None else self._notice(arc, "ended", reason="given up by its client")
         if known is None or notice.outcome == Outcome.CLIENT_LOST:
             self._remember(arc, replace(notice, outcome=outcome))
+        elif notice.outcome == Outcome.COMPLETED:
+            # Nor as one whose time went by while its RCs settled.
+            self._ended[arc] = known[0], replace(notice, grant=None)
 
     # Notices
 

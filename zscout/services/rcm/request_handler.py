@@ -138,7 +138,7 @@ class RequestHandler:
             if ask.reachable:
                 self._emit(Reachable(arc))
             query.answer(self._standing(arc, ask))
-        elif self._registry.ended(arc) and not self._registry.reopens(arc):
+        elif self._registry.ended(arc) and not self._registry.reopens(arc, ask.grant if ask.unserved else None):
             query.answer(self._registry.notice(arc))
         elif self._goes_on_elsewhere(ask):
             query.answer(self._registry.handed_over(arc, ask.arc))
@@ -158,7 +158,7 @@ class RequestHandler:
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
         """Whether its client believes in a grant of an earlier RCM of which this one does not know."""
         known = self.core.arc(arc)
-        unknown = ask.grant is not None and ask.grant.term < self.core.term and not ask.unconfirmed
+        unknown = ask.grant is not None and ask.grant.term < self.core.term and not ask.unconfirmed and not ask.unserved
         return unknown and (known is None or known.hold is None) and not self._registry.ended(arc)
 
     def _may_be_held(self, arc: ArcId) -> bool:
@@ -167,7 +167,7 @@ class RequestHandler:
 
     def _standing(self, arc: ArcId, ask: Ask) -> Notice:
         """How an open ARC stands, for a client that may not have heard how its last hold ended."""
-        if ask.grant is not None and not ask.unconfirmed and self.core.is_queued(arc):
+        if ask.grant is not None and not ask.unconfirmed and not ask.unserved and self.core.is_queued(arc):
             return self._registry.interrupted(arc, ask.grant)
         return self._registry.notice(arc)
 
@@ -385,6 +385,7 @@ def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: Rc
             min_runtime=duration(ask.min_runtime, "min_runtime"),
             keep=ask.keep,
             label=ask.arc,
+            direct=isinstance(ask, Ask) and ask.direct,
         )
     except (BadName, ValueError) as error:
         raise Refused("bad_request", str(error)) from None
