@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
 import click
+from msgspec.structs import replace
 
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import check_name, new_instance
-from zscout.messages import RcmState
+from zscout.messages import RcmState, Who
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
@@ -132,6 +133,7 @@ async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = T
     from zscout.behaviors.client.client import Client
 
     async with await Client.connect(f"{role}-{new_instance()}", fleet=fleet or the_fleet()) as client:
+        client.who = replace(client.who or Who(), command=f"zscout {role}")
         if need_rcm:
             await see_rcm(client)
         yield client

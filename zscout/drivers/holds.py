@@ -26,6 +26,7 @@ from typing import Any, Final, NamedTuple
 from msgspec import structs
 
 from zscout.messages import EndedHold, Grants, Holder, Problem, RcmState, absurd
+from zscout.scheduling.reason import ended, named
 from zscout.types import NO_TERM, SECOND, Grant, HostName, Ns, Place, Term
 
 BEFORE: Final = Grant(NO_TERM, 0)
@@ -103,6 +104,10 @@ def _arc(holder: Holder) -> tuple[str, Place]:
     return holder.id, holder.place
 
 
+def _named(holder: Holder) -> str:
+    return named(holder.who, holder.client, holder.arc)
+
+
 class HoldTable:
     def __init__(self, rc: str, *, hold_lease: Ns, settle: Ns = 0, instance: str = "") -> None:
         self.rc, self.instance = rc, instance
@@ -140,7 +145,7 @@ class HoldTable:
         if len(holders) > 1 and not sharable:
             holders = [max(holders, key=lambda holder: holder.grant)]
             change.announce = True
-        reasons = {revoked.grant: f"{revoked.outcome}: {revoked.reason}" for revoked in grants.revoked}
+        reasons = {revoked.grant: ended(revoked.outcome, revoked.reason) for revoked in grants.revoked}
         for revoked in grants.revoked:
             if revoked.own:
                 self._leave(revoked.grant, change)
@@ -306,7 +311,7 @@ class HoldTable:
         held = self.held.get(grant)
         newer = (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term)
         if held is not None and held.holder.client != client:
-            code, why = "wrong_client", f"{self.rc} is held by {held.holder.client}, not by {client}"
+            code, why = "wrong_client", f"{self.rc} is held by {_named(held.holder)}, not by {client}"
         elif held is not None and now >= held.end and not held.holder.keep:
             code, why = "ended", f"the hold of {self.rc} is over: its time is up"
         elif held is not None:
@@ -318,7 +323,7 @@ class HoldTable:
         elif not self.held:
             code, why = "free", f"{self.rc} is held by nobody; ask the RCM for it"
         else:
-            holders = ", ".join(sorted(held.holder.arc for held in self.held.values()))
+            holders = ", ".join(sorted(_named(held.holder) for held in self.held.values()))
             code, why = "not_holder", f"{self.rc} is held by {holders}"
         return Problem(code, why, self.term)
 

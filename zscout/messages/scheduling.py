@@ -14,6 +14,21 @@ MAX_OTHERS = 255
 """ARCs that one hand-over takes along, beside the one that it names first."""
 
 
+MAX_WHO = 64
+"""Characters of a user's, a host's or a command's name."""
+MAX_COMMENT = 200
+
+
+class Who(Message, frozen=True):
+    """Who asks, by its own word: shown to people, never believed. `host` may be left out: it is that of the client
+    then. `command` is what it runs, `comment` what its user wants others to know."""
+
+    user: Annotated[str, msgspec.Meta(max_length=MAX_WHO)] = ""
+    host: Annotated[str, msgspec.Meta(max_length=MAX_WHO)] = ""
+    command: Annotated[str, msgspec.Meta(max_length=MAX_WHO)] = ""
+    comment: Annotated[str, msgspec.Meta(max_length=MAX_COMMENT)] = ""
+
+
 class _ArcParty(Message, frozen=True):
     """The ARC that a message is about, and its owner."""
 
@@ -57,6 +72,7 @@ class Ask(_Wanted, frozen=True, tag_field="op", tag="request"):
     """Its program touches devices past their RCs, which settle when its hold ends."""
     unserved: bool = False
     """The time of `grant` went by while RCs of it settled: nobody made use of it."""
+    who: Who | None = None
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -64,6 +80,8 @@ class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
 
     id: str
     client: str | None = None
+    who: Who | None = None
+    """Who ends it, where that is not its owner."""
 
 
 class Release(Message, frozen=True, tag_field="op", tag="release"):
@@ -71,6 +89,7 @@ class Release(Message, frozen=True, tag_field="op", tag="release"):
 
     id: str
     client: str | None = None
+    who: Who | None = None
 
 
 class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
@@ -88,6 +107,36 @@ class Foresee(_Wanted, frozen=True, tag_field="op", tag="foresee"):
     """Asks for the forecast of a request without making it. Answered with a Foresight."""
 
 
+class ReasonParty(_ArcParty, frozen=True):
+    """An ARC that is in another's way, or was preferred to it."""
+
+    priority: int
+    who: Who | None = None
+    yields_in: Seconds | None = None
+    """In a reason to wait: seconds until it holds no more, or may be preempted for it, at the latest; absent: not
+    known."""
+
+
+class ReasonInfo(Message, frozen=True):
+    """Why an ARC waits, or why a hold or a wait ended: what `reason` says, as data.
+
+    `count` counts `rcs`, of which the first three are named (with `patterns` eight), or is a quota; with `vetoed` it
+    counts who is in the way. `detail` is a host, a client or an RC's own words, as `code` has it (`docs/protocol.md`).
+    """
+
+    code: str
+    rcs: list[str] = []
+    by: list[ReasonParty] = []
+    detail: str = ""
+    count: int = 0
+    pattern: str | None = None
+    """The pattern of its needs that is not met; the rest is about one of the RCs that would meet it, or with `patterns`
+    about all of them."""
+    patterns: list[str] = []
+    """By each of `rcs` the pattern that it is a choice for, empty where the ARC names it; left out where it names all.
+    """
+
+
 class Foresight(Message, frozen=True):
     """The forecast of a request, if no other came. `starts_in` is absent where it would not start as things
     stand, or not within the horizon of the forecast; `reason` then names what it would wait for."""
@@ -98,31 +147,14 @@ class Foresight(Message, frozen=True):
     preempts: list[str] = []
     """Names of the ARCs that it would preempt at once."""
     reason: str = ""
+    victims: list[ReasonParty] = []
+    """The same ARCs, and whose they are."""
+    why: ReasonInfo | None = None
+    """What `reason` says, as data."""
 
 
 Operation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
 NAMES_ONCE.add(Operation)
-
-
-class ReasonParty(_ArcParty, frozen=True):
-    """An ARC that is in another's way, or was preferred to it."""
-
-    priority: int
-
-
-class ReasonInfo(Message, frozen=True):
-    """Why an ARC waits, or why a hold or a wait ended: what `reason` says, as data.
-
-    `count` counts `rcs`, of which the first three are named, or is a quota. `detail` is a host, a client or
-    an RC's own words, as `code` has it (`docs/protocol.md`)."""
-
-    code: str
-    rcs: list[str] = []
-    by: list[ReasonParty] = []
-    detail: str = ""
-    count: int = 0
-    pattern: str | None = None
-    """The pattern of its needs that is not met; the rest is about one of the RCs that would meet it."""
 
 
 class Notice(_ArcParty, frozen=True):
@@ -153,6 +185,8 @@ class Notice(_ArcParty, frozen=True):
     """While it is queued, where the client asked for estimates: seconds until it will start if nothing else
     comes; None where it will not as things stand, or not within what can be forecast."""
     why: ReasonInfo | None = None
+    who: Who | None = None
+    """Whose it is, while it is open."""
 
 
 class Holder(_ArcParty, frozen=True):
@@ -172,6 +206,7 @@ class Holder(_ArcParty, frozen=True):
     bound: dict[str, str] = {}
     direct: bool = False
     """As asked: its RCs settle when it ends."""
+    who: Who | None = None
 
 
 class Revocation(_ArcParty, frozen=True):
@@ -226,6 +261,7 @@ class HoldView(_ArcParty, frozen=True):
     keep: bool = False
     bound: dict[str, str] = {}
     direct: bool = False
+    who: Who | None = None
 
 
 class WaitView(_ArcParty, frozen=True):
@@ -241,6 +277,7 @@ class WaitView(_ArcParty, frozen=True):
     starts_in: Seconds | None = None
     """An estimate, where one was asked for: as if nothing else were to come."""
     why: ReasonInfo | None = None
+    who: Who | None = None
 
 
 class RcView(Message, frozen=True):
@@ -282,6 +319,7 @@ class OpenRequest(_Wanted, frozen=True):
     rcs: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
     """The RCs of `grant`."""
     direct: bool = False
+    who: Who | None = None
 
 
 class ClientRequests(Message, frozen=True):

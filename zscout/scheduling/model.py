@@ -16,6 +16,7 @@ from enum import StrEnum
 from typing import Final, TypeAlias
 
 from zscout.keyexpr import check_need, is_pattern, matcher
+from zscout.messages import Who
 from zscout.scheduling.reason import Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
@@ -49,6 +50,8 @@ class ArcRequest:
     """What people call it; the core only prints it."""
     direct: bool = False
     """Whether its program touches devices past their RCs; the core only keeps it."""
+    who: Who | None = None
+    """Who asked, as people are told; the core only prints it."""
 
     def __post_init__(self) -> None:
         if not self.needs:
@@ -190,7 +193,7 @@ class Arc:
         self.request, self.id, self.priority = request, request.arc, request.priority
         self.owner = request.client.partition("/")[0]
         self.rank = (-self.priority, request.min_runtime, self.place, self.id)
-        self.party = Party(self.id, request.name, self.priority)
+        self.party = Party(self.id, request.name, self.priority, request.who)
 
     def move_to(self, state: ArcState) -> None:
         """Raises ValueError for a move that is not in `TRANSITIONS`."""
@@ -205,6 +208,11 @@ class Arc:
         kept = self.request.keep and (other is None or self.priority > other.priority)
         last = math.inf if self.hold.last is None else self.hold.last
         return last if kept else min(self.hold.end, last)
+
+    def blocks(self, other: Arc) -> Party:
+        """How the reason names it for which `other` waits, that may not preempt it yet."""
+        end = self.known_end(other)
+        return self.party._replace(until=None if math.isinf(end) else int(end))
 
     def past_min_runtime(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may preempt it then."""

@@ -14,6 +14,8 @@ from dataclasses import replace
 from operator import itemgetter
 from typing import Protocol
 
+from msgspec import structs
+
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName
 from zscout.keyexpr import matcher
 from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc, union
@@ -322,7 +324,10 @@ class SchedulerState:
 
     def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
         self._forget_client(arc)
-        arc.take(replace(arc.request, arc=name, client=client))
+        who = arc.request.who
+        if who is not None and who.host:
+            who = structs.replace(who, host="")  # it is the new client's
+        arc.take(replace(arc.request, arc=name, client=client, who=who))
 
     def start(self, arc: Arc, hold: Hold) -> None:
         self.dequeue(arc)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, events, out_of, read_until, zscout_here
+from tests.cli.tools import CLOCK, end, events, named, out_of, read_until, zscout_here
 from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
 from zscout.cli.requests.options import HoldOptions
@@ -68,8 +68,10 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     }
     assert {rc["rc"]: rc["holders"][0]["arc"] for rc in queued["rcs"] if rc["holders"]} == held
     shown = fleet.zscout("status").stdout
-    assert re.search(rf"^{F2} +exclusive +held +anvil +second$", shown, re.MULTILINE)
-    assert re.search(r"^1 +next +0 .* no framegrabber/\* is to be had: needs framegrabber/", shown, re.MULTILINE)
+    assert re.search(rf"^{F2} +exclusive +held +anvil +{re.escape(named('second'))}$", shown, re.MULTILINE)
+    choices = [rf"{rc} \(held by {re.escape(named(arc))}, until {CLOCK} at the latest\)" for rc, arc in held.items()]
+    text = ", ".join(choices).replace(f", {F2}", f", {F2.removeprefix('framegrabber/')}")
+    assert re.search(rf"^1 +next .* waits for one of {text}  ", shown, re.MULTILINE)
 
     end(second)
     granted, ended = events(out_of(waiting).read())
@@ -85,11 +87,12 @@ def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliF
     first, robot = fleet.holder("first", F1), fleet.holder("robot", "robot/a")
     late = fleet.zscout("request", ANY, ANY, "--name", "both", "--timeout", "0.3")
     (line,) = late.stdout.splitlines()
-    assert re.search(rf"starts in .*; {F1}: first \(priority 0, [^;]* left$", line)
+    blocker = rf"{F1}: {re.escape(named('first'))}, priority 0, since {CLOCK} [^;]*, until {CLOCK} [^;]* at the latest"
+    assert re.search(rf"starts at {CLOCK} .*; {blocker}$", line)
     # One framegrabber is free: who has the other is in nobody's way.
     easy = fleet.zscout("request", ANY, "robot/a", "--name", "easy", "--timeout", "0.3")
     (line,) = easy.stdout.splitlines()
-    assert "; robot/a: robot (priority 0, " in line
+    assert f"; robot/a: {named('robot')}, priority 0, " in line
     assert "framegrabber" not in line
     end(robot)
     with fleet.terminal("request", ANY, ANY, "--name", "both") as terminal:
@@ -113,11 +116,12 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     for process, name in zip(waiting, ("next", "quiet"), strict=True):
         read_until(process, f"{name} waits")
     text = fleet.zscout("why", "next").stdout
-    assert re.search(rf"^  framegrabber/\*: {F1} held by first of .*, priority 0, for .* left$", text, re.MULTILINE)
-    assert re.search(rf"^  framegrabber/\*: {F2} held by second of ", text, re.MULTILINE)
+    one = rf"{F1} held by {re.escape(named('first'))}, priority 0, since {CLOCK} .* at the latest"
+    assert re.search(rf"^  framegrabber/\*: {one}$", text, re.MULTILINE)
+    assert f"\n  framegrabber/*: {F2} held by {named('second')}, " in text
     assert "\n  robot/a: no other ARC holds it\n" in text
     assert "\n  video/*: not on the mesh\n" in text
-    assert " ago  asked for framegrabber/*, robot/a, video/* at priority 0\n" in text
+    assert " ago)  asked for framegrabber/*, robot/a, video/* at priority 0\n" in text
     assert re.search(r"no RC on the mesh is left for .*video/\*", text)
     (told,) = json.loads(fleet.zscout("why", "next", "--json").stdout)["arcs"]
     assert [(need["need"], need["rc"], need["present"]) for need in told["needs"]] == [

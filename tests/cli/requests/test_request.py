@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, events, gone, out_of, read_until
+from tests.cli.tools import CLOCK, by, end, events, gone, named, out_of, read_until
 from tests.hang import HANG
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
 from zscout.cli.requests.request import REFRESH, Report
@@ -62,10 +62,12 @@ def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> 
     blocker = fleet.holder("blocker", "robot/a")
     waiting = fleet.start("request", "robot/a", "--name", "next", "--", "true")
     (line,) = read_until(waiting, "next waits")
-    assert re.search(
-        r"\(held by blocker, priority 0\); starts in (\d\d s|1 min); robot/a: blocker \(priority 0, ", line
+    who = re.escape(named("blocker"))
+    assert re.fullmatch(
+        rf"next waits for {who}: robot/a, until {CLOCK} at the latest; starts at {CLOCK} \(in (\d\d s|1 min)\); "
+        rf"robot/a: {who}, priority 0, since {CLOCK} \(.* s\), until {CLOCK} \((\d\d s|1 min)\) at the latest",
+        line.strip(),
     )
-    assert line.endswith(" left")
     end(blocker)
     read_until(waiting, "next holds robot/a")
     assert waiting.wait(HANG) == 0
@@ -111,7 +113,7 @@ def test_an_estimate_that_ticks_down_prints_nothing_and_asks_for_nothing(fleet: 
 
     assert asyncio.run(wait_in_a_crowd_of_news()) == [False]
     (line,) = out.getvalue().splitlines()
-    assert "; starts in " in line
+    assert "; starts at " in line
     end(blocker)
 
 
@@ -124,7 +126,7 @@ def test_a_command_is_ended_when_its_grant_is_taken(fleet: CliFleet) -> None:
     lines = out_of(victim).read()
     assert victim.wait(HANG) == 75
     assert "told" in lines
-    assert "victim lost its grant: preempted by boss, priority 5" in lines
+    assert f"victim lost its grant: preempted by {by('true')}, priority 5" in lines
     assert fleet.idle("robot/a")
 
 
@@ -290,8 +292,10 @@ def test_refusals_by_the_rcm_are_one_line(fleet: CliFleet) -> None:
 def test_the_live_line_shows_and_ctrl_c_ends_the_wait(fleet: CliFleet) -> None:
     blocker = fleet.holder("blocker", "robot/a")
     with fleet.terminal("request", "robot/a", "--name", "seen") as terminal:
-        assert re.search(r"seen waits \d\.\d s, starts in (\d\d s|1 min): needs ", terminal.until(": needs "))
-        terminal.until("robot/a: blocker (priority 0, ")
+        terminal.until(f"seen waits for {named('blocker')}: robot/a, until ")
+        since = terminal.until("(in ")
+        assert re.search(rf"waits since {CLOCK} \(\d\.\d s\), starts at {CLOCK} ", since)
+        terminal.until(f"robot/a: {named('blocker')}, priority 0, ")
         terminal.until("seen waits ")  # drawn anew
         terminal.press("\x03")
         terminal.until("seen is cancelled")

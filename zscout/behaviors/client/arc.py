@@ -190,11 +190,20 @@ def hold(
     min_runtime: float | Decimal | None = None,
     keep: bool = True,
     timeout: float | None = None,
+    comment: str = "",
 ) -> Attempt:
-    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's.
+    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's; the
+    `comment` is shown to others.
 
     Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
-    ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
+    ask = {
+        "name": name,
+        "needs": needs,
+        "priority": priority,
+        "min_runtime": min_runtime,
+        "keep": keep,
+        "comment": comment,
+    }
     return Attempt(client, ask, timeout=timeout)
 
 
@@ -206,10 +215,18 @@ async def holds(
     priority: int = 0,
     min_runtime: float | Decimal | None = None,
     keep: bool = True,
+    comment: str = "",
 ) -> AsyncIterator[Attempt]:
     """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
     without `keep` has had its time."""
-    ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
+    ask = {
+        "name": name,
+        "needs": needs,
+        "priority": priority,
+        "min_runtime": min_runtime,
+        "keep": keep,
+        "comment": comment,
+    }
     attempt = Attempt(client, ask, again=True)
     yield attempt
     while attempt.goes_on:

@@ -207,8 +207,10 @@ class Lab:
         keep: bool = True,
         timeout: float | None = None,
         interrupt: bool = True,
+        comment: str = "",
     ) -> AbstractContextManager[BlockingHeld, None]:
-        """When entered it waits for all of `needs`, at most `timeout` seconds; when left it gives them back.
+        """When entered it waits for all of `needs`, at most `timeout` seconds; when left it gives them back. Others
+        are shown the `comment`.
 
         The hold is protected for `min_runtime` seconds (default: the fleet's, 60), and goes on until somebody of equal
         or higher priority waits for what it holds; with `keep=False` it ends when they are over. Then, or when it is
@@ -218,6 +220,7 @@ class Lab:
         Entering raises TimeoutError, RequestRefused, Revoked where others ended the request, and NoRcm where none is
         seen within 3 s. Leaving raises Revoked where the hold was taken away and the body has not been told."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
+        how["comment"] = comment
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
     def _stop(self) -> None:

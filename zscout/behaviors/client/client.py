@@ -11,9 +11,12 @@ from contextlib import ExitStack, closing
 from decimal import Decimal
 from typing import Any, Final, Generic, Self, TypeVar
 
+from msgspec.structs import replace
+
 from zscout import messages
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
+from zscout.behaviors.client.identity import checked_comment, this_program
 from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN
 from zscout.behaviors.client.request import CommandRefused, Needs, NoRcm, OpenArc, RequestRefused, amounts
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env
@@ -21,7 +24,7 @@ from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_
 from zscout.mesh import Declaration, Mesh, ZenohMesh
 from zscout.mesh.renewal import PATIENCE
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import Done, Foresight, Notice, Problem, RcmState
+from zscout.messages import Done, Foresight, Notice, Problem, RcmState, Who
 from zscout.types import SECOND, Grant, Ns, Term
 
 __all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "NoRcm", "RequestRefused"]
@@ -63,6 +66,8 @@ class Client(MovableClient):
 
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
         super().__init__(mesh, fleet, Supervisor(f"client {mesh.me}", self._failed))
+        self.who: Who | None = None
+        """Who asks, as others are told; `connect` fills it in."""
         self._leaving: asyncio.Task[None] | None = None
         self._declared: list[Declaration] = []
         self._token: Declaration | None = None
@@ -88,7 +93,9 @@ class Client(MovableClient):
         fleet = fleet or fleet_from_env()
         host = host or os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
         me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
-        return cls(await ZenohMesh.open(fleet.name, me, fleet.mesh), fleet).start()
+        client = cls(await ZenohMesh.open(fleet.name, me, fleet.mesh), fleet)
+        client.who = this_program(host)
+        return client.start()
 
     async def __aenter__(self) -> Self:
         return self
@@ -210,6 +217,7 @@ class Client(MovableClient):
         keep: bool = True,
         estimate: bool = False,
         direct: bool = False,
+        comment: str = "",
     ) -> OpenArc:
         """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
 
@@ -218,14 +226,17 @@ class Client(MovableClient):
 
         A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
         more. With `estimate` its notices say when it will start. `direct`: its program touches devices past their RCs;
-        see `direct_hold`. Raises RequestRefused where the request can't be taken as it is.
+        see `direct_hold`. The `comment` is shown to others. Raises RequestRefused where the request can't be taken as
+        it is, ValueError for too long a comment.
 
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)
+        who = replace(self.who or Who(), comment=checked_comment(comment)) if comment else self.who
         arc = await self._claim(check_name(name, "arc"), wanted)
         if arc is None:
             seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
+            arc.who = who
             self._store.add(arc)
         try:
             await self._rcm.submit(arc)

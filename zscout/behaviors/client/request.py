@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 import msgspec
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, is_pattern, matcher, new_instance
-from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release
+from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release, Who
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
 
 Needs = Mapping[str, Mapping[str, Any]]
@@ -67,6 +67,8 @@ class OpenArc:
     """Whether the RCM is asked to estimate when it will start."""
     direct: bool = False
     """Whether its program touches devices past their RCs (`direct.py`)."""
+    who: Who | None = None
+    """Who asks, as others are told."""
     state: str = "asking"
     reason: str = ""
     why: ReasonInfo | None = None
@@ -99,6 +101,8 @@ class OpenArc:
     shown: Term = NO_TERM
     """In which term its place was shown last, to an RCM that had given a worse one."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
+    told: Ns = 0
+    """When the newest notice came."""
     _came: Term | None = field(default=None, init=False, repr=False)
     """In which term another client handed it over, until an RCM of a later one says whose it is."""
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
@@ -111,6 +115,7 @@ class OpenArc:
         id_, name = check_name(request.id, "id"), check_name(request.arc, "arc")
         arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, place=request.place)
         arc.direct = request.direct
+        arc.who = request.who and msgspec.structs.replace(request.who, host="")
         arc.state, arc.reason = "expected", "another client is to hand it over"
         arc.since, arc.waits_since = now, now - round(request.waited * SECOND)
         return arc
@@ -127,6 +132,7 @@ class OpenArc:
         if (bound := self._binding(notice)) is None:
             return False
         self.last, self.unconfirmed, self.unserved = (notice.term, notice.step), None, None
+        self.told = now
         if self._came is not None and self._came < notice.term:
             self._came = None
         if notice.state != self.state or notice.grant != self.grant:
@@ -256,6 +262,7 @@ class OpenArc:
             "grant": grant,
             "rcs": self.rcs if grant is not None else [],
             "direct": self.direct,
+            "who": self.who,
         }
 
 

@@ -8,8 +8,11 @@ from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import closing
 from typing import Any, Final
 
+from msgspec.structs import replace
+
 from zscout import messages
 from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.identity import bounded
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import ComponentJob, EndReport, Order, OrderAnswer, PhaseReport
 from zscout.behaviors.components.component import (
@@ -25,7 +28,7 @@ from zscout.behaviors.components.processes import limit_allocations
 from zscout.keyexpr import BadName, Role, Token, incarnation_of, matcher, new_instance
 from zscout.mesh import Declaration, MeshError
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import MAX_ERROR, MoveComponent, Problem, RestoreComponent
+from zscout.messages import MAX_ERROR, MoveComponent, Problem, RestoreComponent, Who
 
 STAND_BY: Final = 30.0
 """Seconds that one stands by without being restored or activated, and then again until it is activated."""
@@ -139,6 +142,7 @@ class ComponentLifecycle:
                 kind = self._load()
             finally:
                 client = self._client = await connecting
+                client.who = replace(client.who or Who(), command=bounded(f"component {job.start.component}"))
             made = self._component = self._make(kind)
         except (BadKind, MeshError) as error:
             return EndReport("failed", str(error))

@@ -14,9 +14,10 @@ from msgspec import structs
 from zscout.cli import common
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.watching import Overview, show
+from zscout.cli.requests.waiting import reason_text, whose
 from zscout.keyexpr import Role
-from zscout.messages import Notice, RcmState, RcView
-from zscout.terminal import Table, many, span
+from zscout.messages import HoldView, Notice, RcmState, RcView, WaitView
+from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, Ns
 
 MAX_NAMED: Final = 8
@@ -97,7 +98,7 @@ class Standing:
             there = "held" if holders else "free"
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
-            names = ", ".join(common.with_amounts(hold.arc, hold.needs[view.rc]) for hold in holders)
+            names = ", ".join(common.with_amounts(whose(hold), hold.needs[view.rc]) for hold in holders)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
             styles.append({"absent": "red", "lost": "red", "held": "yellow", "free": "green"}[words])
         return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles)
@@ -105,13 +106,15 @@ class Standing:
     def _running(self, state: RcmState) -> Table:
         rows, styles = [], []
         for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
-            left = span(hold.remaining) if hold.remaining > 0 else "over"
-            left = f"{left}, keeps" if hold.keep else left
+            since = f"{clock(-hold.held)} ({span(hold.held)})"
+            until = f"{clock(hold.remaining, at_latest=True)} ({span(hold.remaining)})"
+            if hold.keep:
+                until = f"{until}, keeps" if hold.remaining > 0 else "kept"
             rcs = " ".join(sorted(hold.needs))
-            rows.append((hold.arc, str(hold.priority), span(hold.held), left, hold.client, rcs))
+            rows.append((hold.arc, _who(hold), str(hold.priority), since, until, rcs, hold.client))
             operator = hold.priority >= self.fleet_view.client.fleet.operator_priority
             styles.append("bold red" if operator else "")
-        columns = ("ARC", "PRIORITY", "SINCE", "LEFT", "CLIENT", "RCS")
+        columns = ("ARC", "WHO", "PRIORITY", "SINCE", "UNTIL", "RCS", "CLIENT")
         return Table("Running", columns, rows, styles, {"CLIENT"})
 
     def _hosts(self) -> Table:
@@ -129,7 +132,8 @@ class Standing:
 
     def _condition(self, name: str, host: Host) -> tuple[str, str]:
         if host.gone is not None:
-            return f"gone for {span((self.fleet_view.mesh.now() - host.gone) / SECOND)}", "red"
+            gone = (self.fleet_view.mesh.now() - host.gone) / SECOND
+            return f"gone since {clock(-gone)} ({span(gone)})", "red"
         if not host.tokens:
             return "not there", "red"
         if self.fleet_view.stale(host):
@@ -156,7 +160,9 @@ class Standing:
             holders = [hold for hold in holds if view.rc in hold.needs]
             return structs.asdict(view) | {
                 "host": homes.get(view.rc),
-                "holders": [{"arc": hold.arc, "id": hold.id, "client": hold.client} for hold in holders],
+                "holders": [
+                    {"arc": hold.arc, "id": hold.id, "client": hold.client, "who": hold.who} for hold in holders
+                ],
                 "health": device.health if device is not None else None,
                 "figures": device.figures if device is not None else {},
                 "capacity": device.capacity if device is not None else {},
@@ -194,14 +200,20 @@ class Standing:
 def _waiting(state: RcmState) -> Table:
     rows = []
     for number, wait in enumerate(state.queue, 1):
-        starts = "?" if wait.starts_in is None else f"in {span(wait.starts_in)}"
-        spans = (span(wait.waited), span(float(wait.min_runtime)), starts)
+        starts = "?" if wait.starts_in is None else f"{clock(wait.starts_in)} (in {span(wait.starts_in)})"
+        spans = (f"{clock(-wait.waited)} ({span(wait.waited)})", span(float(wait.min_runtime)), starts)
+        why = reason_text(wait.reason, wait.why)
         rows.append(
-            (str(number), wait.arc, str(wait.priority), *spans, str(wait.preemptions), wait.client, wait.reason)
+            (str(number), wait.arc, _who(wait), str(wait.priority), *spans, str(wait.preemptions), why, wait.client)
         )
     title = f"Waiting, and {state.more} more" if state.more else "Waiting"
-    columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "CLIENT", "WHY")
+    columns = ("#", "ARC", "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", "CLIENT")
     return Table(title, columns, rows, spare={"RUNTIME", "PREEMPTED", "CLIENT"})
+
+
+def _who(view: HoldView | WaitView) -> str:
+    """Whose it is, and what others are to know."""
+    return whose(view) + (f": {view.who.comment}" if view.who is not None and view.who.comment else "")
 
 
 def _doing(host: Host) -> str:

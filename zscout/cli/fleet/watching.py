@@ -9,6 +9,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+import msgspec
+
 from zscout import terminal
 from zscout.mesh.supervision import done_within
 from zscout.terminal import Table
@@ -23,7 +25,7 @@ HASTE: Final = 0.1
 MAX_ROWS: Final = 500
 """Of one table at a terminal."""
 PASSING: Final = frozenset(
-    {"held", "remaining", "waited", "starts_in", "seq", "links", "load", "age", "gone"}
+    {"held", "remaining", "waited", "starts_in", "yields_in", "seq", "links", "load", "age", "gone"}
     | {"uptime", "cpu", "memory", "figures"}
 )
 """Fields that change without anything having happened."""
@@ -110,6 +112,8 @@ async def show(
 
 def lasting(value: Any) -> Any:
     """A JSON value without what changes all the time."""
+    if isinstance(value, msgspec.Struct):
+        value = msgspec.structs.asdict(value)
     if isinstance(value, dict):
         return {key: lasting(item) for key, item in value.items() if key not in PASSING}
     return [lasting(item) for item in value] if isinstance(value, list) else value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
@@ -11,18 +12,22 @@ from pathlib import Path
 from typing import Any, Final
 
 import click
+from msgspec.structs import replace
 
 from zscout import messages
+from zscout.behaviors.client.identity import bounded, checked_comment
 from zscout.cli.common import F, Parsed, json_option
 from zscout.cli.requests.run_command import check_command
 from zscout.config import strict
 from zscout.config.strict import DURATIONS, BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
-from zscout.messages import MAX_NEEDS, MAX_PARAMS
+from zscout.messages import MAX_NEEDS, MAX_PARAMS, Who
 from zscout.scheduling.model import check_patterns
 
 Needs = dict[str, dict[str, Decimal]]
 
+DEFAULT_NAMES: Final = ("request", "operator")
+"""What ARCs of `zscout request` and `zscout take` are called that run no command."""
 MAX_ARC_NAME: Final = 200
 """Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 _NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
@@ -61,6 +66,14 @@ def seconds_within(low: float, high: float) -> Parsed[float]:
 
 SECONDS: Final = Parsed("duration", lambda text, option: float(parse_duration(text, option)))
 """An option's duration of any length, in seconds."""
+
+
+def parse_comment(text: str, option: str) -> str:
+    """A comment as others are shown it. Raises BadInput."""
+    try:
+        return checked_comment(text)
+    except ValueError as error:
+        raise BadInput(f"{option}: {error}") from None
 
 
 def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
@@ -160,6 +173,13 @@ class HoldOptions:
     command: tuple[str, ...]
     again: bool
     as_json: bool
+    comment: str = ""
+
+    def asked_by(self, who: Who | None) -> Who:
+        """Who asks, of whom only zscout's own command is known yet: for which command, or under which name."""
+        who = who or Who()
+        own = f"{who.command} --name {self.name}" if self.name not in DEFAULT_NAMES else who.command
+        return replace(who, command=bounded(shlex.join(self.command) if self.command else own))
 
     def terms(self) -> dict[str, Any]:
         """How its needs are to be held."""
@@ -193,6 +213,12 @@ def hold_options(command: F) -> F:
             "fleet's, 60 s.",
         ),
         click.option(
+            "--comment",
+            type=Parsed("text", parse_comment),
+            default="",
+            help="What others are to know: shown in status and to who waits for it.",
+        ),
+        click.option(
             "--name", help="What the ARC is called. Default: the command's name, else request (take: operator)."
         ),
     ):
@@ -201,7 +227,7 @@ def hold_options(command: F) -> F:
 
 
 def gather(
-    needs: Any, name: str | None, default_name: str = "request", *, keep: bool, release_after: Any, **rest: Any
+    needs: Any, name: str | None, default_name: str = DEFAULT_NAMES[0], *, keep: bool, release_after: Any, **rest: Any
 ) -> HoldOptions:
     """Checks what can be checked before anybody is asked. Raises BadInput, BadName, Failed."""
     if release_after is not None:

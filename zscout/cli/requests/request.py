@@ -19,11 +19,12 @@ from zscout.cli import common
 from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
-from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
+from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, whose
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState
-from zscout.terminal import LiveLine, clean, print_json, print_line, span
+from zscout.scheduling.reason import waits
+from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, Ns
 
 TAKEN_AWAY: Final = 75
@@ -101,6 +102,7 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
 async def carry_out(client: Client, wanted: HoldOptions) -> int:
     """Waits, holds, runs the command, gives back. Returns the exit code. Raises Failed, RequestRefused."""
     stream = sys.stderr if wanted.command else sys.stdout
+    client.who = wanted.asked_by(client.who)
     with Report(wanted.name, client, as_json=wanted.as_json, stream=stream) as report:
         client.watch(report.news)
         arc: OpenArc | None = None
@@ -126,7 +128,12 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
         async with report.telling(report.follow_wait()), asyncio.timeout(wanted.timeout):
             if arc is None:
                 arc = await client.request(
-                    wanted.name, wanted.needs, **wanted.terms(), estimate=True, direct=bool(wanted.command)
+                    wanted.name,
+                    wanted.needs,
+                    **wanted.terms(),
+                    comment=wanted.comment,
+                    estimate=True,
+                    direct=bool(wanted.command),
                 )
             grant = await client.granted(arc)
     except (TimeoutError, asyncio.CancelledError) as error:
@@ -278,15 +285,17 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
 
 
 def _words(foretold: Foresight) -> Iterator[str]:
-    if foretold.starts_in is None:
-        yield f"{foretold.arc} would wait, and no start can be foretold: {foretold.reason}"
-    elif foretold.reason:
-        yield f"{foretold.arc} would start in {span(foretold.starts_in)}, if nothing else comes"
-        yield f"until then: {foretold.reason}"
+    reason, start = reason_text(foretold.reason, foretold.why), foretold.starts_in
+    if start is None:
+        yield f"{foretold.arc} would wait, and no start can be foretold: {reason}"
+    elif reason:
+        yield f"{foretold.arc} would start at {clock(start)} (in {span(start)}), if nothing else comes"
+        yield f"until then: {reason}"
     else:
         yield f"{foretold.arc} would start at once"
     if foretold.preempts:
-        yield f"it would preempt {', '.join(foretold.preempts)}"
+        told = [f"{one.arc} of {whose(one)}" for one in foretold.victims]
+        yield f"it would preempt {', '.join(told or foretold.preempts)}"
 
 
 class Report(LiveLine):
@@ -360,7 +369,9 @@ class Report(LiveLine):
         if arc.start is not None:
             starts_in = round(max(0, arc.start - now) / SECOND, 3)
         if arc.state == "queued":
-            start = "no start can be foretold" if starts_in is None else f"starts in {span(starts_in)}"
+            start = "no start can be foretold"
+            if starts_in is not None:
+                start = f"starts at {clock(starts_in)} (in {span(starts_in)})"
             if self._state is not None and self._looked is not None:
                 # The state as it is now, if nothing has happened since that look.
                 past = (now - self._looked) / SECOND
@@ -372,17 +383,21 @@ class Report(LiveLine):
         # met by one RC: it is listed once.
         met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
-        holders = [f"{rc.rc}: {'; '.join(map(hold_text, rc.holds))}" for rc in in_way]
-        ahead = f", {arc.ahead} ahead" if arc.ahead else ""
-        waits = f"{arc.name} waits {span(self._since(arc))}{ahead}{f', {start}' if start else ''}: {arc.reason}"
-        self.draw("\n  ".join([waits, *holders]))
+        holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority) for hold in rc.holds)}" for rc in in_way]
+        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc.told) / SECOND))}"
+        ahead = f"{arc.ahead} ahead" if arc.ahead else ""
+        waited = self._since(arc)
+        since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))
+        self.draw("\n  ".join([words, since, *holders]))
         # Without the estimate: it changes all the time.
         if self.watched or self._printed == _how(arc):
             return
         self._printed = _how(arc)
-        text = "; ".join(filter(None, (f"{arc.name} waits{ahead}: {arc.reason}", start, *holders)))
+        text = "; ".join(filter(None, (words, ahead, start, *holders)))
         stand = [need.as_json() for need in needs]
-        self.event("waits", text, id=arc.id, reason=arc.reason, ahead=arc.ahead, starts_in=starts_in, needs=stand)
+        self.event(
+            "waits", text, id=arc.id, reason=arc.reason, why=arc.why, ahead=arc.ahead, starts_in=starts_in, needs=stand
+        )
 
     def _since(self, arc: OpenArc) -> float:
         return (self._mesh.now() - arc.since) / SECOND

@@ -234,12 +234,12 @@ class Rcm:
         changed = [effect for effect in effects if isinstance(effect, (Granted, HoldEnded))]
         if not changed and rcs is None:
             return
+        now = self.mesh.now()
         revoked = [
-            _revocation(effect, self.registry.name(effect.arc), own=self._is_own(effect))
+            _revocation(effect, self.registry.name(effect.arc), now, own=self._is_own(effect))
             for effect in changed
             if isinstance(effect, HoldEnded)
         ]
-        now = self.mesh.now()
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
         # One that has not joined holds what is not known here: to name it would end that.
         concerned = filter(self.membership.has_joined, {rc for effect in changed for rc in effect.rcs})
@@ -347,6 +347,7 @@ def _of(arc: ArcStatus) -> dict[str, Any]:
         "priority": arc.request.priority,
         "place": arc.place,
         "min_runtime": messages.decimal_seconds(arc.request.min_runtime),
+        "who": arc.request.who,
     }
 
 
@@ -367,7 +368,7 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Hol
     ]
 
 
-def _revocation(effect: HoldEnded, name: str, *, own: bool) -> messages.Revocation:
+def _revocation(effect: HoldEnded, name: str, now: Ns, *, own: bool) -> messages.Revocation:
     return messages.Revocation(
         id=request_id(effect.arc),
         arc=name,
@@ -377,7 +378,7 @@ def _revocation(effect: HoldEnded, name: str, *, own: bool) -> messages.Revocati
         outcome=effect.outcome,
         reason=str(effect.reason),
         by=effect.by,
-        why=reason_info(effect.reason),
+        why=reason_info(effect.reason, now),
         own=own,
     )
 
@@ -403,5 +404,5 @@ def _wait_view(arc: ArcStatus, now: Ns, start: Ns | None) -> messages.WaitView:
         reason=str(arc.reason or ""),
         preemptions=arc.preemptions,
         starts_in=None if start is None else (start - now) / SECOND,
-        why=reason_info(arc.reason),
+        why=reason_info(arc.reason, now),
     )

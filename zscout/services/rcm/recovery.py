@@ -179,6 +179,7 @@ def _request(arc: str, client: str, needs: dict[str, Amounts], source: OpenReque
         keep=source.keep,
         label=source.arc,
         direct=source.direct,
+        who=source.who,
     )
 
 

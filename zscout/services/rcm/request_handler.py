@@ -44,8 +44,9 @@ from zscout.scheduling.model import (
     Requested,
     Unconfirmed,
 )
+from zscout.scheduling.reason import Party, named
 from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.registry import RequestRegistry, arc_id, request_id
+from zscout.services.rcm.registry import RequestRegistry, arc_id, party_info, reason_info, request_id
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
 Query: TypeAlias = IncomingQuery[Operation]
@@ -193,7 +194,8 @@ class RequestHandler:
             if self.core.arc(arc) is None:
                 self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
         event = Cancelled if isinstance(operation, Cancel) else Released
-        self._gather(query, arc, event(arc, "its client" if owner == sender else str(sender)))
+        by = str(sender) if operation.who is None else named(operation.who, str(sender), operation.id)
+        self._gather(query, arc, event(arc, "its client" if owner == sender else by))
 
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
@@ -218,6 +220,7 @@ class RequestHandler:
         request = admit(asked, sender, arc, self.core, self.limits)
         expected = forecast(self.core, now, request)
         start = expected.starts.get(arc)
+        victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]
         query.answer(
             Foresight(
                 id=asked.id,
@@ -225,6 +228,8 @@ class RequestHandler:
                 starts_in=None if start is None else (start - now) / SECOND,
                 preempts=[self._registry.name(victim) for victim in expected.preempts],
                 reason=str(expected.reason or ""),
+                victims=[party_info(Party(one.arc, one.name, one.priority, one.who), now) for one in victims],
+                why=reason_info(expected.reason, now),
             )
         )
 
@@ -386,6 +391,7 @@ def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: Rc
             keep=ask.keep,
             label=ask.arc,
             direct=isinstance(ask, Ask) and ask.direct,
+            who=ask.who if isinstance(ask, Ask) else None,
         )
     except (BadName, ValueError) as error:
         raise Refused("bad_request", str(error)) from None

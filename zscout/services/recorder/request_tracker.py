@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, Revocation, absurd
+from zscout.scheduling.reason import ended, named, waits
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import NO_TERM, Grant, Term
@@ -24,11 +25,18 @@ Key = tuple[str, str]
 class _Request:
     label: str
     """The ARC's name; of several that are open at one time, a numbered one."""
+    who: str = ""
+    """Whose it is, where that was told."""
     state: str = ""
     detail: str = ""
     grant: Grant | None = None
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
     """The newest notice."""
+
+    @property
+    def subject(self) -> str:
+        """As a sentence about it begins."""
+        return f"{self.label} of {self.who}" if self.who else self.label
 
 
 class RequestTracker:
@@ -69,6 +77,7 @@ class RequestTracker:
         if request is None or (notice.term, notice.step) <= request.last:
             return
         request.last = (notice.term, notice.step)
+        request.who = named(notice.who, notice.client, notice.arc) if notice.who is not None else request.who
         # That it runs is read from the publication. What was preempted stays so until it runs again.
         if notice.state == "queued" and request.state not in ("preempted", "running"):
             self._waits(at, request, notice.reason)
@@ -89,6 +98,7 @@ class RequestTracker:
             request = self._track((wait.client, wait.id), wait.arc)
             if request is None:
                 continue
+            request.who = named(wait.who, wait.client, wait.arc) if wait.who is not None else request.who
             if request.grant is not None or not request.state:
                 request.grant = None
                 if wait.preemptions:
@@ -125,13 +135,12 @@ class RequestTracker:
         request.grant = None
         match revoked.outcome:
             case "preempted":
-                party = revoked.why.by[0] if revoked.why is not None and revoked.why.by else None
-                by = f"by {party.arc}, priority {party.priority}" if party is not None else f"by {revoked.by}"
-                self._set(at, request, "preempted", by)
-                self.timeline.warn(at, f"{request.label} is preempted {by}, and waits again")
+                how = ended("preempted", revoked.reason)
+                self._set(at, request, "preempted", how.removeprefix("preempted "))
+                self.timeline.warn(at, f"{request.subject} is {how}, and waits again")
             case "lost":
                 self._set(at, request, "waiting", revoked.reason)
-                self.timeline.warn(at, f"{request.label} lost its hold: {revoked.reason}")
+                self.timeline.warn(at, f"{request.subject} lost its hold: {revoked.reason}")
             case "handed_over":
                 self._move(at, revoked, grants)
             case outcome:
@@ -140,7 +149,7 @@ class RequestTracker:
     def _move(self, at: float, revoked: Revocation, grants: Grants) -> None:
         """The ARC goes on in another client: it keeps its lane."""
         request = self._requests.pop((revoked.client, revoked.id))
-        self.timeline.event(at, f"{request.label} goes on elsewhere: {revoked.reason}")
+        self.timeline.event(at, f"{request.subject} goes on elsewhere: {revoked.reason}")
         for holder in (holder for rc in revoked.rcs for holder in grants.rcs.get(rc, [])):
             if holder.id == revoked.id and holder.client != revoked.client and holder.arc == revoked.arc:
                 self._requests[holder.client, holder.id] = request
@@ -152,13 +161,15 @@ class RequestTracker:
         if request is None or request.grant == hold.grant:
             return
         request.grant = hold.grant
-        self._set(at, request, "running", f"priority {hold.priority} · min {float(hold.min_runtime):g} s")
-        self.timeline.event(at, f"{request.label} runs on {', '.join(sorted(_rcs_of(hold)))}")
+        request.who = named(hold.who, hold.client, hold.arc) if hold.who is not None else request.who
+        details = [f"priority {hold.priority}", f"min {float(hold.min_runtime):g} s", *filter(None, [request.who])]
+        self._set(at, request, "running", " · ".join(details))
+        self.timeline.event(at, f"{request.subject} runs on {', '.join(sorted(_rcs_of(hold)))}")
 
     def _waits(self, at: float, request: _Request, reason: str) -> None:
         if (request.state, request.detail) != ("waiting", reason):
             self._set(at, request, "waiting", reason)
-            self.timeline.event(at, f"{request.label} waits: {reason}")
+            self.timeline.event(at, f"{request.subject} {waits(reason)}")
 
     def _ended(self, at: float, key: Key, outcome: str, reason: str) -> None:
         request = self._requests.pop(key, None)
@@ -167,7 +178,7 @@ class RequestTracker:
         self._labels.discard(request.label)
         self.timeline.arc(at, request.label, "done", "" if outcome == "completed" else outcome)
         level = "WARN" if outcome == "client_lost" else "INFO"
-        self.timeline.event(at, f"{request.label} {outcome.replace('_', ' ')}: {reason}", level)
+        self.timeline.event(at, f"{request.subject} {ended(outcome, reason)}", level)
 
     def _track(self, key: Key, name: str) -> _Request | None:
         """The request, followed from now on; None where too many are open."""
