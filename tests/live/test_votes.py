@@ -51,7 +51,7 @@ def test_a_capacity_is_filled_and_never_exceeded(tmp_path: Path) -> None:
             await comes_to(one, "running")
             await comes_to(two, "running")
             three = await ask(client, "three", "0.1")
-            await comes_to(three, "queued", "radio/rf refuses: rate would be 0.4 of 0.3")
+            await comes_to(three, "queued", ": radio/rf refuses more: rate would be 0.4 of 0.3")
             much = await ask(client, "too-much", "0.31", priority=9)
             await comes_to(much, "queued", "radio/rf refuses: rate would be 0.31 of 0.3")
             # What asks for nothing that is scarce fits beside them.
@@ -85,7 +85,7 @@ def test_answers_stand_until_the_rules_change(tmp_path: Path) -> None:
                 await lab.ready(client, "video/v", "robot/a")
                 await running(client, "one", "video/v")
                 two = await client.request("two", {"video/v": {}}, min_runtime=600)
-                await comes_to(two, "queued", "video/v refuses: it carries 1")
+                await comes_to(two, "queued", ": video/v refuses more: it carries 1")
                 asked = list(picky.asked)
                 assert asked[0] == ["one"]
                 assert asked[-1] == ["one", "two"]

@@ -96,7 +96,7 @@ def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliF
     assert "framegrabber" not in line
     end(robot)
     with fleet.terminal("request", ANY, ANY, "--name", "both") as terminal:
-        terminal.until(f"  {F1}: first (priority 0, ")
+        terminal.until(f"  {F1}: {named('first')}, priority 0, ")
         end(first)
         shown = terminal.until(" left; Ctrl-C gives back")
         assert re.search(r"both holds framegrabber/f1 for framegrabber/\*(#2)?, framegrabber/f2 for ", shown)
@@ -153,7 +153,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
 
     low, high = fleet.holder("low", F1), fleet.holder("high", ANY, "--priority", "1")
     would = fleet.zscout("request", ANY, "--priority", "5", "--dry-run")
-    assert would.stdout == "request would start at once\nit would preempt low\n"
+    assert would.stdout == f"request would start at once\nit would preempt low of {named('low')}\n"
     assert fleet.zscout("take", ANY).returncode == 1
     taken = fleet.zscout("take", ANY, "--yes", "--no-keep", "--min-runtime", "2", "--json")
     preview, granted, _ = events(taken.stdout)

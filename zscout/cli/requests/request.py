@@ -261,7 +261,7 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
 
 def _yours(arc: OpenArc, left: float) -> str:
     """For how long a hold goes on, of which so many seconds are protected."""
-    return f"yours for {span(left)}, then {UNTIL if arc.keep else 'given back'}"
+    return f"yours for {span(left)} (until {clock(left)}), then {UNTIL if arc.keep else 'given back'}"
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
@@ -276,7 +276,7 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
     if foretold is None:
         raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
     if wanted.as_json:
-        found = {name: getattr(foretold, name) for name in ("starts_in", "preempts", "reason")}
+        found = {name: getattr(foretold, name) for name in ("starts_in", "preempts", "victims", "reason", "why")}
         print_json({"arc": wanted.name, **found})
     else:
         for line in _words(foretold):

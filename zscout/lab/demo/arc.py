@@ -46,12 +46,14 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
     from zscout.behaviors.client.client import Client
     from zscout.behaviors.client.request import OpenArc
     from zscout.keyexpr import Role, Token
+    from zscout.messages import Who
 
     def report(what: Milestone, detail: str = "") -> None:
         sys.stdout.write(msgspec.json.encode(ArcReport(spec.arc, what, clock.now(), detail)).decode() + "\n")
         sys.stdout.flush()
 
     async with await Client.connect(spec.arc, host=spec.host) as client:
+        client.who = Who(command=spec.arc)
         missing, complete = {Role.RCM, *spec.needs}, asyncio.Event()
 
         def seen(token: Token, alive: bool) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, Revocation, absurd
+from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, Revocation, WaitView, absurd
 from zscout.scheduling.reason import ended, named, waits
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
@@ -32,6 +32,11 @@ class _Request:
     grant: Grant | None = None
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
     """The newest notice."""
+
+    def tell(self, told: Holder | HoldView | WaitView | Notice) -> None:
+        """Takes whose it is from what the RCM says of it."""
+        if told.who is not None and told.who.user:
+            self.who = named(told.who, told.client, told.arc)
 
     @property
     def subject(self) -> str:
@@ -77,7 +82,7 @@ class RequestTracker:
         if request is None or (notice.term, notice.step) <= request.last:
             return
         request.last = (notice.term, notice.step)
-        request.who = named(notice.who, notice.client, notice.arc) if notice.who is not None else request.who
+        request.tell(notice)
         # That it runs is read from the publication. What was preempted stays so until it runs again.
         if notice.state == "queued" and request.state not in ("preempted", "running"):
             self._waits(at, request, notice.reason)
@@ -98,7 +103,7 @@ class RequestTracker:
             request = self._track((wait.client, wait.id), wait.arc)
             if request is None:
                 continue
-            request.who = named(wait.who, wait.client, wait.arc) if wait.who is not None else request.who
+            request.tell(wait)
             if request.grant is not None or not request.state:
                 request.grant = None
                 if wait.preemptions:
@@ -161,7 +166,7 @@ class RequestTracker:
         if request is None or request.grant == hold.grant:
             return
         request.grant = hold.grant
-        request.who = named(hold.who, hold.client, hold.arc) if hold.who is not None else request.who
+        request.tell(hold)
         details = [f"priority {hold.priority}", f"min {float(hold.min_runtime):g} s", *filter(None, [request.who])]
         self._set(at, request, "running", " · ".join(details))
         self.timeline.event(at, f"{request.subject} runs on {', '.join(sorted(_rcs_of(hold)))}")
