@@ -82,6 +82,7 @@ def _quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A folder of its own, and a second try that does not take long; nothing is left behind."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(command_driver, "AGAIN", (0.05, 0.1))
+    monkeypatch.setattr(command_driver, "OPENING", HANG)
     yield
     assert not any(map(alive, told("pids")))
 
@@ -93,7 +94,7 @@ def play(
 
     async def run() -> None:
         rc = Rc()
-        bounds = {"timeout": round(timeout * SECOND), "every": round(every * SECOND)}
+        bounds: dict[str, Any] = {"timeout": round(timeout * SECOND), "every": round(every * SECOND)}
         words: dict[str, Any] = {name: ("sh", "-c", script) for name, script in scripts.items()}
         driver = CommandDriver.configured(CommandRc(name=rc.name, **bounds, **words))
         try:
@@ -110,6 +111,7 @@ def test_each_is_run_in_its_turn_and_told_what_it_is_about() -> None:
         assert told() == ["safe"]
         one = structs.replace(holder(1, "survey"), params={})
         await driver.begin(one)
+        await until(lambda: bool(told("about")))
         await driver.end(one)
         await driver.safe()
         assert told() == ["safe", "start", "stop", "safe"]
@@ -126,7 +128,9 @@ def test_a_hold_that_goes_on_in_another_client_is_not_started_again() -> None:
     async def story(driver: CommandDriver, _rc: Rc) -> None:
         await driver.begin(holder(1, "survey"))
         await driver.begin(holder(2, "survey", "h/heir"))
+        await until(lambda: told() == ["start"])
         await driver.end(holder(2, "survey", "h/heir"))
+        await driver.safe()
         assert told() == ["start", "stop"]
 
     play(story, start=TELL, stop=TELL)
@@ -135,7 +139,7 @@ def test_a_hold_that_goes_on_in_another_client_is_not_started_again() -> None:
 def test_a_start_that_fails_loses_the_device_with_its_last_line_until_it_was_made_safe() -> None:
     async def story(driver: CommandDriver, rc: Rc) -> None:
         await driver.begin(holder(1))
-        assert rc.said == ["start ended with exit code 3: no such\\x1b[2J power".replace("\\x1b", " ")]
+        await rc.until("start ended with exit code 3: no such [2J power")
         await driver.end(holder(1))
         await driver.safe()
         await rc.until("ok")
@@ -169,17 +173,19 @@ def test_health_is_looked_at_and_it_comes_back_by_itself() -> None:
 def test_a_health_that_hangs_holds_up_no_safe_state() -> None:
     async def story(driver: CommandDriver, rc: Rc) -> None:
         async with asyncio.timeout(HANG / 2):  # its own limit is HANG
+            put("go")
             await until(lambda: bool(told("pids")))
             await driver.safe()
         assert "safe" in told()
         assert not any(said.startswith("health") and "killed" in said for said in rc.said)
 
-    play(story, health="echo $$ >> pids; sleep 1000", safe=TELL)
+    play(story, health="test -e go || exit 0; echo $$ >> pids; sleep 1000", safe=TELL)
 
 
 def test_what_takes_too_long_is_killed_with_all_that_it_started() -> None:
     async def story(driver: CommandDriver, rc: Rc) -> None:
         await driver.begin(holder(1))
+        await rc.until("start was")
         assert rc.said == ["start was killed: it took longer than 1 s: on my way"]
         assert len(told("pids")) == 2
 
@@ -190,7 +196,7 @@ def test_what_takes_too_long_is_killed_with_all_that_it_started() -> None:
 def test_what_is_left_of_a_command_that_has_ended_is_killed() -> None:
     async def story(driver: CommandDriver, rc: Rc) -> None:
         await driver.begin(holder(1))
-        assert rc.said == []
+        await until(lambda: bool(told("pids")))
         (pid,) = told("pids")
         await until(lambda: not alive(pid))
 
@@ -200,6 +206,7 @@ def test_what_is_left_of_a_command_that_has_ended_is_killed() -> None:
 def test_a_command_that_writes_without_end_is_held_back_and_only_the_last_is_kept() -> None:
     async def story(driver: CommandDriver, rc: Rc) -> None:
         await driver.begin(holder(1))
+        await rc.until("start")
         (said,) = rc.said
         assert said.startswith("start ended with exit code 5: ")
         assert set(said.partition("5: ")[2]) == {"y"}
@@ -219,9 +226,38 @@ def test_a_program_that_is_not_there_is_the_reason() -> None:
     asyncio.run(run())
 
 
+def test_a_start_that_goes_on_holds_up_nobody_and_ends_with_its_hold() -> None:
+    async def story(driver: CommandDriver, rc: Rc) -> None:
+        await driver.begin(holder(1))
+        await until(lambda: bool(told("pids")))
+        assert rc.said == []
+        await driver.end(holder(1))
+        await driver.safe()
+        assert told() == ["safe", "stop", "safe"]
+        assert rc.said == []
+
+    play(story, start="echo $$ >> pids; sleep 1000", stop=TELL, safe=TELL)
+
+
+def test_a_safe_state_that_its_rc_does_not_wait_for_is_made_later() -> None:
+    async def story(driver: CommandDriver, rc: Rc) -> None:
+        await driver.begin(holder(1))
+        await driver.end(holder(1))
+        put("slow", "1")
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.3):
+                await driver.safe()
+        assert rc.said == ["it was not made safe in time"]
+        put("slow")
+        await rc.until("ok")
+
+    play(story, start="exit 0", safe="echo $$ > pids; test ! -s slow || sleep 1000")
+
+
 def test_a_node_that_ends_stops_and_makes_safe() -> None:
     async def story(driver: CommandDriver, rc: Rc) -> None:
         await driver.begin(holder(1))
+        await until(lambda: told() == ["safe", "start"])
         await rc.supervisor.close()
         await driver.safe()
         assert told() == ["safe", "start", "stop", "safe"]

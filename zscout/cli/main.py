@@ -128,6 +128,11 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         return error.exit_code, f"zscout: {_line(error.format_message())}"
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
         return INTERRUPTED, ""
+    if isinstance(error, ImportError):
+        from zscout.config.packages import how_to_get
+
+        missing = how_to_get(error)
+        return (COULD_NOT, f"zscout: this command {missing}") if missing else None
     # Only a failing command pays for these imports, and most have made them already.
     from zscout.behaviors.client.client import CommandRefused, RequestRefused
     from zscout.behaviors.client.placer_client import PlacerSilent

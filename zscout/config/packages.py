@@ -13,7 +13,8 @@ MODULES: Final = {"cv2": "opencv-python-headless", "numpy": "numpy", "rerun": "r
 
 
 def how_to_get(error: ImportError) -> str:
-    """What is missing where this import failed, with the command that brings it; empty if it is none of these."""
+    """What is missing where this import failed, with the command that brings it, to stand behind the name of what needs
+    it; empty if it is none of these."""
     package = MODULES.get((error.name or "").partition(".")[0])
     if package is None or not isinstance(error, ModuleNotFoundError):
         return ""
@@ -23,4 +24,4 @@ def how_to_get(error: ImportError) -> str:
         required = []
     wanted = next((one for one in required if re.split(r"[^\w.-]", one)[0] == package), package)
     command = shlex.join([sys.executable, "-m", "pip", "install", wanted])
-    return f"it needs {package}, which is not installed here; {command} brings it"
+    return f"needs {package}, which is not installed here; {command} brings it"

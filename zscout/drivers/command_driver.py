@@ -35,6 +35,8 @@ LINGER: Final = 0.2
 """Seconds for what a command has written last to be read."""
 MAX_REASON: Final = 160
 """Characters of its last line that are told on the mesh."""
+AT_ONCE: Final = 0.5
+"""Seconds for which a holder waits for `start`: its client takes an RC that says nothing for a second for gone."""
 OPENING: Final = 1.0
 """Seconds that a node waits for the first `safe` and `health` before it offers the RC as lost."""
 AGAIN: Final = (1.0, 60.0)
@@ -63,7 +65,10 @@ class CommandDriver(Driver):
         self.activation = rc.activation / SECOND
         self._told = rc
         self._holder: Holder | None = None
-        """Whom it was started for."""
+        """Who holds it."""
+        self._started: Holder | None = None
+        """For whom it was started and not stopped since."""
+        self._starting: asyncio.Task[None] | None = None
         self._unsure = "it was not made safe yet"
         """Why its state is not known; empty once `safe` has succeeded."""
         self._lost = ""
@@ -91,7 +96,13 @@ class CommandDriver(Driver):
         if handed_over:
             return
         self._counts["starts"] += 1
-        ended = await self._run("start", self._told.start)
+        self._started = holder
+        self._starting = self._rc.supervisor.spawn(self._start(holder))
+        # The RC answers nobody meanwhile: what takes longer goes on beside its holder.
+        await asyncio.wait({self._starting}, timeout=AT_ONCE)
+
+    async def _start(self, holder: Holder) -> None:
+        ended = await self._run("start", self._told.start, holder)
         self._start_seconds = ended.seconds
         if ended.problem:
             self._failed_starts += 1
@@ -101,16 +112,22 @@ class CommandDriver(Driver):
             self._failed_starts = 0
 
     async def end(self, holder: Holder) -> None:
-        if self._holder is not None:
-            ended = await self._run("stop", self._told.stop)
-            self._holder = None
-            if ended.problem:
-                log.warning("%s: %s", self._rc.name, ended.problem)
+        self._holder = None
 
     async def safe(self) -> None:
-        if self._holder is not None:  # its node ends
-            await self.end(self._holder)
-        self._unsure = (await self._run("safe", self._told.safe)).problem
+        """Stops it first, where it was started: that may take its time as well."""
+        self._holder, started, self._started = None, self._started, None
+        self._unsure, before = "it is being made safe", self._unsure
+        if self._starting is not None and not self._starting.done():
+            self._starting.cancel()
+            await asyncio.wait({self._starting})
+        try:
+            if started is not None and (why := (await self._run("stop", self._told.stop, started)).problem):
+                log.warning("%s: %s", self._rc.name, why)
+            self._unsure = (await self._run("safe", self._told.safe)).problem
+        except asyncio.CancelledError:  # its RC does not wait any longer
+            self._lose(before or "it was not made safe in time")
+            raise
         if self._unsure:
             self._lose(self._unsure)
 
@@ -157,11 +174,11 @@ class CommandDriver(Driver):
             self._lost = ""
             self._rc.recover()
 
-    async def _run(self, do: str, words: Words) -> Ended:
+    async def _run(self, do: str, words: Words, holder: Holder | None = None) -> Ended:
         if not words:
             return Ended("", 0.0)
         env = os.environ | {"ZSCOUT_DO": do, "ZSCOUT_RC": self._rc.name}
-        if do in ("start", "stop") and (holder := self._holder) is not None:
+        if holder is not None:
             params = {name: float(amount) for name, amount in holder.params.items()}
             env |= {"ZSCOUT_ARC": holder.arc, "ZSCOUT_CLIENT": holder.client, "ZSCOUT_PARAMETERS": json.dumps(params)}
         if do != "health":
@@ -169,7 +186,8 @@ class CommandDriver(Driver):
         async with self._one_at_a_time:
             if do != "health":
                 self._give_way.clear()
-            ended = await run_bounded(words, env, self._told.timeout / SECOND, self._give_way)
+            give_way = self._give_way if do == "health" else asyncio.Event()  # else for nothing
+            ended = await run_bounded(words, env, self._told.timeout / SECOND, give_way)
         if ended.problem:
             self._counts["failures"] += 1
         return replace(ended, problem=ended.problem and f"{do} {ended.problem}")

@@ -44,7 +44,7 @@ def driver_for(rc: RcConfig) -> Driver:
         found: type[Driver] = getattr(import_module(module), attribute)
     except ImportError as error:
         if missing := how_to_get(error):
-            raise BadInput(f"{rc.name}: no driver {quoted(name)} here: {missing}") from error
+            raise BadInput(f"{rc.name}: its driver {missing}") from error
         raise
     return found.configured(rc)
 
@@ -110,7 +110,7 @@ def _origin(entry: metadata.EntryPoint) -> str:
 
 def _unfit(at: Where, what: str, error: BaseException) -> BadInput:
     log.debug("%s: %s", at.key, what, exc_info=error)
-    remedy = how_to_get(error) if isinstance(error, ImportError) else ""
+    remedy = f"it {missing}" if isinstance(error, ImportError) and (missing := how_to_get(error)) else ""
     words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return at.bad(
         f"{what}: {words}", remedy or "mend that package, or install what it needs; --log-level debug shows more"

@@ -11,6 +11,7 @@ from contextlib import suppress
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Final
 
+from zscout.config.packages import how_to_get
 from zscout.keyexpr import BadName, check_name
 
 if TYPE_CHECKING:  # a node looks at this module and needs no client
@@ -130,7 +131,12 @@ def installed_kinds() -> dict[str, str]:
 def load_kind(kind: str, where: str) -> type[Component]:
     """The class of a kind at `where`, as `installed_kinds` gives it. Raises BadKind, and what its import raises."""
     module_name, _, attributes = where.partition(":")
-    found: Any = importlib.import_module(module_name.strip())
+    try:
+        found: Any = importlib.import_module(module_name.strip())
+    except ImportError as error:
+        if missing := how_to_get(error):
+            raise BadKind(f"kind {kind} {missing}") from error
+        raise
     for attribute in attributes.partition("[")[0].strip().split("."):
         found = getattr(found, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Component)):

@@ -13,12 +13,20 @@ from typing import BinaryIO
 
 import msgspec
 
+from zscout.config.packages import how_to_get
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Sender
 from zscout.mesh import MeshError, ZenohMesh
 from zscout.services.recorder.process import BAD_SETTINGS, RecorderJob, Recording, decode_job, new_recording, prune
-from zscout.services.recorder.recorder import Recorder, RecorderFailed
-from zscout.services.recorder.timeline import Timeline
+
+try:
+    from zscout.services.recorder.recorder import Recorder, RecorderFailed
+    from zscout.services.recorder.timeline import Timeline
+except ImportError as error:
+    if not (missing := how_to_get(error)):
+        raise
+    sys.stderr.write(f"the recorder {missing}\n")
+    sys.exit(BAD_SETTINGS)
 
 log = logging.getLogger("zscout.recorder")
 
