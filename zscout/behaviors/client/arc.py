@@ -15,21 +15,28 @@ out, and `held.completed` is true). `holds` asks again, and goes again when it i
 
 A need may be a pattern, which any one RC meets: with `{"framegrabber/*": {}}` as needs,
 `held.rc("framegrabber/*")` is the one that was given, and `held.command("framegrabber/*", ...)` goes to it.
+
+A body that touches devices past their RCs says `direct=True`. When its hold ends it is cancelled, and its `finally` and
+`except CancelledError` run to their end, in at most nine tenths of what its RCs settle; the next holder waits for that.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import suppress
 from decimal import Decimal
 from typing import Any
 
 from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.request import HoldEnd, Needs, OpenArc
 from zscout.keyexpr import is_pattern
 from zscout.messages import Done
 from zscout.types import SECOND, Grant, Ns
+
+log = logging.getLogger(__name__)
 
 
 class Revoked(Exception):
@@ -116,8 +123,10 @@ class Attempt:
         self.arc: OpenArc | None = None
         self._anew = False
         """Whether what was kept is to be asked for anew."""
-        self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None]] | None = None
-        """The hold, its body, and what cancels the body when the hold is over."""
+        self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None], DirectHold | None] | None = None
+        """The hold, its body, what cancels the body when the hold is over, and what a direct one owes its RCs."""
+        self._cancelled = 0
+        """How often the body was, for that."""
 
     @property
     def goes_on(self) -> bool:
@@ -147,22 +156,36 @@ class Attempt:
     async def __aenter__(self) -> Held:
         held, body = await self.granted(), asyncio.current_task()
         assert body is not None  # noqa: S101 - this is a coroutine
-        self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body))
+        direct, self._cancelled = self._client.direct_hold(held.grant), 0
+        self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body, direct)), direct
         return held
 
-    async def _interrupt_when_over(self, held: Held, body: asyncio.Task[Any]) -> None:
+    async def _interrupt_when_over(self, held: Held, body: asyncio.Task[Any], direct: DirectHold | None) -> None:
         await held.over()
         await held.resumed()
+        self._cancel(body)
+        if direct is not None:
+            direct.end()
+            await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
+            log.error(
+                "%s clears up for too long after its hold, and is interrupted: the next holder begins", held.arc.name
+            )
+            self._cancel(body)
+
+    def _cancel(self, body: asyncio.Task[Any]) -> None:
+        self._cancelled += 1
         body.cancel()
 
     async def __aexit__(self, kind: type[BaseException] | None, *_error: object) -> bool:
         assert self._entered is not None  # noqa: S101 - entered before left
-        held, body, watch = self._entered
+        held, body, watch, direct = self._entered
         arc = held.arc
-        interrupted = watch.done() and not watch.cancelled()
         watch.cancel()
+        if direct is not None:
+            direct.returned()
         # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
-        interrupted = interrupted and body.uncancel() == 0 and kind is asyncio.CancelledError
+        left = [body.uncancel() for _ in range(self._cancelled)]
+        interrupted = left[-1:] == [0] and kind is asyncio.CancelledError
         if held.completed:
             # What somebody released is not to be had again.
             by_hand = arc.why is not None and arc.why.code == "released"
@@ -189,6 +212,7 @@ def hold(
     priority: int = 0,
     min_runtime: float | Decimal | None = None,
     keep: bool = True,
+    direct: bool = False,
     timeout: float | None = None,
     comment: str = "",
 ) -> Attempt:
@@ -196,15 +220,8 @@ def hold(
     `comment` is shown to others.
 
     Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
-    ask = {
-        "name": name,
-        "needs": needs,
-        "priority": priority,
-        "min_runtime": min_runtime,
-        "keep": keep,
-        "comment": comment,
-    }
-    return Attempt(client, ask, timeout=timeout)
+    how = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "direct": direct, "comment": comment}
+    return Attempt(client, {"name": name, "needs": needs} | how, timeout=timeout)
 
 
 async def holds(
@@ -215,19 +232,13 @@ async def holds(
     priority: int = 0,
     min_runtime: float | Decimal | None = None,
     keep: bool = True,
+    direct: bool = False,
     comment: str = "",
 ) -> AsyncIterator[Attempt]:
     """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
     without `keep` has had its time."""
-    ask = {
-        "name": name,
-        "needs": needs,
-        "priority": priority,
-        "min_runtime": min_runtime,
-        "keep": keep,
-        "comment": comment,
-    }
-    attempt = Attempt(client, ask, again=True)
+    how = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "direct": direct, "comment": comment}
+    attempt = Attempt(client, {"name": name, "needs": needs} | how, again=True)
     yield attempt
     while attempt.goes_on:
         yield attempt
