@@ -331,7 +331,10 @@ class Client(MovableClient):
                     return refused
                 if refused.code == SETTLING:
                     # Neither a refusal nor silence.
-                    arc.settling = grant
+                    if arc.settling != grant:
+                        most = "" if refused.left is None else f", for {refused.left:.1f} s at most"
+                        arc.settling, arc.reason = grant, f"a former holder's program may still touch {rc}{most}"
+                        self._store.notify(arc)
                     if not arc.keep and self.mesh.now() >= arc.end:
                         return refused
                     deadline, pause = self.mesh.now() + second, BACKOFF[0]

@@ -345,6 +345,8 @@ class Report(LiveLine):
             arc = self._arc
             if arc is None:
                 self.draw(f"{self._name}: asking the RCM")
+            elif arc.state == "running" and arc.settling == arc.grant:
+                self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:
                 news = arc.last != self._seen if self.watched else _how(arc) != self._printed
                 if arc.state == "queued" and news:
@@ -398,6 +400,14 @@ class Report(LiveLine):
         self.event(
             "waits", text, id=arc.id, reason=arc.reason, why=arc.why, ahead=arc.ahead, starts_in=starts_in, needs=stand
         )
+
+    def _show_settling(self, arc: OpenArc) -> None:
+        text = f"{arc.name} is granted {_held_text(arc)}, and waits {span(self._since(arc))}: {arc.reason}"
+        self.draw(text)
+        if self._printed != arc.grant:
+            self._printed = arc.grant
+            text = "" if self.watched else f"{arc.name} is granted {_held_text(arc)}, and waits: {arc.reason}"
+            self.event("settling", text, id=arc.id, rcs=arc.rcs, grant=arc.grant, reason=arc.reason)
 
     def _since(self, arc: OpenArc) -> float:
         return (self._mesh.now() - arc.since) / SECOND
