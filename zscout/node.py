@@ -128,11 +128,13 @@ def main(file: Path | None, log_level: str) -> None:
     """Runs this host's part of a fleet, as the node FILE (TOML) says.
 
     Without FILE the node stands as a candidate for the RCM of the fleet "zscout" and reports the host's load.
+    `zscout simulate --node lab.toml` writes one for a simulated building; docs/reference/configuration.md has
+    all settings.
 
     \b
     Examples:
       zscout-node
-      zscout-node /etc/zscout/node.toml
+      zscout-node lab.toml
     """
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     try:

@@ -199,14 +199,18 @@ async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
 def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> Failed:
     """What to raise where nobody knows a `name`: it lists names like it, or those that are known (the word is
     `listed`) and how many `more` there are, or it says that there is `nothing`."""
+    return Failed(f"no {what} {quoted(name)} is known{hint_at(name, known, nothing, listed, more)}")
+
+
+def hint_at(name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> str:
+    """The end of a line that says that nobody knows `name`: what was meant, perhaps."""
     names = sorted(set(known))
-    hint = f", {nothing}"
     if near := difflib.get_close_matches(name, names, n=3):
-        hint = f"; did you mean {' or '.join(near)}?"
-    elif names:
-        rest = len(names) - MAX_NAMED + more
-        hint = f"; {listed}: {', '.join(names[:MAX_NAMED])}" + (f" and {rest} more" if rest > 0 else "")
-    return Failed(f"no {what} {quoted(name)} is known{hint}")
+        return f"; did you mean {' or '.join(near)}?"
+    if not names:
+        return f", {nothing}"
+    rest = len(names) - MAX_NAMED + more
+    return f"; {listed}: {', '.join(names[:MAX_NAMED])}" + (f" and {rest} more" if rest > 0 else "")
 
 
 class Parsed(click.ParamType[T]):

@@ -205,7 +205,7 @@ def main(verbose: bool, **_: Any) -> None:
 
     \b
     Examples:
-      zscout request robot/scout33 radio/rf0:command_rate=5 -- ./survey.py
+      zscout request robot/scout33 radio/rf0:command_rate=5 -- bash
       zscout take robot/scout33
       zscout status --watch
       zscout why survey

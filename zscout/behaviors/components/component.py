@@ -18,13 +18,16 @@ if TYPE_CHECKING:  # a node looks at this module and needs no client
     from zscout.behaviors.client.client import Client
 
 GROUP: Final = "zscout.components"
+BAD_PARAMS: Final = 78
+"""Exit code (EX_CONFIG) of a component whose parameters are no good: it is not started again, here or elsewhere."""
 
 
 class Component:
     """Base of all components. It is made in the process that runs it, before that process is on the mesh."""
 
     def __init__(self, params: dict[str, Any]) -> None:
-        """`params` are the spec's. Raise ValueError, with one line that says what to mend, for bad ones."""
+        """`params` are the spec's. Raise ValueError, with one line that says what to mend, for bad ones: then it is
+        given up, with that line. What is found later ends with `sys.exit(BAD_PARAMS)`."""
 
     async def run(self, context: ComponentContext) -> None:
         """Does the work. Cancelled when the component is to end: let `async with` give back its ARCs."""

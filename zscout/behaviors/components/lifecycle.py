@@ -16,6 +16,7 @@ from zscout.behaviors.client.identity import bounded
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import ComponentJob, EndReport, Order, OrderAnswer, PhaseReport
 from zscout.behaviors.components.component import (
+    BAD_PARAMS,
     BadKind,
     Component,
     ComponentContext,
@@ -40,6 +41,10 @@ CLOSE: Final = 4.0
 """Seconds for giving back what it holds."""
 SUPERSEDED: Final = 0.5
 """Seconds that a superseded one has to clean up."""
+
+
+class BadParams(BadKind):
+    """What a component was given is no good."""
 
 
 class ComponentLifecycle:
@@ -145,7 +150,7 @@ class ComponentLifecycle:
                 client.who = replace(client.who or Who(), command=bounded(f"component {job.start.component}"))
             made = self._component = self._make(kind)
         except (BadKind, MeshError) as error:
-            return EndReport("failed", str(error))
+            return EndReport("failed", str(error), bad_params=isinstance(error, BadParams))
         movable = is_movable(made)
         with closing(client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)):
             if job.start.standby:
@@ -172,7 +177,7 @@ class ComponentLifecycle:
         try:
             return kind(self._job.start.spec.params)
         except ValueError as error:
-            raise BadKind(f"these parameters are no good: {_words(error, named=False)}") from None
+            raise BadParams(f"these parameters are no good: {_words(error, named=False)}") from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
             raise BadKind(f"it can't be made: {_words(error)}") from None
@@ -189,6 +194,9 @@ class ComponentLifecycle:
             if self._wanted is None:
                 raise
         except SystemExit as left:
+            if left.code == BAD_PARAMS:
+                words = f"it left with code {BAD_PARAMS}: its parameters are no good; see its output"
+                return self._wanted or EndReport("failed", words, bad_params=True)
             if left.code:
                 return self._wanted or EndReport("failed", f"it left with {left.code!r}")
         except Exception as error:

@@ -171,11 +171,11 @@ async def _kinds(*, as_json: bool) -> None:
             f"no host of fleet {fleet} told what it can start; start zscout-node there, or see its log"
         )
     if as_json:
-        hosts = [{"host": one.host, "kinds": sorted(one.kinds)} for one in nodes]
+        hosts = [{"host": one.host, "kinds": sorted(one.kinds or ())} for one in nodes]
         terminal.print_json({"fleet": fleet, "hosts": hosts})
         return
-    kinds = sorted({kind for one in nodes for kind in one.kinds})
-    rows = [(kind, ", ".join(one.host for one in nodes if kind in one.kinds)) for kind in kinds]
+    kinds = sorted({kind for one in nodes for kind in one.kinds or ()})
+    rows = [(kind, ", ".join(one.host for one in nodes if kind in (one.kinds or ()))) for kind in kinds]
     nothing = [one.host for one in nodes if not one.kinds]
     without = f"; nothing on {', '.join(nothing)}" if nothing else ""
     headline = f"Fleet {fleet}: {len(kinds)} kinds can be started{without}"

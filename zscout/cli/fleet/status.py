@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import Any, Final
@@ -11,8 +11,9 @@ from typing import Any, Final
 import click
 from msgspec import structs
 
-from zscout.cli import common
+from zscout.cli import common, completion
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
+from zscout.cli.fleet.selection import Selection
 from zscout.cli.fleet.watching import Overview, show
 from zscout.cli.requests.waiting import reason_text, whose
 from zscout.keyexpr import Role
@@ -26,12 +27,17 @@ MAX_FIGURES_SHOWN: Final = 12
 
 
 @click.command()
-@click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
+@click.argument("names", nargs=-1, metavar="[NAME...]", shell_complete=completion.shown)
+@click.option("--watch", is_flag=True, help="Go on showing it: the arrows scroll, q or Ctrl-C ends.")
 @click.option("--devices", "every", is_flag=True, help="Show the figures of all devices: rates, drops, latency.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
 @common.runs
-async def status(watch: bool, every: bool, as_json: bool) -> None:
+async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) -> None:
     """Show the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
+
+    A NAME is that of an RC, an ARC (or its id) or a host, or a pattern: 'robot/*'. With some, only these are shown, and
+    what has to do with them: an RC with who holds it and who waits for it, an ARC with its RCs and their holders, a
+    host with its RCs and programs. Exit code 1: nothing has one of these names.
 
     The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
     where they are not there; other hosts that died only with --watch. A device that says that something is wrong with
@@ -43,17 +49,20 @@ async def status(watch: bool, every: bool, as_json: bool) -> None:
       zscout status
       zscout status --json | jq -r '.queue[] | .arc + ": " + .reason'
       zscout status --devices --watch
+      zscout status 'framegrabber/*' anvil
     """
     async with AsyncExitStack() as stack:
         client = await stack.enter_async_context(common.connected("status", need_rcm=False))
         fleet_view = stack.enter_context(FleetView(client))
-        standing = Standing(fleet_view, None, Devices(fleet_view), every)
+        standing = Standing(fleet_view, None, Devices(fleet_view), every, names)
         nobody: common.NobodyThere | None = None
         try:
             standing.state = await fleet_view.settled()
         except common.NobodyThere as error:  # hosts and RCs are shown all the same
             nobody = error
         await standing.devices.ask()
+        if nobody is None and not watch and (missing := standing.selection().missing()):
+            raise missing
         # Whatever becomes of an ARC is published to its client.
         news = asyncio.Event()
         client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
@@ -64,12 +73,18 @@ async def status(watch: bool, every: bool, as_json: bool) -> None:
 
 @dataclass(slots=True)
 class Standing:
-    """How the fleet stands; `state` is None where there is no RCM. `every`: with figures of all devices."""
+    """How the fleet stands; `state` is None where there is no RCM. `every`: with figures of all devices. `names`: only
+    these, where there are some."""
 
     fleet_view: FleetView
     state: RcmState | None
     devices: Devices
     every: bool
+    names: Sequence[str] = ()
+
+    def selection(self) -> Selection:
+        """Of what is there now, what is to be shown."""
+        return Selection(self.names, self.state, self._homes(), self.fleet_view.all_hosts())
 
     async def refresh(self) -> None:
         self.state = await self.fleet_view.client.state(forecast=True)
@@ -80,11 +95,13 @@ class Standing:
         fleet, links = self.fleet_view.client.fleet.name, many(self.fleet_view.mesh.links(), "link")
         headline = f"Fleet {fleet}: nobody leads; nothing is granted until a node does ({links})"
         tables: list[Table] = []
-        if self.state is not None:
+        chosen = self.selection()
+        if self.state is not None and chosen.state is not None:
             leader, term = self.state.host, self.state.term.counter
             headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
-            tables = [self._rcs(self.state), self._running(self.state), _waiting(self.state)]
-        return Overview(headline, [*tables, self._hosts(), self._devices()], alarm=self.state is None)
+            ranks = {f"{wait.client}/{wait.id}": number for number, wait in enumerate(self.state.queue, 1)}
+            tables = [self._rcs(chosen.state), self._running(chosen.state), _waiting(chosen.state, ranks)]
+        return Overview(headline, [*tables, self._hosts(chosen), self._devices(chosen)], alarm=self.state is None)
 
     def _homes(self) -> dict[str, str]:
         return {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
@@ -117,9 +134,9 @@ class Standing:
         columns = ("ARC", "WHO", "PRIORITY", "SINCE", "UNTIL", "RCS", "CLIENT")
         return Table("Running", columns, rows, styles, {"CLIENT"})
 
-    def _hosts(self) -> Table:
+    def _hosts(self, chosen: Selection) -> Table:
         rows, styles = [], []
-        for name, host in self.fleet_view.all_hosts().items():
+        for name, host in chosen.hosts.items():
             words, style = self._condition(name, host)
             load, cpu, memory = "-", "-", "-"
             if (report := host.load) is not None:
@@ -141,9 +158,9 @@ class Standing:
         words, style = ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
         return (f"{words}, cordoned", "yellow") if name in self.fleet_view.placer.cordoned else (words, style)
 
-    def _devices(self) -> Table:
+    def _devices(self, chosen: Selection) -> Table:
         """Those that are not well; with `every` also those that report figures."""
-        known = self.devices.known().values()
+        known = [one for one in self.devices.known().values() if chosen.shows(one.rc)]
         shown = [one for one in known if one.health != "ok" or (self.every and one.figures)]
         rows = [(one.rc, one.health, figures_text(one.figures)) for one in shown]
         styles = ["" if one.health == "ok" else "red" for one in shown]
@@ -151,7 +168,8 @@ class Standing:
 
     def as_object(self) -> dict[str, Any]:
         """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
-        state, homes, now = self.state, self._homes(), self.fleet_view.mesh.now()
+        chosen = self.selection()
+        state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
         known = self.devices.known()
 
@@ -176,7 +194,7 @@ class Standing:
             "holds": list(map(structs.asdict, holds)),
             "queue": list(map(structs.asdict, queue)),
             "more": state.more if state is not None else 0,
-            "hosts": [self._host_object(name, host, now) for name, host in self.fleet_view.all_hosts().items()],
+            "hosts": [self._host_object(name, host, now) for name, host in chosen.hosts.items()],
         }
 
     def _host_object(self, name: str, host: Host, now: Ns) -> dict[str, Any]:
@@ -197,9 +215,10 @@ class Standing:
         }
 
 
-def _waiting(state: RcmState) -> Table:
+def _waiting(state: RcmState, ranks: Mapping[str, int]) -> Table:
     rows = []
-    for number, wait in enumerate(state.queue, 1):
+    for wait in state.queue:
+        number = ranks[f"{wait.client}/{wait.id}"]
         starts = "?" if wait.starts_in is None else f"{clock(wait.starts_in)} (in {span(wait.starts_in)})"
         spans = (f"{clock(-wait.waited)} ({span(wait.waited)})", span(float(wait.min_runtime)), starts)
         why = reason_text(wait.reason, wait.why)

@@ -77,7 +77,7 @@ async def view(file: Path | None, web: bool, bind: str, port: int | None, out: P
     Examples:
       zscout view
       zscout view --web
-      zscout view runs/lab.rrd
+      zscout view demo.rrd
       zscout view --web --json | jq -r --unbuffered .url
     """
     try:

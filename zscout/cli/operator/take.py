@@ -47,7 +47,7 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: s
     \b
     Examples:
       zscout take robot/scout33 --reason 'the gripper is stuck'
-      zscout take robot/scout33 radio/rf0:command_rate=5 --yes -- ./drive.py
+      zscout take robot/scout33 radio/rf0:command_rate=5 --yes -- bash
       zscout take 'robot/*' 'framegrabber/*' --release-after 2m
     """
     priority = common.the_fleet().operator_priority

@@ -68,7 +68,7 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
 
     \b
     Examples:
-      zscout watch --source garden.avi
+      zscout watch --source /dev/video0
       zscout watch --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
       zscout watch --source /dev/video0 --limit 600 --record garden.rrd
     """

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from zscout import messages
 from zscout.behaviors.client.identity import bounded, checked_comment
+from zscout.cli import completion
 from zscout.cli.common import F, Parsed, json_option
 from zscout.cli.requests.run_command import check_command
 from zscout.config import strict
@@ -189,7 +190,14 @@ class HoldOptions:
 def hold_options(command: F) -> F:
     """The NEEDs and the options of all commands that hold something."""
     for option in (
-        click.argument("needs", nargs=-1, required=True, type=Parsed("need", parse_need), metavar="NEED..."),
+        click.argument(
+            "needs",
+            nargs=-1,
+            required=True,
+            type=Parsed("need", parse_need),
+            metavar="NEED...",
+            shell_complete=completion.needs,
+        ),
         json_option("Print JSON lines, one for each event."),
         click.option(
             "--again", is_flag=True, help="Ask again and run the command again, when it was ended for others."
@@ -252,4 +260,4 @@ def arc_named(text: str, _option: str) -> str:
     return text
 
 
-arc_argument = click.argument("arc", type=Parsed("text", arc_named))
+arc_argument = click.argument("arc", type=Parsed("text", arc_named), shell_complete=completion.arcs)

@@ -84,11 +84,11 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
 
     \b
     Examples:
-      zscout request robot/scout33 --min-runtime 2h -- ./night.sh
+      zscout request robot/scout33 --min-runtime 2h -- sleep 7200
       zscout request robot/scout33 --release-after 5m
-      zscout request robot/scout33 radio/rf0:command_rate=5 -- ./survey.py --fast
-      zscout request framegrabber/fgrab1 --timeout 30 --again -- ./record.sh
-      zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- ./stereo.py
+      zscout request robot/scout33 radio/rf0:command_rate=5 -- sh -c 'echo I hold $ZSCOUT_RCS; sleep 50'
+      zscout request framegrabber/fgrab1 --timeout 30 --again -- sleep 60
+      zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- python3 -i
       zscout request robot/scout33 --json | jq .event
       zscout request robot/scout33 --priority 5 --dry-run
     """
