@@ -215,8 +215,7 @@ def test_tab_offers_components_hosts_and_kinds(fleet: CliFleet) -> None:
     assert offered("zscout", "request", "ro") == ["plain,robot/a"]
     assert offered("zscout", "status", "an") == ["plain,anvil"]
     assert offered("zscout", "status", "anvil", "an") == []
-    with connect("desk", fleet=fleet.lab.fleet, host="test") as lab:
-        with lab.hold("surveying", {"robot/a": {}}):
-            assert offered("zscout", "why", "surv") == ["plain,surveying"]
-            assert offered("zscout", "status", "surv") == ["plain,surveying"]
+    with connect("desk", fleet=fleet.lab.fleet, host="test") as lab, lab.hold("surveying", {"robot/a": {}}):
+        assert offered("zscout", "why", "surv") == ["plain,surveying"]
+        assert offered("zscout", "status", "surv") == ["plain,surveying"]
     assert fleet.zscout("stop", "offered").returncode == 0
