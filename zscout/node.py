@@ -19,7 +19,9 @@ import uvloop
 from zscout import __version__
 from zscout.config.devices import RobotRc
 from zscout.config.node import Node, default_node, load_node
+from zscout.config.state_folder import state_folder
 from zscout.config.strict import BadInput
+from zscout.drivers.last_holder import LastHolderFile, UnknownLastHolder
 from zscout.drivers.lock import only_here
 from zscout.drivers.registry import driver_for, driver_name
 from zscout.drivers.resource_controller import ResourceController
@@ -71,11 +73,21 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
         stack.callback(token.close)
         lease = node.fleet.timing.hold_lease / SECOND
+        kept = state_folder(node.fleet.name, me.host, node.state) if node.rcs else None
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
             stack.enter_context(only_here(node.fleet.name, me.host, spec.name))
             driver = drivers[spec.name]
-            rc = ResourceController(mesh, spec.name, driver, hold_lease=lease, stall=stall, on_failure=fail)
+            rc = ResourceController(
+                mesh,
+                spec.name,
+                driver,
+                hold_lease=lease,
+                settle=spec.settle / SECOND,
+                last_holder=LastHolderFile(kept, spec.name) if kept is not None else UnknownLastHolder(),
+                stall=stall,
+                on_failure=fail,
+            )
             await rc.start()
             stack.push_async_callback(rc.stop)
             log.info("runs %s (%s)", spec.name, driver_name(spec))

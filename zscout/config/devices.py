@@ -30,6 +30,7 @@ A_SOURCE: Final = 'source = "/dev/video0", or a table sources'
 
 Words: TypeAlias = tuple[str, ...]
 """A program and its arguments; no shell reads them."""
+SETTLE: Final[Ns] = 5 * SECOND
 Activation: TypeAlias = Annotated[Ns, seconds("0", "3600", "From a grant until the device can be used.")]
 
 
@@ -37,6 +38,9 @@ class AnyRc(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What every RC that a node runs is told, whatever its driver."""
 
     name: Annotated[str, key("`kind/name`.", example="robot/scout33")]
+    settle: Annotated[
+        Ns, seconds("0.5", "60", "A program that touches the device past its RC must end within, and a safe state.")
+    ] = SETTLE
 
 
 class RcTable(AnyRc, frozen=True, tag_field="driver"):

@@ -23,6 +23,8 @@ MAX_STARTED: Final = 256
 FRAMES: Final = 2.0
 """Pictures a second that a recorder shows of each camera, by default."""
 
+STATE: Final = 'state = "/var/lib/zscout"'
+
 LoadKind = bool | Literal["tree"]
 
 
@@ -62,6 +64,8 @@ class Node(Struct, frozen=True):
     """None: this node does not record."""
     labels: tuple[str, ...] = ()
     components: ComponentsConfig = ComponentsConfig()
+    state: Path | None = None
+    """The folder of what must outlive the node (`state_folder.py`); None: where such folders usually are."""
 
 
 # The file as it is written
@@ -77,6 +81,9 @@ class NodeTable(Struct, frozen=True, forbid_unknown_fields=True):
         LoadKind, key('Whether it reports its load; "tree": only that of this node and what it started.')
     ] = True
     labels: Annotated[tuple[str, ...], key("For components that need them.", most=MAX_LABELS, example=["gpu"])] = ()
+    state: Annotated[
+        str | None, key("The folder of what must outlive the node, relative to this file.", example="/var/lib/zscout")
+    ] = None
 
 
 class RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -141,12 +148,19 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         recorder=None if file.recorder is None else _recorder(file.recorder, folder, top / "recorder"),
         labels=file.node.labels,
         components=file.components,
+        state=None if file.node.state is None else _folder(file.node.state, folder, top / "node" / "state", STATE),
     )
 
 
+def _folder(text: str, folder: Path, at: Where, example: str) -> Path:
+    """The folder of this name, relative to that of the file. Raises BadInput."""
+    if not text or "\0" in text:
+        raise at.bad(f"{quoted(text)} is no folder", f"name one, as in {example}")
+    return folder / text
+
+
 def _recorder(table: RecorderTable, folder: Path, at: Where) -> RecorderConfig:
-    if not table.path or "\0" in table.path:
-        raise (at / "path").bad(f"{quoted(table.path)} is no folder", 'name one, as in path = "runs"')
+    path = _folder(table.path, folder, at / "path", 'path = "runs"')
     address = ip_of("127.0.0.1" if table.bind == "localhost" else table.bind)
     if address is None:
         raise (at / "bind").bad(f"{quoted(table.bind)} is not an IP address", 'write one, as in "127.0.0.1"')
@@ -155,4 +169,4 @@ def _recorder(table: RecorderTable, folder: Path, at: Where) -> RecorderConfig:
             f"{quoted(table.bind)} shows the recording to other hosts",
             'write "127.0.0.1", or add allow_remote = true if that is meant',
         )
-    return RecorderConfig(folder / table.path, str(address), table.port, table.frames)
+    return RecorderConfig(path, str(address), table.port, table.frames)

@@ -15,6 +15,7 @@ from typing import Any, Final, TypeAlias
 from msgspec import structs
 
 from zscout import messages, trace
+from zscout.config import devices
 from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.instances import Instances, InstanceState
@@ -37,7 +38,7 @@ REREAD_TIMEOUT = 0.5
 """Seconds that one query for `rcm/state` waits for an answer."""
 REREADS = 4
 """Queries in a row when publications overtake the answers."""
-SETTLE: Final = 5.0
+SETTLE: Final = devices.SETTLE / SECOND
 """Seconds from the end of a direct hold, as its client heard of it, in which its program must be gone; and within which
 a device must be safe."""
 AT_ONCE: Final = 0.1

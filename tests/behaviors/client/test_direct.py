@@ -174,7 +174,8 @@ def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_runtime
             assert grant not in (None, first_grant)
             assert arc.place == place
             assert (two.mesh.now() - asked) / SECOND >= SETTLE - 0.1
-            assert (arc.end - two.mesh.now()) / SECOND > 0
+            # What is kept goes on after its minimum runtime, which passed meanwhile.
+            assert keep or (arc.end - two.mesh.now()) / SECOND > 1.5
             state = await two.state()
             assert state is not None
             (hold,) = state.holds
