@@ -39,11 +39,13 @@ def run(
     *command: object, cwd: Path, env: Mapping[str, str] = CLEAN, timeout: float = HANG, check: bool = True
 ) -> subprocess.CompletedProcess[str]:
     """Runs a program to its end. Raises CheckFailed, with its output, where it fails."""
-    done = subprocess.run(
-        [str(word) for word in command], cwd=cwd, env=env, capture_output=True, text=True, timeout=timeout, check=False
-    )
+    words = [str(word) for word in command]
+    try:
+        done = subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, timeout=timeout, check=False)
+    except subprocess.TimeoutExpired:
+        raise CheckFailed(f"{' '.join(words)} did not end within {timeout:g} s") from None
     if check and done.returncode:
-        raise CheckFailed(f"{' '.join(map(str, command))} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
+        raise CheckFailed(f"{' '.join(words)} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
     return done
 
 
@@ -57,11 +59,15 @@ def megabytes(folder: Path) -> float:
     return sum(path.lstat().st_blocks for path in folder.rglob("*")) * 512 / 1e6
 
 
+def make_environment(folder: Path) -> None:
+    run(sys.executable, "-m", "venv", folder, cwd=folder.parent, timeout=INSTALL)
+
+
 # Ways to install; each returns the folder that has the programs
 
 
 def by_pip(wheel: Path, folder: Path) -> Path:
-    run(sys.executable, "-m", "venv", folder, cwd=folder.parent)
+    make_environment(folder)
     run(folder / "bin/python", "-m", "pip", "install", "--quiet", wheel, cwd=folder, timeout=INSTALL)
     return folder / "bin"
 
@@ -85,7 +91,7 @@ def by_uv(tools: Path, wheel: Path, folder: Path) -> Path:
 
 
 def light(wheel: Path, folder: Path) -> Path:
-    run(sys.executable, "-m", "venv", folder, cwd=folder.parent)
+    make_environment(folder)
     pip = (folder / "bin/python", "-m", "pip", "install", "--quiet")
     run(*pip, "--require-hashes", "-r", REQUIREMENTS / "light.txt", cwd=folder, timeout=INSTALL)
     run(*pip, "--no-deps", wheel, cwd=folder)
@@ -222,17 +228,22 @@ def main() -> int:
         run(*build, "--wheel-dir", folder, ROOT, cwd=folder, timeout=INSTALL)
         (wheel,) = folder.glob("zscout-*.whl")
         tools = folder / "tools"
-        ways: dict[str, Callable[[Path, Path], Path]] = {"light": light, "pip": by_pip}
-        try:
-            run(sys.executable, "-m", "venv", tools, cwd=folder)
-            pip = (tools / "bin/python", "-m", "pip", "install", "--quiet", "--require-hashes")
-            run(*pip, "-r", REQUIREMENTS / "installers.txt", cwd=folder, timeout=INSTALL)
-        except CheckFailed as error:
-            print(f"pipx and uv are skipped, they can't be had here: {error}", flush=True)
-        else:
-            ways["pipx"] = lambda wheel, home: by_pipx(tools / "bin", wheel, home)
-            ways["uv"] = lambda wheel, home: by_uv(tools / "bin", wheel, home)
-        for way in [way for way in sys.argv[1:] if way in ways] or list(ways):
+        ways: dict[str, Callable[[Path, Path], Path]] = {
+            "light": light,
+            "pip": by_pip,
+            "pipx": lambda wheel, home: by_pipx(tools / "bin", wheel, home),
+            "uv": lambda wheel, home: by_uv(tools / "bin", wheel, home),
+        }
+        wanted = [way for way in sys.argv[1:] if way in ways] or list(ways)
+        if {"pipx", "uv"} & set(wanted):
+            try:
+                make_environment(tools)
+                pip = (tools / "bin/python", "-m", "pip", "install", "--quiet", "--require-hashes")
+                run(*pip, "-r", REQUIREMENTS / "installers.txt", cwd=folder, timeout=INSTALL)
+            except CheckFailed as error:
+                print(f"pipx and uv are skipped, they can't be had here: {error}", flush=True)
+                wanted = [way for way in wanted if way not in ("pipx", "uv")]
+        for way in wanted:
             print(f"{way} ...", flush=True)
             try:
                 began = time.monotonic()

@@ -118,10 +118,10 @@ class CommandDriver(Driver):
         """Stops it first, where it was started: that may take its time as well."""
         self._holder, started, self._started = None, self._started, None
         self._unsure, before = "it is being made safe", self._unsure
-        if self._starting is not None and not self._starting.done():
-            self._starting.cancel()
-            await asyncio.wait({self._starting})
         try:
+            if self._starting is not None and not self._starting.done():
+                self._starting.cancel()
+                await asyncio.wait({self._starting})
             if started is not None and (why := (await self._run("stop", self._told.stop, started)).problem):
                 log.warning("%s: %s", self._rc.name, why)
             self._unsure = (await self._run("safe", self._told.safe)).problem
@@ -232,7 +232,7 @@ async def run_bounded(words: Words, env: Mapping[str, str], timeout: float, give
         code = waiting.result()
         if not code:
             return Ended("", seconds)
-        how = f"ended with exit code {code}" if code > 0 else f"ended by {signal.Signals(-code).name}"
+        how = f"ended with exit code {code}" if code > 0 else f"ended by signal {-code}"
         return Ended(how + output.said, seconds)
     finally:
         draining.cancel()
