@@ -17,6 +17,7 @@ from zscout.config.node import load_node
 from zscout.config.strict import BadInput
 from zscout.drivers import registry
 from zscout.drivers.driver import Driver
+from zscout.types import SECOND
 
 ARM = """
 from dataclasses import dataclass
@@ -121,6 +122,9 @@ def test_a_driver_is_made_with_its_options() -> None:
     assert type(arm).__name__ == "Arm"
     assert (arm.options.port, arm.options.speed, arm.options.joints) == ("/dev/arm", 1.5, (1, 2))
     assert type(made("bare")).__name__ == "Bare"
+    Path("node.toml").write_text('[[rc]]\nname = "arm/a"\ndriver = "bare"\nsettle = 2.5\n')
+    (rc,) = load_node(Path("node.toml")).rcs
+    assert rc.settle == 5 * SECOND // 2
 
 
 def test_what_comes_with_zscout_is_found_in_the_same_way() -> None:

@@ -166,7 +166,7 @@ class CommandDriver(Driver):
             ended = await self._run("health", self._told.health)
             if ended.gave_way:
                 return
-            why = ended.problem
+            why = self._unsure or ended.problem  # a start may have failed before it
         if why:
             self._lose(why)
         elif self._lost:
