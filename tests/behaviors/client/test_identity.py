@@ -20,7 +20,7 @@ from zscout.messages import MAX_COMMENT, MAX_WHO, Who
         ("-c", "python"),
         ("", "python"),
         ("/usr/lib/python3/site-packages/lab/__main__.py", "lab"),
-        ("/tmp/" + "x" * 100 + ".py", "x" * 63 + "…"),
+        ("./" + "x" * 100 + ".py", "x" * 63 + "…"),
     ],
 )
 def test_a_program_is_its_user_its_host_and_its_name_without_arguments(

@@ -56,7 +56,7 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
     plain = fleet.zscout("components")
     assert re.search(r"^Fleet test-\w+: 1 of 1 run on 1 host$", plain.stdout, re.MULTILINE)
     assert re.search(
-        r"^counter  counter  running  anvil +[0-9.]+ s +0 +0 +[0-9.]+ +\d+ MiB", plain.stdout, re.MULTILINE
+        r"^counter  counter  running  anvil +[0-9:]+ \([0-9.]+ s\) +0 +0 +[0-9.]+ +\d+ MiB", plain.stdout, re.MULTILINE
     )
 
     again = fleet.zscout("start", "counter", "--set", "period=0.1", "--set", "rc=robot/a")

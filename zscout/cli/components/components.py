@@ -110,7 +110,7 @@ class Listing:
         for one in self._all():
             use, up = self._use(one), self._uptime(one)
             where = f"{one.host or '-'} > {one.to}" if one.to is not None else one.host or "-"
-            since = "-" if up is None else terminal.span(up)
+            since = "-" if up is None else f"{terminal.clock(-up)} ({terminal.span(up)})"
             moves = str(one.moves) + (f" ({one.dead * 1000:.0f} ms)" if one.dead is not None else "")
             cores, memory = ("-", "-") if use is None else (f"{use.cpu:.2f}", f"{use.memory / 2**20:.0f} MiB")
             stands = (one.component, one.spec.kind, one.state.replace("_", " "), where, since)

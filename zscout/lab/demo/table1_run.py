@@ -20,7 +20,7 @@ from zscout.lab.demo.tables import Observed
 from zscout.lab.workload import Arrival, Workload
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.messages import Grants, LoadReport, RcmState, StateAsk, decimal_seconds
-from zscout.scheduling.reason import ended
+from zscout.scheduling.reason import ended, waits
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 START: Final = 30.0
@@ -126,7 +126,7 @@ class Table1Demo(DemoRunner):
                     needs = f"{', '.join(arc.needs)}; priority {arc.priority}"
                     self.event(f"{arc.arc} asks for {needs}", report.at)
                 case "answered" if report.detail:
-                    self.event(f"{arc.arc} waits: {report.detail}", report.at)
+                    self.event(f"{arc.arc} {waits(report.detail)}", report.at)
                 case "entered":
                     self.seen.entered(arc.arc, arc.needs, report.at)
                 case "left":
