@@ -101,7 +101,7 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
             await recorder.start()
             stack.push_async_callback(recorder.stop)
         if node.candidate:
-            candidate = Candidate(mesh, node.fleet)
+            candidate = Candidate(mesh, node.fleet, state_folder(node.fleet.name, node.host))
             candidate.start()
             stack.push_async_callback(candidate.stop)
         await components.start()

@@ -141,6 +141,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     from zscout.keyexpr import BadName
     from zscout.lab import LabError
     from zscout.mesh import MeshError
+    from zscout.messages import DOOR_CODES
 
     words = f"zscout: {_line(str(error))}"
     match error:
@@ -152,6 +153,8 @@ def explain(error: BaseException) -> tuple[int, str] | None:
             return BAD_INPUT, words
         case PlacerSilent():
             return NOBODY, words
+        case RequestRefused(code=code) if code in DOOR_CODES:
+            return BAD_INPUT, words
         case RequestRefused() | CommandRefused() | MeshError() | LabError():
             return COULD_NOT, words
     return None

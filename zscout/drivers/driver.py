@@ -12,7 +12,7 @@ from msgspec import Struct
 from zscout.drivers.holds import HoldTable
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import Declaration, Mesh, Refused, Supervisor
-from zscout.messages import Amounts, Figures, Holder, ProposedHolder
+from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder
 from zscout.types import SECOND, Ns
 
 __all__ = ["Driver", "Figures", "Holder", "ProposedHolder", "RcDirectory", "RcHandle", "Refused"]
@@ -107,6 +107,11 @@ class Driver:
     def vote(self, holders: list[ProposedHolder]) -> str:
         """Why a sharable device can't carry these holders; empty if it can, and any subset of them."""
         return ""
+
+    def parameters(self) -> list[Parameter] | None:
+        """The bandwidth parameters that it knows: who asks for another one, or for more than the bound of one, is
+        refused at once. None: it does not say, and votes on whatever comes."""
+        return None
 
     def capacity(self) -> Amounts:
         """Bounds to show to people, by bandwidth parameter."""

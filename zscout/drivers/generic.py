@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 
 from zscout.config.devices import CapacityRc, ExclusiveRc, VideoRc
 from zscout.drivers.driver import Driver, RcHandle
-from zscout.messages import Amounts, Figures, Holder, ProposedHolder, exact, exact_amounts
+from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder, exact, exact_amounts
 from zscout.scheduling.capacity import excess
 from zscout.types import SECOND
 
@@ -32,6 +32,9 @@ class ExclusiveDriver(Driver):
             return do.get("value")
         return await super().command(holder, do)
 
+    def parameters(self) -> list[Parameter] | None:
+        return []
+
 
 class CapacityDriver(ExclusiveDriver):
     """A sharable device that carries holders as long as no bandwidth parameter's sum exceeds its bound."""
@@ -52,6 +55,9 @@ class CapacityDriver(ExclusiveDriver):
 
     def capacity(self) -> Amounts:
         return {name: Decimal(repr(float(bound))) for name, bound in self._capacity.items()}
+
+    def parameters(self) -> list[Parameter]:
+        return [Parameter(name, bound=bound, default=Decimal(0)) for name, bound in self.capacity().items()]
 
 
 class VideoDriver(Driver):
@@ -88,6 +94,9 @@ class VideoDriver(Driver):
 
     def capacity(self) -> Amounts:
         return {"transmitters": Decimal(1)}
+
+    def parameters(self) -> list[Parameter]:
+        return [Parameter("transmitters", bound=Decimal(1), default=Decimal(1))]
 
     def figures(self) -> Figures:
         held = self._holders()

@@ -240,6 +240,8 @@ class ResourceController:
         self.publish()
 
     def fail(self, why: str) -> None:
+        if why != self.health:
+            log.warning("%s is lost: %s", self.name, why)
         self.health = why
         change = self.holds.fail(why, self.mesh.now())
         if change:
@@ -248,6 +250,8 @@ class ResourceController:
         self.publish()
 
     def recover(self) -> None:
+        if self.health != "ok":
+            log.info("%s is well", self.name)
         self.health = "ok"
         self.publish()
 
@@ -321,6 +325,7 @@ class ResourceController:
             duplicate_of=self.instances.duplicate_of,
             leaving=leaving,
             settle=self._settle / SECOND,
+            parameters=None if leaving else self.driver.parameters(),
         )
 
     def _on_proposal(self, query: IncomingQuery[messages.Proposal]) -> None:

@@ -19,7 +19,7 @@ from zscout.drivers import commands
 from zscout.drivers.driver import Driver, RcDirectory, RcHandle
 from zscout.mesh import Declaration, Refused, Reply
 from zscout.mesh.supervision import done_within
-from zscout.messages import Command, Done, Figures, Holder, RcState
+from zscout.messages import Command, Done, Figures, Holder, Parameter, RcState
 from zscout.types import SECOND, Grant, Ns
 
 ANSWER: Final = 0.5
@@ -99,6 +99,9 @@ class RobotDriver(Driver):
     async def close(self) -> None:
         for declared in self._declared:
             declared.close()
+
+    def parameters(self) -> list[Parameter]:
+        return []
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
         """Only the camera warms up, and not before a command switches it on."""

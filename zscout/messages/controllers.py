@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeAlias
 from msgspec import Meta
 
 from zscout.messages.base import Amounts, Elapsed, Message, Seconds
-from zscout.messages.scheduling import Holder
+from zscout.messages.scheduling import Holder, Parameters
 from zscout.types import NO_TERM, Grant, Term
 
 MAX_FIGURES = 32
@@ -102,6 +102,8 @@ class RcState(Message, frozen=True):
     """Its device is in its safe state for good: another instance may be taken at once."""
     settle: Elapsed | None = None
     """Seconds that it settles at most after `leaving`; absent: it does not know how to settle."""
+    parameters: Parameters | None = None
+    """All bandwidth parameters that it knows; None: it does not say."""
 
 
 class FrameHead(Message, frozen=True):

@@ -10,6 +10,10 @@ import msgspec
 from zscout.messages.base import NAMES_ONCE, Amounts, Elapsed, Message, Seconds, State
 from zscout.types import NO_TERM, Grant, Place, Term
 
+DOOR_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
+"""What a request is refused with that asked for a `check` and can never start."""
+MAX_KNOWN = 64
+"""Bandwidth parameters that one RC knows."""
 MAX_OTHERS = 255
 """ARCs that one hand-over takes along, beside the one that it names first."""
 
@@ -49,7 +53,15 @@ class _Wanted(Message, frozen=True):
     keep: bool = False
 
 
-class Ask(_Wanted, frozen=True, tag_field="op", tag="request"):
+class _Asked(_Wanted, frozen=True):
+    check: bool = False
+    """Refuse at once what can never start: a need that nobody knows, a parameter that its RC does not know, or more of
+    one than that ever carries. Not with a `place`."""
+    wait_for_device: bool = False
+    """With `check`: a need that nobody knows is waited for."""
+
+
+class Ask(_Asked, frozen=True, tag_field="op", tag="request"):
     """Asks for an ARC. `id` is the client's own and stays the same however often it asks; `place` is what an earlier
     RCM gave, and `waited` the seconds since it was last queued there."""
 
@@ -103,7 +115,7 @@ class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
     others: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
 
 
-class Foresee(_Wanted, frozen=True, tag_field="op", tag="foresee"):
+class Foresee(_Asked, frozen=True, tag_field="op", tag="foresee"):
     """Asks for the forecast of a request without making it. Answered with a Foresight."""
 
 
@@ -245,6 +257,8 @@ class StateAsk(Message, frozen=True):
     holds_only: bool = False
     forecast: bool = False
     """Whether to estimate when queued ARCs will start."""
+    devices_only: bool = False
+    """Whether only `rcs` is wanted."""
 
 
 class HoldView(_ArcParty, frozen=True):
@@ -280,12 +294,40 @@ class WaitView(_ArcParty, frozen=True):
     who: Who | None = None
 
 
+class Parameter(Message, frozen=True):
+    """A bandwidth parameter that an RC knows."""
+
+    name: str
+    unit: str = ""
+    bound: Decimal | None = None
+    """More than this is never carried, whoever holds the RC besides; None: any amount is."""
+    default: Decimal | None = None
+    """What an ARC books that does not say; None: nothing."""
+    unless: list[str] = []
+    """With one of these other parameters `bound` says nothing."""
+
+
+Parameters: TypeAlias = Annotated[list[Parameter], msgspec.Meta(max_length=MAX_KNOWN)]
+
+
 class RcView(Message, frozen=True):
     rc: str
     present: bool
     sharable: bool
     holders: list[str] = []
     """Ids of the ARCs that hold it."""
+    host: str = ""
+    """Of the instance that is meant; while there is none, where it was last, or is expected."""
+    reason: str = ""
+    """Why it is not present, in words."""
+    gone: Elapsed | None = None
+    """For how many seconds it has not been seen."""
+    duplicates: list[str] = []
+    """Hosts that offer it as well, and stand by."""
+    unseen: dict[str, Elapsed] = {}
+    """Hosts that offered it as well, and have not been seen for so many seconds."""
+    parameters: Parameters | None = None
+    """All bandwidth parameters that it knows; None: it does not say."""
 
 
 class StoryLine(Message, frozen=True):

@@ -140,7 +140,11 @@ class Core:
     def as_events(self, term: Term) -> tuple[list[model.Event], model.LeadTaken]:
         """The events that bring another core to the state of this one, in a term of its own."""
         state = self._state
-        joined: list[model.Event] = [model.RcJoined(rc.name, rc.sharable) for rc in state.rcs.values() if rc.present]
+        joined: list[model.Event] = [
+            model.RcJoined(rc.name, rc.sharable) if rc.present else model.RcLost(rc.name, why=rc.absence)
+            for rc in state.rcs.values()
+            if rc.present or rc.absence
+        ]
         recovered_holds = tuple(
             model.RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
             for arc in state.running.values()
@@ -199,8 +203,9 @@ class Core:
                         self._end_hold(self._state.running[arc], Outcome.LOST, Reason(ReasonCode.RC_ENDED, (rc,)))
                 if rules_changed:
                     self._votes.forget_rc(rc)
-            case model.RcLost(rc, reason):
-                self._lose_rc(rc, reason)
+            case model.RcLost(rc, reason, why):
+                self._lose_rc(rc, why or reason)
+                self._state.rc(rc).absence = why
             case model.ClientLost(client, reason):
                 for lost in self.arcs_of(client):
                     self._end_request(lost, Outcome.CLIENT_LOST, Reason(ReasonCode.CLIENT_LOST, detail=reason))

@@ -17,7 +17,7 @@ from typing import Final, TypeAlias
 
 from zscout.keyexpr import check_need, is_pattern, matcher
 from zscout.messages import Who
-from zscout.scheduling.reason import Party, Reason
+from zscout.scheduling.reason import SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
 QUANTUM: Ns = SECOND
@@ -238,6 +238,8 @@ class Rc:
     bit: int
     present: bool = False
     sharable: bool = False
+    absence: str = ""
+    """While it is absent: why, if that is known."""
     holders: dict[ArcId, Arc] = field(default_factory=dict)
     demand: int = 0
     """How many of the queued ARCs name it."""
@@ -247,6 +249,13 @@ class Rc:
     def non_preemptible_holders(self, arc: Arc, now: Ns) -> list[Arc]:
         """Its holders that are not preempted for `arc`."""
         return [holder for holder in self.holders.values() if not holder.preemptible_by(arc, now)]
+
+
+def absences(rcs: Iterable[Rc]) -> str:
+    """Why these RCs are absent, as far as that is known, in words."""
+    known = [f"{rc.name}: {rc.absence}" for rc in rcs if rc.absence]
+    more = f"; {len(known) - SHOWN} more" if len(known) > SHOWN else ""
+    return "; ".join(known[:SHOWN]) + more
 
 
 def union(masks: Iterable[int]) -> int:
@@ -318,10 +327,12 @@ class RcReported:
 
 @dataclass(frozen=True, slots=True)
 class RcLost:
-    """An RC is gone, or can't carry its holders any longer."""
+    """An RC is gone, or can't carry its holders any longer; `why`, if that is known, stands in the reason of whoever
+    waits for it."""
 
     rc: RcName
     reason: str = "it left the mesh"
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)

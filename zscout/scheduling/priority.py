@@ -47,7 +47,7 @@ from operator import attrgetter
 from typing import Final, Literal, TypeAlias
 
 from zscout.config.scheduling_policy import StrategyName
-from zscout.scheduling.model import Arc, ArcState, Rank, Rc, union
+from zscout.scheduling.model import Arc, ArcState, Rank, Rc, absences, union
 from zscout.scheduling.patterns import bind, no_match
 from zscout.scheduling.reason import SHOWN, SHOWN_CHOICES, Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible, Reservations
@@ -100,8 +100,9 @@ class AdmissionCheck:
         several that are held, one that is likely to stay held for long: that saves checks."""
         for rc in self.arc.rcs:
             if not rc.present:
-                absent = [rc.name for rc in self.arc.rcs if not rc.present]
-                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, absent))
+                absent = [rc for rc in self.arc.rcs if not rc.present]
+                why = rc.absence if len(absent) == 1 else absences(absent)
+                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, [one.name for one in absent], why))
         lasting: tuple[int, float, int] | None = None
         for number, (rc, holder) in enumerate(self.non_preemptible):
             if not off_limits or not rc.bit & off_limits:

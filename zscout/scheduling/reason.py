@@ -19,9 +19,9 @@ SHOWN_CHOICES = 8
 class ReasonCode(StrEnum):
     # An ARC waits:
     ABSENT = "absent"
-    """`rcs` are not on the mesh."""
+    """`rcs` are not on the mesh, or can't carry anybody; `detail` says why, as far as that is known."""
     NO_MATCH = "no_match"
-    """No RC is left for the patterns in `rcs`."""
+    """No RC is left for the patterns in `rcs`; `detail` says why RCs that would do are lost."""
     HELD = "held"
     """`rcs` are held by `by`, one each, who are not preempted for it; of a pattern all its choices are told."""
     VETOED = "vetoed"
@@ -136,9 +136,9 @@ def ended(outcome: str, reason: str) -> str:
     return reason if reason.startswith(word) else f"{word}: {reason}" if reason else word
 
 
-def of_rcs(code: ReasonCode, rcs: Sequence[RcName]) -> Reason:
+def of_rcs(code: ReasonCode, rcs: Sequence[RcName], detail: str = "") -> Reason:
     """A reason that concerns all of `rcs`."""
-    return Reason(code, tuple(rcs[:SHOWN]), number=len(rcs))
+    return Reason(code, tuple(rcs[:SHOWN]), number=len(rcs), detail=detail)
 
 
 def _last(party: Party, until: Until | None) -> str:
@@ -189,9 +189,17 @@ def _listed(reason: Reason) -> str:
     return ", ".join(reason.rcs) + more
 
 
+def _because(reason: Reason) -> str:
+    return f" ({reason.detail})" if reason.detail else ""
+
+
 _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
-    ReasonCode.ABSENT: lambda one: f"{_listed(one)} not on the mesh",
-    ReasonCode.NO_MATCH: lambda one: f"no RC on the mesh is left for {_listed(one)}",
+    ReasonCode.ABSENT: lambda one: (
+        f"{one.rcs[0]} is lost: {one.detail}"
+        if one.detail and one.number == 1
+        else f"{_listed(one)} not on the mesh{_because(one)}"
+    ),
+    ReasonCode.NO_MATCH: lambda one: f"no RC on the mesh is left for {_listed(one)}{_because(one)}",
     ReasonCode.SILENT: lambda one: f"{_listed(one)} does not answer",
     ReasonCode.UNCONFIRMED: lambda one: f"{_listed(one)} did not confirm the grant",
     ReasonCode.CLAIMED: lambda one: f"{one.detail} claims it as well",

@@ -217,7 +217,7 @@ class SchedulerState:
 
     def join(self, name: RcName, *, sharable: bool) -> None:
         rc = self.rc(name)
-        rc.present, rc.sharable = True, sharable
+        rc.present, rc.sharable, rc.absence = True, sharable, ""
         self.present |= rc.bit
         self.sharable = self.sharable | rc.bit if sharable else self.sharable & ~rc.bit
         self.index.freed |= rc.bit

@@ -164,7 +164,7 @@ def test_an_rc_that_comes_is_granted_and_one_that_goes_ends_the_whole_gang() -> 
         await until(lambda: client.notices[-1].state == "running")
         # Its token goes; another instance comes.
         robots[1].token.close()
-        await until(lambda: client.notices[-1].reason == "robot/b was lost: it left the mesh")
+        await until(lambda: client.notices[-1].reason == "robot/b was lost: it is gone from devices")
         fleet.rc("robot/b", instance="i2")
         await until(lambda: client.notices[-1].state == "running")
         assert client.notices[-1].place == place

@@ -215,12 +215,20 @@ def hold(
     direct: bool = False,
     timeout: float | None = None,
     comment: str = "",
+    wait_for_device: bool | None = None,
 ) -> Attempt:
     """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's; the
-    `comment` is shown to others.
+    `comment` is shown to others; `wait_for_device` as `Client.request` has it.
 
     Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
-    how = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "direct": direct, "comment": comment}
+    how: dict[str, Any] = {
+        "priority": priority,
+        "min_runtime": min_runtime,
+        "keep": keep,
+        "direct": direct,
+        "comment": comment,
+    }
+    how["wait_for_device"] = wait_for_device
     return Attempt(client, {"name": name, "needs": needs} | how, timeout=timeout)
 
 
@@ -234,10 +242,18 @@ async def holds(
     keep: bool = True,
     direct: bool = False,
     comment: str = "",
+    wait_for_device: bool | None = None,
 ) -> AsyncIterator[Attempt]:
     """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
     without `keep` has had its time."""
-    how = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "direct": direct, "comment": comment}
+    how: dict[str, Any] = {
+        "priority": priority,
+        "min_runtime": min_runtime,
+        "keep": keep,
+        "direct": direct,
+        "comment": comment,
+    }
+    how["wait_for_device"] = wait_for_device
     attempt = Attempt(client, {"name": name, "needs": needs} | how, again=True)
     yield attempt
     while attempt.goes_on:

@@ -208,6 +208,7 @@ class Lab:
         timeout: float | None = None,
         interrupt: bool = True,
         comment: str = "",
+        wait_for_device: bool | None = None,
     ) -> AbstractContextManager[BlockingHeld, None]:
         """When entered it waits for all of `needs`, at most `timeout` seconds; when left it gives them back. Others
         are shown the `comment`.
@@ -217,10 +218,13 @@ class Lab:
         taken away before, `Revoked` is raised in a body in the main thread, unless `interrupt` is false: its `outcome`
         is `completed` where it had its time.
 
+        What can never start is refused; with `wait_for_device`, not for a need that nobody knows.
+
         Entering raises TimeoutError, RequestRefused, Revoked where others ended the request, and NoRcm where none is
         seen within 3 s. Leaving raises Revoked where the hold was taken away and the body has not been told."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
         how["comment"] = comment
+        how["wait_for_device"] = wait_for_device
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
     def _stop(self) -> None:

@@ -78,6 +78,8 @@ class Client(MovableClient):
         self._direct: dict[Grant, DirectHold] = {}
         """Holds of direct requests, until their programs are gone."""
         self._store.watchers.append(self._look_at_direct)
+        self.waits_for_devices = False
+        """Whether its requests wait for what nobody knows, instead of being refused, if they do not say."""
 
     @classmethod
     def connect(
@@ -218,6 +220,7 @@ class Client(MovableClient):
         estimate: bool = False,
         direct: bool = False,
         comment: str = "",
+        wait_for_device: bool | None = None,
     ) -> OpenArc:
         """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
 
@@ -226,8 +229,10 @@ class Client(MovableClient):
 
         A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
         more. With `estimate` its notices say when it will start. `direct`: its program touches devices past their RCs;
-        see `direct_hold`. The `comment` is shown to others. Raises RequestRefused where the request can't be taken as
-        it is, ValueError for too long a comment.
+        see `direct_hold`. The `comment` is shown to others. What can never start is refused at once: a parameter that
+        its RC does not know, more of one than that ever carries, and, unless it is to `wait_for_device` (default:
+        `waits_for_devices`), a need that nobody knows. Raises RequestRefused where the request can't be taken as it is,
+        ValueError for too long a comment.
 
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)
@@ -237,6 +242,7 @@ class Client(MovableClient):
             seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
             arc.who = who
+            arc.check, arc.wait_for_device = True, self._waits(wait_for_device)
             self._store.add(arc)
         try:
             await self._rcm.submit(arc)
@@ -251,6 +257,9 @@ class Client(MovableClient):
     def _protected(self, min_runtime: float | Decimal | None) -> Decimal:
         """In seconds; what nobody gave is the fleet's."""
         return Decimal(self.fleet.min_runtime) / SECOND if min_runtime is None else Decimal(str(min_runtime))
+
+    def _waits(self, wait_for_device: bool | None) -> bool:
+        return self.waits_for_devices if wait_for_device is None else wait_for_device
 
     async def changed(self, arc: OpenArc) -> None:
         """Waits until there is news of `arc`."""
@@ -469,10 +478,14 @@ class Client(MovableClient):
         priority: int = 0,
         min_runtime: float | Decimal | None = None,
         keep: bool = True,
+        wait_for_device: bool | None = None,
     ) -> Foresight | None:
         """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
         seconds = self._protected(min_runtime)
-        asked = messages.Foresee(new_instance(), name, amounts(needs), priority, seconds, keep)
+        waits, wanted = self._waits(wait_for_device), amounts(needs)
+        asked = messages.Foresee(
+            new_instance(), name, wanted, priority, seconds, keep, check=True, wait_for_device=waits
+        )
         reply = await self.mesh.ask_one(self._rcm.key, asked, Foresight, timeout=QUERY_TIMEOUT)
         if reply is not None and reply.problem is not None:
             raise RequestRefused(reply.problem)

@@ -69,6 +69,10 @@ class OpenArc:
     """Whether its program touches devices past their RCs (`direct.py`)."""
     who: Who | None = None
     """Who asks, as others are told."""
+    check: bool = False
+    """Whether it is to be refused at once if it can never start."""
+    wait_for_device: bool = False
+    """Whether it waits for an RC that nobody knows all the same."""
     state: str = "asking"
     reason: str = ""
     why: ReasonInfo | None = None
@@ -242,7 +246,15 @@ class OpenArc:
         grant, unconfirmed = self.unconfirmed or (self.grant or self.unserved, [])
         asked = self._as_asked(now, grant)
         unserved = self.unserved is not None and grant == self.unserved
-        return Ask(**asked, estimate=self.estimate, unconfirmed=unconfirmed, reachable=reachable, unserved=unserved)
+        return Ask(
+            **asked,
+            estimate=self.estimate,
+            unconfirmed=unconfirmed,
+            reachable=reachable,
+            unserved=unserved,
+            check=self.check and self.place is None,
+            wait_for_device=self.wait_for_device and self.place is None,
+        )
 
     def open_request(self, now: Ns) -> OpenRequest:
         """As it is reported to an RCM that takes the lead."""

@@ -148,6 +148,8 @@ class ComponentLifecycle:
             finally:
                 client = self._client = await connecting
                 client.who = replace(client.who or Who(), command=bounded(f"component {job.start.component}"))
+                # Whoever started it may have started it before its devices.
+                client.waits_for_devices = True
             made = self._component = self._make(kind)
         except (BadKind, MeshError) as error:
             return EndReport("failed", str(error), bad_params=isinstance(error, BadParams))

@@ -215,5 +215,6 @@ class Devices:
     def _on_state(self, key: str, state: RcState) -> None:
         with suppress(BadName):
             named = any(token.name == state.rc for token in self._fleet_view.tokens(Role.RC))
-            if named and key == self._mesh.keys.rc_state(state.rc):
+            # One that stands by says nothing of the device.
+            if named and not state.duplicate_of and key == self._mesh.keys.rc_state(state.rc):
                 self._states[state.rc] = state

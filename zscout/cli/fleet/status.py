@@ -12,6 +12,7 @@ import click
 from msgspec import structs
 
 from zscout.cli import common, completion
+from zscout.cli.device_words import remarks
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.selection import Selection
 from zscout.cli.fleet.watching import Overview, show
@@ -41,8 +42,10 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
 
     The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
     where they are not there; other hosts that died only with --watch. A device that says that something is wrong with
-    it is shown with its words, and counts as lost until it is well. --watch refreshes once a second; in a pipe it
-    prints a new block when something else than a load, a time or a figure has changed. Exit code 3: no RCM.
+    it is shown with its words, and counts as lost until it is well; one that was seen within a day, or that the fleet
+    file expects, with why it is gone; one that several hosts offer, with those that stand by. --watch refreshes once a
+    second; in a pipe it prints a new block when something else than a load, a time or a figure has changed. Exit code
+    3: no RCM.
 
     \b
     Examples:
@@ -104,7 +107,10 @@ class Standing:
         return Overview(headline, [*tables, self._hosts(chosen), self._devices(chosen)], alarm=self.state is None)
 
     def _homes(self) -> dict[str, str]:
-        return {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
+        """By RC: the host of the instance that is meant; of an RCM that does not say, one that offers it."""
+        offered = {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
+        views = self.state.rcs if self.state is not None else []
+        return offered | {view.rc: view.host for view in views if view.host}
 
     def _rcs(self, state: RcmState) -> Table:
         homes = self._homes()
@@ -159,11 +165,18 @@ class Standing:
         return (f"{words}, cordoned", "yellow") if name in self.fleet_view.placer.cordoned else (words, style)
 
     def _devices(self, chosen: Selection) -> Table:
-        """Those that are not well; with `every` also those that report figures."""
-        known = [one for one in self.devices.known().values() if chosen.shows(one.rc)]
-        shown = [one for one in known if one.health != "ok" or (self.every and one.figures)]
-        rows = [(one.rc, one.health, figures_text(one.figures)) for one in shown]
-        styles = ["" if one.health == "ok" else "red" for one in shown]
+        """Those of which there is something to say; with `every` also those that report figures."""
+        known = self.devices.known()
+        said = {view.rc: list(remarks(view)) for view in (self.state.rcs if self.state is not None else ())}
+        rows, styles = [], []
+        for rc in filter(chosen.shows, sorted(known.keys() | said.keys())):
+            device, words = known.get(rc), said.get(rc, [])
+            figures = device.figures if device is not None else {}
+            if device is not None and device.health != "ok":
+                words = [device.health, *(one for one in words if one != device.health)]
+            if words or (self.every and figures):
+                rows.append((rc, "; ".join(words) or "ok", figures_text(figures)))
+                styles.append("red" if words else "")
         return Table("Devices", ("RC", "HEALTH", "FIGURES"), rows, styles)
 
     def as_object(self) -> dict[str, Any]:

@@ -175,5 +175,7 @@ def lasting(value: Any) -> Any:
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.asdict(value)
     if isinstance(value, dict):
-        return {key: lasting(item) for key, item in value.items() if key not in PASSING}
+        known = {key: item for key, item in value.items() if key not in PASSING}
+        # By host, for how long.
+        return {key: sorted(item) if key == "unseen" else lasting(item) for key, item in known.items()}
     return [lasting(item) for item in value] if isinstance(value, list) else value

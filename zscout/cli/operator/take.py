@@ -42,7 +42,7 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: s
 
     Says who will be preempted and asks, on stderr; without a terminal it needs --yes. Then it waits, holds and runs a
     COMMAND as `zscout request` does, with the same exit codes; 1 also where the question was not answered with y. A
-    NEED is written as there.
+    NEED is written as there, and refused for the same reasons (2).
 
     \b
     Examples:
@@ -54,6 +54,8 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: s
     terms = {"priority": priority, "keep": not no_keep, "comment": reason or comment}
     wanted = gather(needs, name, DEFAULT_NAMES[1], **terms, **rest)
     async with common.connected("take") as client:
+        # What can never start is refused before anybody is asked about anything.
+        await client.foresee(wanted.name, wanted.needs, **wanted.terms())
         await _agree(client, wanted, yes=yes)
         return await carry_out(client, wanted)
 

@@ -175,6 +175,7 @@ class HoldOptions:
     again: bool
     as_json: bool
     comment: str = ""
+    wait_for_device: bool = False
 
     def asked_by(self, who: Who | None) -> Who:
         """Who asks, of whom only zscout's own command is known yet: for which command, or under which name."""
@@ -184,7 +185,8 @@ class HoldOptions:
 
     def terms(self) -> dict[str, Any]:
         """How its needs are to be held."""
-        return {"priority": self.priority, "min_runtime": self.min_runtime, "keep": self.keep}
+        terms = {"priority": self.priority, "min_runtime": self.min_runtime, "keep": self.keep}
+        return terms | {"wait_for_device": self.wait_for_device}
 
 
 def hold_options(command: F) -> F:
@@ -199,6 +201,7 @@ def hold_options(command: F) -> F:
             shell_complete=completion.needs,
         ),
         json_option("Print JSON lines, one for each event."),
+        click.option("--wait-for-device", is_flag=True, help="Wait for a device that nobody knows, too."),
         click.option(
             "--again", is_flag=True, help="Ask again and run the command again, when it was ended for others."
         ),

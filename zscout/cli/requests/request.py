@@ -79,6 +79,7 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
       124  its time was over: somebody waited after the minimum runtime, or --release-after
       126  it can't be executed           127  there is no such command
       1    not granted; without a command also: taken away    3  no RCM
+      2    it can never start: a device that nobody knows, a parameter that it does not know, or too much of one
 
     With a COMMAND all lines of zscout go to stderr.
 
@@ -386,6 +387,7 @@ class Report(LiveLine):
         met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority) for hold in rc.holds)}" for rc in in_way]
+        holders += [f"{rc.rc}: {rc.lost}" for need in needs if need.rc for rc in need.rcs if rc.lost]
         words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc.told) / SECOND))}"
         ahead = f"{arc.ahead} ahead" if arc.ahead else ""
         waited = self._since(arc)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zscout.cli import common
+from zscout.cli.device_words import absence
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import HoldView, RcmState, ReasonInfo, ReasonParty, WaitView, Who
 from zscout.scheduling.reason import Party, Reason, ReasonCode, named
@@ -22,6 +23,8 @@ class RcContention:
     present: bool
     sharable: bool
     holds: list[HoldView]
+    lost: str = ""
+    """Why it is not present, in words, if that is known."""
 
 
 @dataclass(slots=True)
@@ -69,7 +72,9 @@ def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> lis
     def seen(rc: str) -> RcContention:
         view = views.get(rc)
         theirs = [hold for hold in holds if rc in hold.needs]
-        return RcContention(rc, view is not None and view.present, view is not None and view.sharable, theirs)
+        if view is None:
+            return RcContention(rc, False, False, theirs)
+        return RcContention(rc, view.present, view.sharable, theirs, absence(view))
 
     found = []
     for need in sorted(needs):

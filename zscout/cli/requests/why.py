@@ -75,13 +75,14 @@ async def _described(client: Client, view: View, state: RcmState) -> dict[str, A
 
 
 async def _health(client: Client, need: NeedContention) -> str | None:
-    """Why an RC that counts as lost does so, in its own words; None where it is well or does not answer."""
+    """Why an RC that counts as lost does so, in its own words, or in the RCM's; None where nobody knows."""
     if need.rc is None or need.present:
         return None
+    lost = need.rcs[0].lost or None
     mesh = client.mesh
     reply = await mesh.ask_one(mesh.keys.rc_state(need.rc), RcAsk(), RcState, timeout=ASK_RC)
     state = None if reply is None else reply.message
-    return None if state is None or state.health == "ok" else state.health
+    return lost if state is None or state.health == "ok" else state.health
 
 
 def _full(view: View) -> str:

@@ -385,6 +385,8 @@ class Simulation:
 
     async def _client(self, name: str, mesh: MemoryMesh) -> None:
         client = self.programs[name] = Client(mesh, self.fleet).start()
+        # A leader that has just begun may know nothing of an RC that is down.
+        client.waits_for_devices = True
         busy = self.busy[name] = set()
         self.watch(name, client)
         await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))

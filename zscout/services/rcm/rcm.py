@@ -42,12 +42,14 @@ from zscout.scheduling.model import (
     RecoveredHold,
     Released,
     Requested,
+    Status,
     Tick,
     Vote,
     VoteOverdue,
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.services.rcm.registry import RequestRegistry, reason_info, request_id
@@ -75,16 +77,23 @@ class Rcm:
         term: Term,
         on_newer: Callable[[Term, str | None], object],
         on_failure: Callable[[Exception], object],
+        inventory: Inventory | None = None,
     ) -> None:
+        """`inventory`: that of its candidate, if it has one."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         self.core = Core(STRATEGIES[fleet.strategy](), fleet.scheduling)
         supervisor, receive = self.supervisor, self._receive
         self.registry = RequestRegistry(mesh, self.core, term, supervisor)
-        self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer)
+        self._own_inventory = inventory is None
+        self.inventory = inventory or Inventory(mesh, fleet)
+        devices = self.inventory.devices
+        self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer, devices)
         self.membership.on_requests = self._on_requests
         self.membership.on_named = lambda rc: self._publish([], [rc])
-        self.requests = RequestHandler(mesh, fleet, self.core, self.registry, self.membership, supervisor, receive)
+        self.requests = RequestHandler(
+            mesh, fleet, self.core, self.registry, self.membership, devices, supervisor, receive
+        )
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
         self.seq = 0
@@ -108,6 +117,8 @@ class Rcm:
     def start(self, recovered: RecoveredState) -> None:
         """Begins to lead. Everything that is declared here is declared by the leader only."""
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
+        if self._own_inventory:
+            self.inventory.start(self.supervisor)
         joined = self.membership.join(recovered.rcs, recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
             self.registry.give_up(arc, Outcome.RELEASED)
@@ -135,6 +146,8 @@ class Rcm:
         for declared in reversed(self._declared):
             declared.close()
         self.supervisor.cancel()
+        if self._own_inventory:
+            self.inventory.stop()
         self.registry.close()
         self.requests.close()
         self._grants.close()
@@ -316,6 +329,10 @@ class Rcm:
 
     def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
         asked, now = query.message, self.mesh.now()
+        if asked.devices_only:
+            rcs = self._devices(self.core.status(0), now)
+            query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs))
+            return
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
         instances = self.membership.named(sorted({rc for hold in holds for rc in hold.needs}))
@@ -325,14 +342,30 @@ class Rcm:
             state = replace(
                 state,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
-                rcs=[
-                    messages.RcView(rc.name, rc.present, rc.sharable, [*map(request_id, rc.holders)])
-                    for rc in status.rcs
-                ],
+                rcs=self._devices(status, now),
                 story=self.registry.story(asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
             )
         query.answer(state)
+
+    def _devices(self, status: Status, now: Ns) -> list[messages.RcView]:
+        """All RCs that are there or expected. What somebody asks for and nobody ever offered is not among them."""
+        known = {rc.name: rc for rc in status.rcs}
+        devices = self.inventory.devices
+        devices.forget_old(now)
+        named = self.membership.named(known)
+        there = {rc.name for rc in status.rcs if rc.present}
+        views = []
+        for name in sorted(there | devices.names):
+            rc, state = known.get(name), self.membership.reported(name)
+            view = messages.RcView(name, present=False, sharable=False)
+            if rc is not None:
+                view = messages.RcView(name, rc.present, rc.sharable, [*map(request_id, rc.holders)])
+            if state is not None:
+                reason = "" if state.health == "ok" else state.health[:MAX_REASON]
+                view = replace(view, sharable=state.sharable, reason=reason, parameters=state.parameters)
+            views.append(devices.view(view, now, named[name][1] if name in named else None))
+        return views
 
 
 # The core's values as messages

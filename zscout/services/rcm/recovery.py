@@ -8,7 +8,7 @@ more is not carried on: it gave it up while nobody led."""
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from operator import attrgetter
@@ -19,7 +19,7 @@ from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of,
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
 from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
 from zscout.services.rcm.registry import arc_id, request_id
-from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, Need, Ns, RcName
+from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, RcName
 
 log = logging.getLogger(__name__)
 
@@ -48,10 +48,17 @@ def aged(state: RcState, by: Ns) -> RcState:
     return replace(state, holders=[replace(one, remaining=one.remaining - by / SECOND) for one in state.holders])
 
 
-def take_over(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:
-    """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided."""
-    # Of two instances of one RC the one with the newest hold is meant.
+def take_over(
+    states: Iterable[RcState],
+    clients: Collection[ClientRequests],
+    now: Ns,
+    home_of: Callable[[RcName], HostName | None] = lambda _: None,
+) -> RecoveredState:
+    """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided.
+    `home_of`: the host at which the fleet file has an RC."""
+    # Of two instances of one RC the one with the newest hold is meant, else the one at home.
     by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
+    by_host.sort(key=lambda state: state.host == home_of(state.rc))
     answered = {state.rc: state for state in sorted(by_host, key=_newest_grant)}
     pending = {rc for rc in answered if not gangs_of(rc, answered) <= answered.keys()}
     result = recover([state for rc, state in answered.items() if rc not in pending], clients, now)

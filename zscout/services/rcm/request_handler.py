@@ -22,6 +22,7 @@ from zscout.messages import (
     HandOver,
     Notice,
     Operation,
+    Parameters,
     Release,
     absurd,
     duration,
@@ -45,6 +46,8 @@ from zscout.scheduling.model import (
     Unconfirmed,
 )
 from zscout.scheduling.reason import Party, named
+from zscout.services.rcm.devices import ExpectedDevices
+from zscout.services.rcm.door import check_door
 from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.registry import RequestRegistry, arc_id, party_info, reason_info, request_id
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
@@ -68,10 +71,13 @@ class RequestHandler:
         core: Core,
         registry: RequestRegistry,
         membership: Membership,
+        devices: ExpectedDevices,
         supervisor: Supervisor,
         emit: Callable[..., None],
     ) -> None:
-        self.mesh, self.limits, self.core = mesh, fleet.limits, core
+        self.mesh, self.limits, self.core, self._devices = mesh, fleet.limits, core, devices
+        self._knows_all = mesh.now() + fleet.timing.hold_lease
+        """From when on an RC that was not seen yet is none of this fleet."""
         self._first_answer_timeout = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
         self._registry, self._membership, self._supervisor = registry, membership, supervisor
         self._flush_guarded = supervisor.guard(self.flush)
@@ -146,6 +152,8 @@ class RequestHandler:
         else:
             self._check_room(str(sender))
             request = admit(ask, sender, arc, self.core, self.limits)
+            if ask.check and ask.place is None and ask.grant is None:
+                self._check_door(ask)
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
             self._registry.record(arc, f"asked for {', '.join(sorted(ask.needs))} at priority {ask.priority}")
             since = None if ask.place is None else self.mesh.now() - round(ask.waited * SECOND)
@@ -155,6 +163,16 @@ class RequestHandler:
                 query.answer(self._standing(arc, ask))
             else:
                 self._gather(query, arc, Requested(request, ask.place, since))
+
+    def _check_door(self, ask: Ask | Foresee) -> None:
+        """Raises Refused for what can never start."""
+        known = {*self._devices.names, *filter(self._membership.is_known, ask.needs)}
+        waits = ask.wait_for_device or self.mesh.now() < self._knows_all
+        check_door(ask.needs, known, self._parameters, waits=waits)
+
+    def _parameters(self, rc: RcName) -> Parameters | None:
+        state = self._membership.reported(rc)
+        return state.parameters if state is not None else self._devices.parameters(rc)
 
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
         """Whether its client believes in a grant of an earlier RCM of which this one does not know."""
@@ -218,6 +236,8 @@ class RequestHandler:
             raise Refused("bad_request", f"{asked.id} is a request already; ask how it stands")
         now = self.mesh.now()
         request = admit(asked, sender, arc, self.core, self.limits)
+        if asked.check:
+            self._check_door(asked)
         expected = forecast(self.core, now, request)
         start = expected.starts.get(arc)
         victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]
