@@ -156,9 +156,10 @@ class Reservations:
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
         band = self._state.band
-        if band(arc.priority) > band(reservation.arc.priority):
-            return False
-        return self._state.over_by(arc, reservation.arc) > reservation.start
+        return (
+            band(arc.priority) <= band(reservation.arc.priority)
+            and self._state.now + arc.request.min_runtime > reservation.start
+        )
 
     def changed(self, earlier: Reservations) -> int:
         """Bits of the RCs at which the reservations differ from the `earlier` ones."""

@@ -6,7 +6,6 @@ Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an
 from __future__ import annotations
 
 import heapq
-import math
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -387,12 +386,6 @@ class SchedulerState:
         """When a hold from `start` on ends at the latest."""
         limit = self.policy.max_runtime
         return None if limit is None else start + limit
-
-    def over_by(self, arc: Arc, other: Arc) -> float:
-        """When `other` could take what `arc` would hold from now on; infinite where it may keep it."""
-        if arc.request.keep and arc.priority > other.priority:
-            return math.inf if (last := self.longest(self.now)) is None else last
-        return self.now + arc.request.min_runtime
 
     def protected_below(self, arc: Arc) -> int | None:
         """Below which priority nobody takes a hold that `arc` is granted now, before its minimum runtime is
