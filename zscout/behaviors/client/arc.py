@@ -167,7 +167,7 @@ class Attempt:
         if direct is not None:
             direct.end()
             await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
-            log.error(
+            log.warning(
                 "%s clears up for too long after its hold, and is interrupted: the next holder begins", held.arc.name
             )
             self._cancel(body)
