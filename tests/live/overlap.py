@@ -31,7 +31,6 @@ from typing import Any, Final, Literal, NamedTuple, Self
 
 from tests.chaos import net
 from tests.chaos.net import Net
-from tests.hang import HANG
 from zscout.behaviors.client.direct import DEFAULT_SETTLE
 from zscout.config.fleet import default_fleet
 from zscout.mesh import clock
@@ -42,6 +41,8 @@ How = Literal["preempted", "cut off", "killed", "frozen"]
 RC: Final = "robot/x"
 LEADER, DEVICE, LEFT, RIGHT = "lead", "device", "left", "right"
 LOOK: Final = 0.02
+WITHIN: Final = 600.0
+"""Seconds after which what is waited for counts as what never comes."""
 FOREVER: Final = "1h"
 SLACK: Final = 2.0
 """Seconds beside the rule: from a client's question whether it has settled to its program's first line, on a machine
@@ -196,19 +197,22 @@ class Rounds:
         for number, how in enumerate(hows, start=1):
             priority += how == "preempted"
             following = self.request(number, priority)
-            if how == "preempted":
-                self._until("it preempts", lambda one=following: one.said.keys() & {"settling", "granted"})
-                ended = min(at for event, at in following.said.items() if event in ("settling", "granted"))
-            else:
-                self._until("it waits", lambda one=following: "waits" in one.said)
-                ended = clock.now()
-                self._strike(how, former)
-            self._until("the next program runs", lambda number=number: number in self.programs.begun())
-            taken.append(Taken(how, ended, self.programs.begun()[number]))
+            taken.append(self._follow(how, former, following, number))
             tell(taken[-1])
             self._mend(former)
             former = following
         return taken
+
+    def _follow(self, how: How, former: Request, following: Request, number: int) -> Taken:
+        if how == "preempted":
+            self._until("it preempts", lambda: following.said.keys() & {"settling", "granted"})
+            ended = min(at for event, at in following.said.items() if event in ("settling", "granted"))
+        else:
+            self._until("it waits", lambda: "waits" in following.said)
+            ended = clock.now()
+            self._strike(how, former)
+        self._until("the next program runs", lambda: number in self.programs.begun())
+        return Taken(how, ended, self.programs.begun()[number])
 
     def _strike(self, how: How, request: Request) -> None:
         if how == "cut off":
@@ -225,10 +229,10 @@ class Rounds:
         self._until("the former request has ended", lambda: request.process.poll() is not None)
 
     def _until(self, what: str, done: Callable[[], object]) -> None:
-        deadline = time.monotonic() + HANG
+        deadline = time.monotonic() + WITHIN
         while not done():
             if time.monotonic() > deadline:
-                raise TimeoutError(f"not within {HANG:g} s: {what}; see the logs in {self.folder}")
+                raise TimeoutError(f"not within {WITHIN:g} s: {what}; see the logs in {self.folder}")
             time.sleep(LOOK)
 
 
@@ -241,8 +245,9 @@ def main() -> int:
     options.add_argument("--seed", type=int, default=1, help="their order (1)")
     options.add_argument("--slack", type=float, default=SLACK, help=f"seconds beside the rule ({SLACK:g})")
     asked = options.parse_args()
-    hows: list[How] = [*["cut off"] * asked.cut, *["killed"] * asked.kill, *["frozen"] * asked.freeze]
-    hows += ["preempted"] * (asked.times - len(hows))
+    faults: dict[How, int] = {"cut off": asked.cut, "killed": asked.kill, "frozen": asked.freeze}
+    faults["preempted"] = asked.times - sum(faults.values())
+    hows = [how for how, times in faults.items() for _ in range(times)]
     random.Random(asked.seed).shuffle(hows)  # noqa: S311
     try:
         net.check()
