@@ -73,7 +73,7 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
         stack.callback(token.close)
         lease = node.fleet.timing.hold_lease / SECOND
-        kept = state_folder(node.fleet.name, me.host, node.state) if node.rcs else None
+        kept = state_folder(node.fleet.name, me.host, node.state) if node.rcs or node.candidate else None
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
             stack.enter_context(only_here(node.fleet.name, me.host, spec.name))
@@ -101,7 +101,7 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
             await recorder.start()
             stack.push_async_callback(recorder.stop)
         if node.candidate:
-            candidate = Candidate(mesh, node.fleet, state_folder(node.fleet.name, node.host))
+            candidate = Candidate(mesh, node.fleet, kept)
             candidate.start()
             stack.push_async_callback(candidate.stop)
         await components.start()

@@ -160,7 +160,7 @@ def test_a_failing_device_ends_the_whole_gang_which_waits_for_it(tmp_path: Path)
                 assert "smoke comes out of it" in arc.ending.reason
                 assert bench.calls == ["begin gang", "safe"]
                 waits = await lab.state(client, lambda state: [wait.arc for wait in state.queue] == ["gang"])
-                assert waits.queue[0].reason == "robot/bench not on the mesh"
+                assert waits.queue[0].reason == "robot/bench is lost: smoke comes out of it"
                 await lab.held_by(client, "robot/a")
                 for name in ("robot/a", "robot/bench"):
                     assert await answer(client.command(name, grant, ECHO)) == "ended"

@@ -110,7 +110,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     first, second = fleet.holder("first", F1), fleet.holder("second", ANY)
     radio = fleet.holder("loud", "radio/*:rate=8")
     waiting = [
-        fleet.start("request", ANY, "robot/a", "video/*", "--name", "next"),
+        fleet.start("request", ANY, "robot/a", "video/*", "--name", "next", "--wait-for-device"),
         fleet.start("request", "radio/*:rate=5", "robot/*", "--name", "quiet"),
     ]
     for process, name in zip(waiting, ("next", "quiet"), strict=True):

@@ -75,7 +75,7 @@ def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> 
 
 
 def test_a_start_that_nobody_can_foretell_is_said_to_be_so(fleet: CliFleet) -> None:
-    never = ("request", "robot/nowhere", "--name", "never", "--timeout", "1")
+    never = ("request", "robot/nowhere", "--wait-for-device", "--name", "never", "--timeout", "1")
     line, _ = out_of(fleet.start(*never)).read().splitlines()
     assert line == "never waits: robot/nowhere not on the mesh; no start can be foretold"
     waits, _ = events(fleet.zscout(*never, "--json").stdout)
@@ -281,6 +281,20 @@ def test_what_can_not_run_is_said_before_anybody_waits(fleet: CliFleet, tmp_path
     assert (missing.returncode, missing.stdout) == (127, "")
     assert missing.stderr == "zscout: no-such-program: there is no such command; check the name and $PATH\n"
     assert fleet.zscout("request", "robot/a", "--", str(plain)).returncode == 126
+
+
+def test_what_can_never_start_is_refused_at_once_with_code_2(fleet: CliFleet) -> None:
+    for command in (("request",), ("request", "--dry-run"), ("take", "--yes")):
+        much = fleet.zscout(*command, "radio/rf0:rate=50")
+        assert (much.returncode, much.stdout) == (2, "")
+        assert much.stderr == "zscout: can never start: rate 50 of 10 at radio/rf0; ask for less\n"
+        typo = fleet.zscout(*command, "radio/rf0:rat=5")
+        assert typo.returncode == 2
+        assert typo.stderr == "zscout: radio/rf0 knows no parameter rat; did you mean rate?\n"
+    none = fleet.zscout("request", "robot/a:speed=1", "--", "true")
+    assert none.returncode == 2
+    assert none.stderr == "zscout: robot/a knows no parameter speed; it takes none\n"
+    fleet.state(lambda state: not state.queue and not state.holds)
 
 
 def test_refusals_by_the_rcm_are_one_line(fleet: CliFleet) -> None:

@@ -25,7 +25,7 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             survey = await client.request("survey", {"robot/a": {}, "radio/rf0": {"rate": 4}}, min_runtime=600)
             await other.request("mapping", {"radio/rf0": {"rate": 5}}, min_runtime=600, keep=True)
             await other.request("take", {"robot/a": {}}, priority=10, min_runtime=600)
-            await other.request("late", {"robot/b": {}, "robot/nowhere": {}}, min_runtime=30)
+            await other.request("late", {"robot/b": {}, "robot/nowhere": {}}, min_runtime=30, wait_for_device=True)
             await lab.state(client, lambda state: len(state.holds) == 2 and len(state.queue) == 2)
 
             plain = await zscout_soon("why", "survey", env=lab.env)
@@ -64,7 +64,7 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             assert "  robot/b: no other ARC holds it\n" in missing
 
             # Two of one name are told of one by one; ended ones from memory; unknown ones with what is near.
-            twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1)
+            twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1, wait_for_device=True)
             runs, waits = (await zscout_soon("why", "take", env=lab.env)).stdout.split("\n\n")
             assert re.match(rf"take of {US}, priority 10, has run since ", runs)
             assert re.search(rf"\n  until {CLOCK} \(.*\), its minimum runtime of 10 min\nHolds\n", runs)
