@@ -111,7 +111,7 @@ def test_a_grant_is_waited_for_at_most_so_long() -> None:
     async def test() -> None:
         async with small_fleet("one", "two") as (_, (one, two)):
             async with hold(one, "first", {RC: {}}):
-                with pytest.raises(TimeoutError, match=r"second was not granted within 30 s: needs robot/x \(held by "):
+                with pytest.raises(TimeoutError, match=r"second was not granted within 30 s: waits for h/one"):
                     await hold(two, "second", {RC: {}}, timeout=30).granted()
                 state = await one.state()
                 assert state is not None

@@ -181,6 +181,8 @@ class Client(MovableClient):
     async def see_rcm(self, seconds: float = LOOK_FOR_RCM, takeover: float = LOOK_FOR_TAKEOVER) -> None:
         """Returns as soon as an RCM is seen. Raises NoRcm where none is within `seconds`, or within `takeover` where a
         candidate is seen, which may be about to take the lead."""
+        if self.leader is not None:
+            return
         seen, candidates = asyncio.Event(), set[Token]()
 
         def on_token(token: Token, alive: bool) -> None:
