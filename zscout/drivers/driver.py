@@ -15,7 +15,7 @@ from zscout.mesh import Declaration, Mesh, Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder
 from zscout.types import SECOND, Ns
 
-__all__ = ["Driver", "Figures", "Holder", "ProposedHolder", "RcDirectory", "RcHandle", "Refused"]
+__all__ = ["Driver", "Figures", "Holder", "Parameter", "ProposedHolder", "RcDirectory", "RcHandle", "Refused"]
 
 NODE: Final = "node"
 """The client name of a node."""
