@@ -9,6 +9,7 @@ import json
 import os
 import re
 import select
+import socket
 import struct
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from typing import IO, Any, Self
 from tests.hang import HANG
 from zscout.behaviors.client.identity import this_program
 from zscout.cli.main import main
+from zscout.keyexpr import valid_name
 
 COMMAND = (sys.executable, "-m", "zscout.cli.main")
 # Makes the terminal that it has as stdin its controlling one: what a terminal window does for its shell.
@@ -40,8 +42,9 @@ def zscout(*args: object, env: Mapping[str, str] | None = None, stdin: str = "")
     return subprocess.run(command, env=env, input=stdin, capture_output=True, text=True, timeout=HANG)
 
 
-def by(command: str, *, host: str = "test") -> str:
-    """Whose a request of such a command is said to be."""
+def by(command: str) -> str:
+    """Whose a request of such a command, started here, is said to be."""
+    host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
     return f"{getpass.getuser()}@{host} ({command})"
 
 

@@ -50,8 +50,8 @@ def test_status_and_why_tell_when_a_waiting_one_may_start(fleet: CliFleet) -> No
         status = json.loads(fleet.zscout("status", "--json").stdout)
         [queued] = status["queue"]
         assert queued["starts_in"] > 0
-        assert " in " in fleet.zscout("status").stdout
-        assert "it may start in" in fleet.zscout("why", "next").stdout
+        assert " (in " in fleet.zscout("status").stdout
+        assert "it may start at " in fleet.zscout("why", "next").stdout
     finally:
         end(waiting)
         end(mine)
