@@ -192,7 +192,8 @@ class Attempt:
             self._anew = self._again and interrupted and arc.keep and not by_hand
             self._client.complete(arc)
             return interrupted
-        if held.active or (kind is not None and not interrupted):
+        # Whose body was interrupted is over for it, though a new RCM may have found that it stands all the same.
+        if not interrupted and (held.active or kind is not None):
             if arc.open:
                 await self._client.end(arc)
             return False

@@ -278,7 +278,12 @@ class Client(MovableClient):
                 return None
             if arc.state == "running" and arc.grant is not None:
                 grant = arc.grant
-                refusals = await self._confirm(arc, grant)
+                if grant == arc.left:
+                    # Its RCs have been told that its program leaves, whatever a new RCM has found.
+                    over = Problem("ended", "its program was told to leave")
+                    refusals = [CommandRefused(rc, over) for rc in arc.rcs]
+                else:
+                    refusals = await self._confirm(arc, grant)
                 if arc.grant == grant and not refusals:
                     arc.settling = None
                     if grant in self._direct:

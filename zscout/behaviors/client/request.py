@@ -98,6 +98,8 @@ class OpenArc:
     """The grant that some of its RCs did not confirm, and which, until the RCM has answered that."""
     settling: Grant | None = None
     """The grant whose RCs have not all stopped settling: it is not entered yet."""
+    left: Grant | None = None
+    """The last grant whose program was told to leave: it is not entered again."""
     unserved: Grant | None = None
     """The grant whose time went by so, until the RCM has answered that."""
     ending: HoldEnd | None = None

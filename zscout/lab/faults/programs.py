@@ -40,7 +40,8 @@ class Program:
         if self._timer is not None:
             self._timer.cancel()
         left = max(0.0, (direct.gone_by - self._now()) / SECOND)
-        self._timer = asyncio.get_running_loop().call_later(left, self.end, context=Context())
+        # The guardian is no part of the client's process, and its clock is its own.
+        self._timer = Context().run(asyncio.get_running_loop().call_later, left, self.end)
 
     def end(self) -> None:
         """Nothing of it is left."""
