@@ -94,7 +94,7 @@ def light(wheel: Path, folder: Path) -> Path:
     make_environment(folder)
     pip = (folder / "bin/python", "-m", "pip", "install", "--quiet")
     run(*pip, "--require-hashes", "-r", REQUIREMENTS / "light.txt", cwd=folder, timeout=INSTALL)
-    run(*pip, "--no-deps", wheel, cwd=folder)
+    run(*pip, "--no-deps", wheel, cwd=folder, timeout=INSTALL)
     return folder / "bin"
 
 
