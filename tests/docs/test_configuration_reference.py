@@ -42,7 +42,7 @@ def keys(table: Any, path: str = "") -> Iterator[tuple[str, inspect.Field]]:
         inner = _plain(field.type)
         if isinstance(inner, inspect.VarTupleType):
             inner = inner.item_type
-        if isinstance(inner, inspect.DictType) and not path:  # a table whose keys are names of hosts
+        if isinstance(_plain(field.type), inspect.DictType) and not path:  # a table whose keys are names of hosts
             yield f"{field.encode_name}.host", field
             continue
         options = inner.types if isinstance(inner, inspect.UnionType) else (inner,)

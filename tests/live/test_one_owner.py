@@ -112,18 +112,18 @@ class Halves:
         rcs = json.loads(done.stdout)["rcs"] if done.returncode == 0 else []
         return next((rc for rc in rcs if rc["rc"] == RC), {})
 
-    async def says(self, host: str, **wanted: Any) -> dict[str, Any]:
+    async def says(self, at: str, /, **wanted: Any) -> dict[str, Any]:
         seen: dict[str, Any] = {}
         try:
             async with asyncio.timeout(HANG):
                 while True:
-                    seen = await self.status(host)
+                    seen = await self.status(at)
                     known = seen | {"unseen": sorted(seen.get("unseen", ()))}
                     if wanted.items() <= known.items():
                         return seen
         except TimeoutError:
             logs = "\n".join(f"--- {one}\n{self.log(one)}" for one in self.HOSTS)
-            raise AssertionError(f"{host} never said {wanted}; last {seen}\n{logs}") from None
+            raise AssertionError(f"{at} never said {wanted}; last {seen}\n{logs}") from None
 
 
 def test_each_half_of_a_partition_says_that_the_other_owner_is_not_seen_and_after_it_there_is_one(
