@@ -61,7 +61,7 @@ def test_who_goes_on_asks_anew_behind_those_who_wait() -> None:
                 async with hold(two, "other", {RC: {}}):
                     assert [*entered, "out"] == [*entered[:turn], "out"]
                     await asyncio.sleep(LONG)
-                await until(lambda turn=turn: len(entered) == turn + 1)
+                await until(lambda: len(entered) == turn + 1)  # noqa: B023 - awaited here
             await working
             # Turns of a minute each.
             assert entered == [0, 120, 240]

@@ -51,7 +51,7 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: s
       zscout take 'robot/*' 'framegrabber/*' --release-after 2m
     """
     priority = common.the_fleet().operator_priority
-    terms = {"priority": priority, "keep": not no_keep, "comment": reason or comment}
+    terms: dict[str, Any] = {"priority": priority, "keep": not no_keep, "comment": reason or comment}
     wanted = gather(needs, name, DEFAULT_NAMES[1], **terms, **rest)
     async with common.connected("take") as client:
         # What can never start is refused before anybody is asked about anything.
