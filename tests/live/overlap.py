@@ -69,6 +69,10 @@ time.sleep(3600)
 """Of `python -S -c`. Its lock is that of both its processes: it is free when the last of them is gone."""
 
 
+class NeverCame(Exception):
+    """What was waited for."""
+
+
 class Begun(NamedTuple):
     """A program that runs: whether alone, and since when."""
 
@@ -189,10 +193,9 @@ class Rounds:
         return self._requests[-1]
 
     def run(self, hows: list[How], tell: Callable[[Taken], None]) -> list[Taken]:
-        """Raises TimeoutError."""
+        """Raises NeverCame."""
         priority = 0
-        former = self.request(0, priority)
-        self._until("the first program runs", lambda: 0 in self.programs.begun())
+        former = self._first()
         taken: list[Taken] = []
         for number, how in enumerate(hows, start=1):
             priority += how == "preempted"
@@ -203,15 +206,28 @@ class Rounds:
             former = following
         return taken
 
+    def _first(self) -> Request:
+        """Once there is a leader that sees the device."""
+        first = self.request(0, 0)
+
+        def runs() -> bool:
+            nonlocal first
+            if first.process.poll() is not None:
+                first = self.request(0, 0)
+            return 0 in self.programs.begun()
+
+        self._until("the first program runs", runs)
+        return first
+
     def _follow(self, how: How, former: Request, following: Request, number: int) -> Taken:
         if how == "preempted":
-            self._until("it preempts", lambda: following.said.keys() & {"settling", "granted"})
+            self._until("it preempts", lambda: following.said.keys() & {"settling", "granted"}, following)
             ended = min(at for event, at in following.said.items() if event in ("settling", "granted"))
         else:
-            self._until("it waits", lambda: "waits" in following.said)
+            self._until("it waits", lambda: "waits" in following.said, following)
             ended = clock.now()
             self._strike(how, former)
-        self._until("the next program runs", lambda: number in self.programs.begun())
+        self._until("the next program runs", lambda: number in self.programs.begun(), following)
         return Taken(how, ended, self.programs.begun()[number])
 
     def _strike(self, how: How, request: Request) -> None:
@@ -228,11 +244,14 @@ class Rounds:
         request.process.terminate()
         self._until("the former request has ended", lambda: request.process.poll() is not None)
 
-    def _until(self, what: str, done: Callable[[], object]) -> None:
+    def _until(self, what: str, done: Callable[[], object], of: Request | None = None) -> None:
+        """Raises NeverCame: not in time, or the request `of` which that is awaited has ended."""
         deadline = time.monotonic() + WITHIN
         while not done():
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"not within {WITHIN:g} s: {what}; see the logs in {self.folder}")
+            ended = of is not None and of.process.poll() is not None
+            if ended or time.monotonic() > deadline:
+                why = "its request ended" if ended else f"not within {WITHIN:g} s"
+                raise NeverCame(f"{why}: {what}; see the logs in {self.folder}")
             time.sleep(LOOK)
 
 
@@ -266,7 +285,7 @@ def main() -> int:
     try:
         with Rounds(folder) as rounds:
             taken = rounds.run(hows, tell)
-    except TimeoutError as error:
+    except NeverCame as error:
         print(f"overlap: {error}", file=sys.stderr)
         return 1
     beside = sum(not one.begun.alone for one in taken)
