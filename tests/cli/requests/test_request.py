@@ -163,9 +163,9 @@ def test_again_asks_anew_for_what_was_kept_and_ended_for_another(fleet: CliFleet
     script = f"echo run $$; if mkdir {tmp_path}/first; then sleep 1000; fi; exit 4"
     options = ["--again", "--name", "kept", "--min-runtime", "300ms"]
     kept = fleet.start("request", "robot/b", *options, "--", "sh", "-c", script)
-    first = read_until(kept, "run")[-1]
+    first = read_until(kept, "run ")[-1]
     assert fleet.zscout("request", "robot/b", "--", "true").returncode == 0
-    lines = read_until(kept, "run")
+    lines = read_until(kept, "run ")
     assert any(line.endswith("; asking anew") for line in lines)
     assert lines[-1] != first
     assert kept.wait(HANG) == 4

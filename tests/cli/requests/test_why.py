@@ -24,7 +24,7 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             await lab.ready(client, "robot/a", "robot/b", "radio/rf0")
             survey = await client.request("survey", {"robot/a": {}, "radio/rf0": {"rate": 4}}, min_runtime=600)
             await other.request("mapping", {"radio/rf0": {"rate": 5}}, min_runtime=600, keep=True)
-            await other.request("take", {"robot/a": {}}, priority=10, min_runtime=600)
+            await other.request("take", {"robot/a": {}}, priority=10, min_runtime=600, keep=False)
             await other.request("late", {"robot/b": {}, "robot/nowhere": {}}, min_runtime=30, wait_for_device=True)
             await lab.state(client, lambda state: len(state.holds) == 2 and len(state.queue) == 2)
 

@@ -363,7 +363,7 @@ class Report(LiveLine):
             self.changed.clear()
             left = (arc.end - self._mesh.now()) / SECOND
             rest = _yours(arc, left) if left > 0 or not arc.keep else f"for {span(self._since(arc))}, {UNTIL}"
-            self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}; Ctrl-C gives back")
+            self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}\n  Ctrl-C gives back")
             await done_within(REFRESH if self.watched else None, self.changed.wait())
 
     def _show_wait(self, arc: OpenArc) -> None:
