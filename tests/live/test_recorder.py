@@ -159,7 +159,7 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
     assert words(path, "operator") == ["running", "done"]
     waiting = next(text for (text,) in lane(path, "/arc/later") if text.startswith("waiting"))
     assert "robot/b" in waiting
-    assert "survey" in waiting
+    assert re.match(r"waiting · for \S+@\S+ \(.+\): ", waiting)
     assert any(", priority 1" in text for (text,) in lane(path, "/arc/survey") if text.startswith("preempted"))
 
     owner = r" of \S+@\S+ \([^)]*\)"

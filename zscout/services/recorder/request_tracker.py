@@ -199,7 +199,8 @@ class RequestTracker:
 
     def _set(self, at: float, request: _Request, state: str, detail: str) -> None:
         request.state, request.detail = state, detail
-        self.timeline.arc(at, request.label, state, detail)
+        # `waiting · for alice@ws1 (survey.py): robot/a`
+        self.timeline.arc(at, request.label, state, detail.removeprefix("waits ") if state == "waiting" else detail)
 
     def _show(self, at: float, rc: str, holders: Sequence[Holder | HoldView]) -> None:
         if rc not in self._rcs and len(self._rcs) >= MAX_RCS:
