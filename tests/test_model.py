@@ -65,3 +65,22 @@ def test_a_forged_step_is_refused_in_any_piece(trace: list[str]) -> None:
     assert "piece 1, " not in verdict.refused[1]
     assert "holds" in verdict.refused[1]
     assert "does not lead to" in verdict.refused[3]
+
+
+def test_who_promises_once_more_goes_on_with_what_it_holds() -> None:
+    """A leader that was away itself asks its RCs again, and names what they hold as before."""
+    term, robot, radio = [1, "z"], {"rc": "robot/a", "instance": "a"}, {"rc": "radio/b", "instance": "b"}
+    both, grant = {"robot/a": "a", "radio/b": "b"}, [[1, "z"], 2]
+    held = [[grant, "arc", [term, 1], ["robot/a"]]]
+    events = [
+        {"do": "promise", **robot, "seq": 0, "holds": []},
+        {"do": "promise", **radio, "seq": 0, "holds": []},
+        {"do": "publish", "seq": 1, "rcs": {"robot/a": [], "radio/b": []}, "instances": both},
+        {"do": "publish", "seq": 2, "rcs": {"robot/a": held}, "instances": {"robot/a": "a"}},
+        {"do": "hear", **robot, "seq": 2, "holds": [grant]},
+        {"do": "promise", **robot, "seq": 2, "holds": [grant]},
+        # It does not hear this one.
+        {"do": "publish", "seq": 3, "rcs": {"robot/a": held, "radio/b": []}, "instances": both},
+        {"do": "command", **robot, "seq": 2, "holds": [grant], "grant": grant},
+    ]
+    assert not accept([Behaviour([{**event, "term": term} for event in events])]).refused
