@@ -21,6 +21,8 @@ BELIEF: Final = HOLD_LEASE + 2 * SECOND
 AFTER: Final = 10 * SECOND
 """For so long after it was mended a fault may still show, where nobody waited until all were served."""
 CALM: Final = 3 * SECOND
+JUST_OVER: Final = SECOND // 5
+"""A leader that was away may lose its first link as others come back, in 0.1 s; a client hears of that later."""
 TERMS, TERMS_WITHIN = 4, 10 * SECOND
 KEPT: Final = 4096
 
@@ -108,6 +110,16 @@ class Checker:
             and any(one.pair == {host, node} and led >= one.since for host in hosts for node, led in self._led.items())
             for one in self.apart
         )
+
+    def excused(self, hosts: Iterable[str], at: int) -> bool:
+        """Whether what was lost by one of these hosts may be a fault's doing, or that of a leader that is just back."""
+        back = {
+            host
+            for fault in self.faults
+            if fault.mended and 0 <= at - fault.mended <= JUST_OVER
+            for host in fault.touched
+        }
+        return bool(back & self._led.keys()) or self.touched(hosts, at) or self.unlinked(hosts, at)
 
     def take(self, host: str, event: Json) -> None:
         self.counts[event["do"]] += 1
@@ -249,11 +261,11 @@ class Checker:
         if request is None:
             return
         outcome, held = event.get("outcome"), request.believed
-        if outcome == "client_lost" and not (self.touched([host], at) or self.unlinked([host], at)):
+        if outcome == "client_lost" and not self.excused([host], at):
             self.broken(at, "10 nobody alive is dropped", f"{host} {event['id']}: {event['reason']}")
         elif held is not None and (outcome == "lost" or event["do"] == "lost"):
             where = {host, *map(host_of, held[2])}
-            if held[0] == request.entered and not (self.touched(where, at) or self.unlinked(where, at)):
+            if held[0] == request.entered and not self.excused(where, at):
                 text = f"{host} {event['id']} lost {held[0]} of {', '.join(held[2])}: {event['reason']}"
                 self.broken(at, "10 what no fault touches goes on", text)
         self._disbelieve(host, at, request)
