@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from tests.mesh.kit import until
+from tests.mesh.kit import WITHIN, until
 from zscout.config.fleet import MeshConfig
 from zscout.mesh import relinking
 from zscout.mesh.zenoh_mesh import ZenohTransport, _relinking, increasing_id, zenoh_config
@@ -25,13 +25,14 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def _cut(here: ZenohTransport, gone: Sequence[str]) -> None:
-    """Ends its links with those below Zenoh: nobody says goodbye."""
-    ends = {
-        tuple(int(_PORT.search(end)[1]) for end in (link.src, link.dst))  # type: ignore[index]
-        for link in here._session.info.links()
-        if str(link.zid) in gone
-    }
+def _ends(here: ZenohTransport, there: str) -> set[tuple[int, int]]:
+    """The ports of its links with one of them."""
+    links = (link for link in here._session.info.links() if str(link.zid) == there)
+    return {tuple(int(_PORT.search(end)[1]) for end in (link.src, link.dst)) for link in links}  # type: ignore[index, misc]
+
+
+def _cut(ends: set[tuple[int, int]]) -> None:
+    """Ends these links below Zenoh: nobody says goodbye."""
     assert ends
     for file in Path("/proc/self/fd").iterdir():
         with suppress(OSError), socket.socket(fileno=os.dup(int(file.name))) as one:
@@ -70,22 +71,45 @@ class _World:
         return peer
 
 
-@pytest.mark.parametrize("others", [1, 2], ids=["made from here", "two of others"])
-def test_a_link_that_is_lost_is_made_again(others: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who made a single link makes it again; who lost two at a time was away itself, and sees to both, whoever made
-    them."""
-    if others == 2:
-        monkeypatch.setattr(relinking, "_listens", lambda _: False)
+def test_a_link_that_is_lost_is_made_again() -> None:
+    """By who made it."""
 
     async def story() -> None:
         async with AsyncExitStack() as stack:
             world = _World(stack)
             await world.peer()
             here = await world.peer(relinks=True, makes_links=True)
-            there = [await world.peer() for _ in range(others)]
-            _cut(here, [one.id() for one in there])
-            await until(lambda: not {one.id() for one in there} <= set(here.peers()))
-            await until(lambda: {one.id() for one in there} <= set(here.peers()))
+            there = (await world.peer()).id()
+            _cut(before := _ends(here, there))
+            await until(lambda: _ends(here, there) - before)
+
+    asyncio.run(story())
+
+
+def test_who_lost_two_links_made_by_others_sees_to_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was away itself. The second may be lost when it has looked for the first in vain."""
+    looked: list[object] = []
+
+    def listens(addresses: Sequence[str]) -> bool:
+        looked.append(addresses)
+        return False
+
+    monkeypatch.setattr(relinking, "_listens", listens)
+    # However late this process comes to cut the second.
+    monkeypatch.setattr(relinking, "TOGETHER", WITHIN)
+
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            world = _World(stack)
+            await world.peer()
+            here = await world.peer(relinks=True, makes_links=True)
+            there = [(await world.peer()).id() for _ in range(2)]
+            before = [_ends(here, one) for one in there]
+            for number, ends in enumerate(before, 1):
+                _cut(ends)
+                await until(lambda: len(looked) >= number)  # noqa: B023 - awaited here
+            for one, ends in zip(there, before, strict=True):
+                await until(lambda: _ends(here, one) - ends)  # noqa: B023 - awaited here
 
     asyncio.run(story())
 

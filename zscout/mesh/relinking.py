@@ -95,7 +95,8 @@ class Relinking:
             self._lost.setdefault(peer, _Lost(now)).addresses.append(event.link.dst)
             lately = [one for one in self._lost.values() if now - one.at < TOGETHER]
             for one in lately:
-                one.together |= len(lately) > 1
+                if len(lately) > 1 and not one.together:
+                    one.together, one.looks = True, 0
             if self._thread is None:
                 self._begin(greet=False)
 
@@ -148,8 +149,8 @@ class Relinking:
             listens = _listens(one.addresses)
             if listens or (one.together and one.looks <= LOOKS_FOR_GREATER):
                 wanted.add(peer)
-            elif listens is False:
-                # Its process has gone, or it is it that makes the link.
+            elif listens is False and time.monotonic() - one.at >= TOGETHER:
+                # Its process has gone, or it is it that makes the link. Until then another may be lost.
                 one.looks = len(PAUSES)
         if wanted and not self._closed.is_set():
             there = self._scout(SCOUT_TIMEOUT, wanted)
