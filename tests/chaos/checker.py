@@ -113,13 +113,9 @@ class Checker:
 
     def excused(self, hosts: Iterable[str], at: int) -> bool:
         """Whether what was lost by one of these hosts may be a fault's doing, or that of a leader that is just back."""
-        back = {
-            host
-            for fault in self.faults
-            if fault.mended and 0 <= at - fault.mended <= JUST_OVER
-            for host in fault.touched
-        }
-        return bool(back & self._led.keys()) or self.touched(hosts, at) or self.unlinked(hosts, at)
+        back = [fault for fault in self.faults if fault.mended and 0 <= at - fault.mended <= JUST_OVER]
+        led = any(self._led.get(one, 0) >= fault.began - LEASE * SECOND for fault in back for one in fault.touched)
+        return led or self.touched(hosts, at) or self.unlinked(hosts, at)
 
     def take(self, host: str, event: Json) -> None:
         self.counts[event["do"]] += 1

@@ -185,15 +185,16 @@ def test_who_had_no_link_with_the_leader_may_lose(promise: str) -> None:
 
 @pytest.mark.parametrize("promise", ["10 nobody alive is dropped", "10 what no fault touches goes on"])
 def test_a_leader_that_is_just_back_may_drop_somebody(promise: str) -> None:
-    def found(node: str, lost: float) -> list[Violation]:
-        back = round((lost - 0.15) * SECOND)
-        fault = Fault("leader away", "cut", 1, (node,), isolated(node), began=2 * SECOND, at=2 * SECOND, mended=back)
+    def found(node: str, lost: float, began: float = 2) -> list[Violation]:
+        fault = Fault("leader away", "cut", 1, (node,), isolated(node), began=round(began * SECOND))
+        fault.mended = round((lost - 0.15) * SECOND)
         return held_against([*LIFE, *BROKEN[promise]], fault)
 
     at = 4 if promise == "10 nobody alive is dropped" else 3.2
     assert found("n1", at) == []
-    # Longer ago, and another than the leader.
+    # Longer ago, another than the leader, and one that had led long before.
     assert found("n1", at - 0.1) != [] != found("n2", at)
+    assert found("n1", at, began=3.03)
 
 
 def test_a_killed_client_asks_for_nothing_any_more() -> None:

@@ -39,10 +39,10 @@ def test_a_leader_is_killed_and_nothing_is_left() -> None:
 @pytest.mark.skipif(bool(why_not), reason=why_not)
 def test_a_net_that_was_closed_is_gone_at_once() -> None:
     for _ in range(5):
-        nets = net.Net([f"h{number}" for number in range(10)])
-        nets.open()
-        nets.close()
-        assert nets.mark not in net.ip("netns", "list") + net.ip("link")
+        closed = net.Net([f"h{number}" for number in range(10)])
+        closed.open()
+        closed.close()
+        assert closed.mark not in net.ip("netns", "list") + net.ip("link")
 
 
 def test_where_it_can_t_run_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
