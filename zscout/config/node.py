@@ -24,6 +24,8 @@ FRAMES: Final = 2.0
 """Pictures a second that a recorder shows of each camera, by default."""
 
 STATE: Final = 'state = "/var/lib/zscout"'
+RECORDED: Final = 5_000
+"""Megabytes of recordings that are kept, by default."""
 
 LoadKind = bool | Literal["tree"]
 
@@ -38,6 +40,8 @@ class RecorderConfig(Struct, frozen=True):
     port: int
     frames: float = FRAMES
     """Frames a second shown of each camera; 0: none."""
+    limit: int = RECORDED
+    """Megabytes (10^6 bytes) of this fleet's recordings that are kept."""
 
 
 class ComponentsConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -94,6 +98,9 @@ class RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
     port: Annotated[int, key("TCP port of the live view.", 1, 65_535)] = 9876
     allow_remote: Annotated[bool, key("Whether `bind` may let other hosts in.")] = False
     frames: Annotated[float, key("Shown of each camera; 0: none.", 0, 30, unit="frames/s")] = FRAMES
+    limit: Annotated[
+        int, key("Kept of this fleet's recordings in `path`; the oldest go first.", 300, 1_000_000, unit="MB")
+    ] = RECORDED
 
 
 class NodeMeshTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -169,4 +176,4 @@ def _recorder(table: RecorderTable, folder: Path, at: Where) -> RecorderConfig:
             f"{quoted(table.bind)} shows the recording to other hosts",
             'write "127.0.0.1", or add allow_remote = true if that is meant',
         )
-    return RecorderConfig(path, str(address), table.port, table.frames)
+    return RecorderConfig(path, str(address), table.port, table.frames, table.limit)

@@ -95,3 +95,17 @@ class HostRanking(Message, frozen=True):
     """Ranked hosts that are not named."""
     reports: list[KnownLoad] | None = None
     """None: they were not asked for, or the balancer does not know of that."""
+
+
+class RecordedAsk(Message, frozen=True):
+    """Asks a recorder where its recording is."""
+
+
+class Recorded(Message, frozen=True):
+    """Where a recorder writes, and serves the same live. `file` and `inode` tell whether that is the asker's host."""
+
+    file: Annotated[str, msgspec.Meta(max_length=4096)]
+    inode: int
+    bind: Annotated[str, msgspec.Meta(max_length=45)]
+    """IP address that the live view listens on."""
+    port: Annotated[int, msgspec.Meta(ge=1, le=65_535)]

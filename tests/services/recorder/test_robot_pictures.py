@@ -95,7 +95,7 @@ def test_garbled_pictures_and_words_do_not_end_the_viewer(tmp_path: Path) -> Non
         for number in range(4):
             robots.frame(1, f"framegrabber/fgrab{number}", head(1), good)
         assert robots.floor.size is not None
-        timeline.recording.flush(timeout_sec=10)
+        timeline.flush(10)
         live.write_bytes(path.read_bytes())
     # Seven cameras on two pages, and each of the other panes.
     with viewer(live, tmp_path, panes=7 + 7, height=HEIGHT) as client:
