@@ -15,7 +15,6 @@ from typing import Final
 
 import msgspec
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk, OptimizationProfile, RrdReader
 
@@ -76,7 +75,7 @@ def _thinned(before: float) -> Callable[[Chunk], Iterator[Chunk]]:
         if batch is None or PICTURE not in batch.schema.names:
             yield chunk
             return
-        times = batch.column(chunk.timeline_names[0]).cast(pa.int64()).to_numpy()
+        times = batch.column(chunk.timeline_names[0]).cast("int64").to_numpy()
         pictures = batch.column(PICTURE).is_valid().to_numpy(zero_copy_only=False)
         keep = np.ones(len(times), bool)
         for row in np.flatnonzero(pictures & (times < before)):
@@ -87,7 +86,7 @@ def _thinned(before: float) -> Callable[[Chunk], Iterator[Chunk]]:
         if keep.all():
             yield chunk
         elif keep.any():
-            yield from Chunk.from_record_batch(batch.filter(pa.array(keep)))
+            yield from Chunk.from_record_batch(batch.take(np.flatnonzero(keep)))
 
     return thin
 
