@@ -28,7 +28,7 @@ from zscout.cli import common
 from zscout.config.node import RecorderConfig
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import valid_name
-from zscout.services.recorder.process import BAD_SETTINGS, RecorderJob, Recording, encode_job
+from zscout.services.recorder.process import BAD_SETTINGS, QUIET, RecorderJob, Recording, encode_job
 
 if TYPE_CHECKING:
     from zscout.config.fleet import Fleet
@@ -150,22 +150,25 @@ async def _source(
         yield Recording(str(file), None), None
         return
     fleet = common.the_fleet()
-    if (joined := await _recorded_here(fleet, bind)) is not None:
+    joined, alone = await _recorded_here(fleet, bind)
+    if joined is not None:
         yield joined, None
         return
     host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
     job = RecorderJob(RecorderConfig(out, bind, port or 0), fleet, host, joined=False)
     command = [sys.executable, "-m", "zscout.services.recorder"]
-    async with child("the recorder", command, {}, job=encode_job(job)) as recorder:
+    async with child("the recorder", command, QUIET, job=encode_job(job)) as recorder:
         recording = await recorder.recording()
         if recording.url is None:
             raise common.Failed("the recorder serves no live stream; report this as a bug")
+        if alone:
+            terminal.print_line(f"zscout: {alone}", sys.stderr)
         yield recording, recorder
 
 
-async def _recorded_here(fleet: Fleet, bind: str) -> Recording | None:
-    """What a node of this host records of the fleet, where it serves that on `bind` too. Without an RCM the view is
-    empty: a line tells so, and it may fill later."""
+async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str]:
+    """What a node of this host records of the fleet, where it serves that for pages on `bind`. And a line where there
+    is no RCM: then a view is empty, and may fill later."""
     from zscout.messages import Recorded, RecordedAsk
 
     async with common.connected("view", fleet, need_rcm=False) as client:
@@ -178,10 +181,8 @@ async def _recorded_here(fleet: Fleet, bind: str) -> Recording | None:
         replies = await mesh.ask(mesh.keys.recorded_any, RecordedAsk(), Recorded, timeout=LOOK_FOR_RECORDER)
     for reply in replies:
         if reply.message is not None and (recording := await _reached(reply.message, bind)) is not None:
-            return recording
-    if alone:
-        terminal.print_line(f"zscout: {alone}", sys.stderr)
-    return None
+            return recording, ""
+    return None, alone
 
 
 async def _reached(recorded: Recorded, bind: str) -> Recording | None:

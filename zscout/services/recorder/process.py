@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import logging
+import os
 import re
 import sys
 import time
@@ -33,6 +34,8 @@ LONG_ENOUGH: Final = 60.0
 """A recorder that ran for this many seconds is no failure in a row any more."""
 GRACE: Final = 40.0
 """Seconds for the recorder to finish its file."""
+QUIET: Final = {"RUST_LOG": "error"}
+"""Rerun would warn of each file that is to have no footer before it is finished."""
 BAD_SETTINGS: Final = 2
 """Its exit code where trying again would not help."""
 KEEP: Final = 500
@@ -193,6 +196,7 @@ class RecorderProcess:
             *("-m", "zscout.services.recorder"),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
+            env=os.environ | QUIET,
             start_new_session=True,
         )
         assert child.stdin is not None  # noqa: S101

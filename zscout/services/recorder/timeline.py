@@ -218,10 +218,9 @@ class Timeline(Drawing):
                 log.warning("the recording %s stays as it was written, and opens slowly: %s", self._path, error)
 
     def _end(self) -> bool:
-        """Whether all was written."""
-        # The file first: a viewer that hangs holds up the server.
-        ended = [disconnect(stream, DISCONNECT_SECONDS) for stream in reversed(self.streams)]
-        return all(ended)
+        """Whether the file was written to its end; a viewer that hangs holds up the server alone."""
+        ended = {id(stream): disconnect(stream, DISCONNECT_SECONDS) for stream in reversed(self.streams)}
+        return ended.get(id(self._file), False)
 
     def __enter__(self) -> Timeline:
         return self
