@@ -17,7 +17,7 @@ from zscout.services.recorder.colours import ABSENT, OPERATOR
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.finish import APART, WHOLE, finish
 from zscout.services.recorder.process import new_recording, prune, writing
-from zscout.services.recorder.timeline import Timeline
+from zscout.services.recorder.timeline import Timeline, TimelineError
 
 CAMERA = "framegrabber/fgrab1"
 
@@ -98,6 +98,16 @@ def test_a_recording_goes_on_in_a_file_that_begins_with_what_is_shown(tmp_path: 
     }
     assert colours(second, "/rc/robot/b") == {"/rc/robot/b": {"drive (operator)": OPERATOR}}
     assert len(list(rows(second, "/load/anvil", "SeriesLines:colors", static=True))) == 1
+
+
+def test_a_recording_that_can_t_go_on_in_another_file_goes_on_in_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        timeline.event(1, "before")
+        with pytest.raises(TimelineError):
+            timeline.roll(2, tmp_path / "none" / "run.rrd")
+        timeline.event(3, "after")
+    assert events(path) == ["before", "after"]
 
 
 def test_the_oldest_recordings_make_room_but_not_what_is_written(tmp_path: Path) -> None:

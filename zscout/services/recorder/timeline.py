@@ -86,13 +86,16 @@ class Timeline(Drawing):
             server = rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=SERVER_MEMORY)
             self._live = self._open(server, self.url)
         if path is not None:
-            self._file = self._open_file(path)
+            try:
+                self._file = self._open_file(path)
+            except TimelineError:
+                self._end()
+                raise
 
     def _open_file(self, path: Path) -> rr.RecordingStream:
         try:
             path.open("ab").close()
         except OSError as error:
-            self._end()
             raise TimelineError(
                 f"timeline: can't write the recording {path} ({error.strerror}); "
                 "give a file in a directory that is there and can be written"
@@ -117,7 +120,6 @@ class Timeline(Drawing):
             stream.flush(timeout_sec=FLUSH_SECONDS)
         except (RuntimeError, ValueError) as error:
             disconnect(stream, DISCONNECT_SECONDS)
-            self._end()
             raise TimelineError(
                 f"timeline: can't write to {where} ({error}); make room there, or choose another"
             ) from error
