@@ -110,7 +110,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
 def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View]]:
     """Share of the height and view, by any name. Within a view lanes are sorted by their names: what is to stand above
     them has a view of its own."""
-    apart = layout.contended | layout.absent
+    apart = {**layout.contended, **layout.absent}
     rest = layout.rc_rows - sum(apart.values())
     panes: dict[str, tuple[int, rrb.View]] = {}
 
