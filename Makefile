@@ -6,13 +6,14 @@ READY := $(VENV)/.ready
 PEERS := .venv-peers
 PEERS_READY := $(PEERS)/.ready
 
-.PHONY: help setup demo test docs lint bench bench-peers model chaos soak lock clean
+.PHONY: help setup demo test docs lint bench bench-peers model install-check chaos soak lock clean
 
 help:
 	@echo "make demo   four robots in a simulated building hide and watch, on a live mesh"
 	@echo "make test   all tests"
 	@echo "make docs   the documentation as a site, in site/"
 	@echo "make lint   formatting, linting, strict types, the rooms' contracts, links of the docs"
+	@echo "make install-check   the wheel in clean environments, by pip, pipx and uv, and the light installation"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"
 	@echo "make model  what the model checker TLC says of formal/ownership.tla; needs a Java runtime"
 	@echo "make chaos  20 minutes of faults in a real fleet, held against docs/promises.md; needs root, network namespaces, iproute2"
@@ -51,6 +52,10 @@ bench: $(READY)
 model: $(READY)
 	$(BIN)/python -m formal
 
+# Not among the tests: it needs a package index, and a minute or two.
+install-check: $(READY)
+	$(BIN)/python -m tests.install
+
 # More options: $(BIN)/python -m tests.chaos --help
 MINUTES ?= 20
 chaos: $(READY)
@@ -73,8 +78,11 @@ bench-peers: $(PEERS_READY)
 	$(PEERS)/bin/python -m benchmarks.peers
 
 # Needs uv; only names, versions and hashes are written.
+LOCK := uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate
 lock:
-	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate --group dev pyproject.toml -o requirements/dev.txt
+	$(LOCK) --group dev pyproject.toml -o requirements/dev.txt
+	$(LOCK) --constraints requirements/dev.txt --group light -o requirements/light.txt
+	$(LOCK) --group installers -o requirements/installers.txt
 
 clean:
 	rm -rf $(VENV) $(PEERS) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks import crowd, frames, hosts, latency, process, reporter
+from benchmarks import commands, crowd, frames, hosts, latency, process, reporter
 from benchmarks.loop import run
 from benchmarks.stats import Row, table
 
@@ -44,6 +44,8 @@ async def measure(rounds: int, crowds: int, programs: int) -> list[Row]:
         progress("1,000 hosts")
         (folder / "hosts").mkdir()
         rows += await hosts.rows_of_thousand(folder / "hosts")
+    progress("commands")
+    rows += await commands.measure(15)
     rows += await frames.measure(15.0, progress)
     return rows
 

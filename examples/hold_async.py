@@ -10,7 +10,7 @@ PICTURES = 3
 async def survey() -> None:
     taken = 0
     async with zscout.Client.connect() as client:
-        async for attempt in zscout.holds(client, "survey", {"robot/scout33": {}}, min_runtime=60):
+        async for attempt in zscout.holds(client, "survey", {"robot/scout33": {}}):
             async with attempt as held:  # cancelled when it is taken away, entered again when granted again
                 while taken < PICTURES:
                     done = await held.command("robot/scout33", {"name": "echo", "value": taken})

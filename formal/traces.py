@@ -240,6 +240,9 @@ class Behaviour:
 
     # Leaders
 
+    def _reopened(self, event: Mapping[str, Any]) -> None:
+        """That it is not over after all shows in a grant that follows."""
+
     def _over(self, event: Mapping[str, Any]) -> None:
         """Grants are what the model has; that an ARC is over shows in that none follows."""
 

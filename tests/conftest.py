@@ -13,7 +13,7 @@ from hypothesis import settings
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
-BYTECODE = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
+BYTECODE, STATE = (pytest.StashKey[tempfile.TemporaryDirectory[str]]() for _ in range(2))
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -25,6 +25,9 @@ def pytest_configure(config: pytest.Config) -> None:
     for number, action in ((signal.SIGHUP, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler)):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, action)
+    # What nodes keep for after them goes with this run.
+    state = config.stash[STATE] = tempfile.TemporaryDirectory(prefix="zscout-state-")
+    os.environ["XDG_STATE_HOME"] = state.name
     if sys.dont_write_bytecode and "PYTHONDONTWRITEBYTECODE" in os.environ:
         del os.environ["PYTHONDONTWRITEBYTECODE"]
         folder = config.stash[BYTECODE] = tempfile.TemporaryDirectory(prefix="zscout-bytecode-")
@@ -37,5 +40,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    if BYTECODE in config.stash:
-        config.stash[BYTECODE].cleanup()
+    for key in (BYTECODE, STATE):
+        if key in config.stash:
+            config.stash[key].cleanup()

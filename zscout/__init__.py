@@ -1,7 +1,7 @@
 """zscout: all the devices a program asked for, or none, over a Zenoh mesh.
 
     import zscout
-    with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}, min_runtime=60) as held:
+    with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}) as held:
         ...
 
 For asyncio see `zscout.Client`, `zscout.hold` and `zscout.holds`; for what nodes can start and move,
@@ -16,32 +16,46 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.arc import Held, Revoked, hold, holds
-    from zscout.behaviors.client.blocking import Lab, connect
-    from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+    from zscout.behaviors.client.blocking import BlockingHeld, Lab, connect
+    from zscout.behaviors.client.client import Client, CommandRefused, NoRcm, RequestRefused
     from zscout.behaviors.components.component import Component, ComponentContext, Stage
+    from zscout.config.fleet import Fleet, load_fleet
+    from zscout.config.strict import BadInput
+    from zscout.mesh import MeshError
 
 _HOME = {
+    "BadInput": "zscout.config.strict",
+    "BlockingHeld": "zscout.behaviors.client.blocking",
     "Client": "zscout.behaviors.client.client",
     "CommandRefused": "zscout.behaviors.client.client",
     "Component": "zscout.behaviors.components.component",
     "ComponentContext": "zscout.behaviors.components.component",
+    "Fleet": "zscout.config.fleet",
     "Held": "zscout.behaviors.client.arc",
     "Lab": "zscout.behaviors.client.blocking",
+    "MeshError": "zscout.mesh",
+    "NoRcm": "zscout.behaviors.client.client",
     "RequestRefused": "zscout.behaviors.client.client",
     "Revoked": "zscout.behaviors.client.arc",
     "Stage": "zscout.behaviors.components.component",
     "connect": "zscout.behaviors.client.blocking",
     "hold": "zscout.behaviors.client.arc",
     "holds": "zscout.behaviors.client.arc",
+    "load_fleet": "zscout.config.fleet",
 }
 
 __all__ = [
+    "BadInput",
+    "BlockingHeld",
     "Client",
     "CommandRefused",
     "Component",
     "ComponentContext",
+    "Fleet",
     "Held",
     "Lab",
+    "MeshError",
+    "NoRcm",
     "RequestRefused",
     "Revoked",
     "Stage",
@@ -49,6 +63,7 @@ __all__ = [
     "connect",
     "hold",
     "holds",
+    "load_fleet",
 ]
 
 
@@ -58,3 +73,7 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

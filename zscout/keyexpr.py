@@ -200,6 +200,7 @@ class Keys:
     notice_any = _Key("client/*/*/notice")
     requests_any = _Key("client/*/*/requests")
     behavior_any = _Key("client/*/*/behavior")
+    recorded_any = _Key("recorder/*/*/recorded")
     building_plan_any = _Key("building/*/*/plan")
     building_poses_any = _Key("building/*/*/poses")
 
@@ -213,6 +214,7 @@ class Keys:
     notice = _sender_key("client", "/notice")
     requests = _sender_key("client", "/requests")
     behavior = _sender_key("client", "/behavior")
+    recorded = _sender_key("recorder", "/recorded")
     building_plan = _sender_key("building", "/plan")
     building_poses = _sender_key("building", "/poses")
 

@@ -19,9 +19,11 @@ import uvloop
 from zscout import __version__
 from zscout.config.devices import RobotRc
 from zscout.config.node import Node, default_node, load_node
+from zscout.config.state_folder import state_folder
 from zscout.config.strict import BadInput
+from zscout.drivers.last_holder import LastHolderFile, UnknownLastHolder
 from zscout.drivers.lock import only_here
-from zscout.drivers.registry import driver_for
+from zscout.drivers.registry import driver_for, driver_name
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError, ZenohMesh
@@ -51,8 +53,10 @@ async def run_node(node: Node, stop: asyncio.Event) -> None:
 
 async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
     """The services of a node, until `stop` or until one fails. The recorder, the load reporter and the
-    candidate start again by themselves; an RC and the component host end the node, and all in order."""
+    candidate start again by themselves; an RC and the component host end the node, and all in order. Raises BadInput
+    before anything begins where an RC's driver can't be had."""
     me, failures = mesh.me, list[Exception]()
+    drivers = {spec.name: driver_for(spec) for spec in node.rcs}
 
     def fail(error: Exception) -> None:
         failures.append(error)
@@ -69,13 +73,24 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
         stack.callback(token.close)
         lease = node.fleet.timing.hold_lease / SECOND
+        kept = state_folder(node.fleet.name, me.host, node.state) if node.rcs or node.candidate else None
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
             stack.enter_context(only_here(node.fleet.name, me.host, spec.name))
-            rc = ResourceController(mesh, spec.name, driver_for(spec), hold_lease=lease, stall=stall, on_failure=fail)
+            driver = drivers[spec.name]
+            rc = ResourceController(
+                mesh,
+                spec.name,
+                driver,
+                hold_lease=lease,
+                settle=spec.settle / SECOND,
+                last_holder=LastHolderFile(kept, spec.name) if kept is not None else UnknownLastHolder(),
+                stall=stall,
+                on_failure=fail,
+            )
             await rc.start()
             stack.push_async_callback(rc.stop)
-            log.info("runs %s (%s)", spec.name, type(spec).__struct_config__.tag)
+            log.info("runs %s (%s)", spec.name, driver_name(spec))
         components = ComponentHost(mesh, node.fleet, node.components, fail)
         if node.load:
             reporter = LoadReporter(mesh, node.labels, components.running, tree=node.load == "tree")
@@ -86,7 +101,7 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
             await recorder.start()
             stack.push_async_callback(recorder.stop)
         if node.candidate:
-            candidate = Candidate(mesh, node.fleet)
+            candidate = Candidate(mesh, node.fleet, kept)
             candidate.start()
             stack.push_async_callback(candidate.stop)
         await components.start()
@@ -125,11 +140,13 @@ def main(file: Path | None, log_level: str) -> None:
     """Runs this host's part of a fleet, as the node FILE (TOML) says.
 
     Without FILE the node stands as a candidate for the RCM of the fleet "zscout" and reports the host's load.
+    `zscout simulate --node lab.toml` writes one for a simulated building; docs/reference/configuration.md has
+    all settings.
 
     \b
     Examples:
       zscout-node
-      zscout-node /etc/zscout/node.toml
+      zscout-node lab.toml
     """
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     try:

@@ -12,10 +12,13 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from itertools import zip_longest
 from typing import IO, TYPE_CHECKING, Any, Final, Self
 
 import msgspec
+
+from zscout.types import clean as clean
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -23,6 +26,10 @@ if TYPE_CHECKING:
 
 NARROW: Final = 110
 """Columns of a terminal below which tables leave out what matters least."""
+NEAR: Final = 120.0
+"""Seconds from now within which a time of day is told with its seconds."""
+MAX_CLOCK: Final = 1e9
+"""Seconds from now that a time of day may be, either way."""
 MAX_TYPED: Final = 1_024
 KEYS: Final = re.compile(rb"\x1b[\[O].|.", re.DOTALL)
 """The single keys of what was typed; an escape sequence is one key."""
@@ -54,11 +61,6 @@ def console(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
 
 
-def clean(text: str) -> str:
-    """Words from another host, on one line, unable to draw on the terminal."""
-    return "".join(char if char.isprintable() else " " for char in text)
-
-
 def span(seconds: float) -> str:
     """A span of time as people read it: `0.4 s`, `12 s`, `3 min 5 s`, `2 h 4 min`, `3 d 2 h`."""
     seconds = max(0.0, seconds)
@@ -70,6 +72,21 @@ def span(seconds: float) -> str:
             rest = whole % big // small
             return f"{whole // big} {big_unit}" + (f" {rest} {small_unit}" if rest else "")
     return f"{whole} s"
+
+
+def clock(seconds: float, *, at_latest: bool = False) -> str:
+    """The time of day `seconds` from now, by this host's clock and zone: `14:32`, `14:32:05` within two minutes of now,
+    with the date on another day. What is cut off is rounded down, with `at_latest` up; negative: that long ago."""
+    now = datetime.now().astimezone()
+    at = (now + timedelta(seconds=max(-MAX_CLOCK, min(seconds, MAX_CLOCK)))).astimezone()
+    near = abs(seconds) < NEAR
+    unit = timedelta(seconds=1) if near else timedelta(minutes=1)
+    if at_latest and (rest := (at - datetime.min.replace(tzinfo=at.tzinfo)) % unit):
+        at += unit - rest
+    time = f"{at:%H:%M:%S}" if near else f"{at:%H:%M}"
+    if at.date() == now.date():
+        return time
+    return f"{at:%Y-%m-%d} {time}" if at.year != now.year else f"{at:%b} {at.day} {time}"
 
 
 def many(count: int, what: str) -> str:

@@ -40,6 +40,11 @@ METRICS: Final[tuple[Metric, ...]] = ("load_average", "processor_speed", "availa
 POLICIES: Final[tuple[Policy, ...]] = ("least_loaded", "randomized", "two_choices", "pending")
 
 
+def clean(text: str) -> str:
+    """Words from another host, on one line, unable to draw on a terminal."""
+    return text if text.isprintable() else "".join(char if char.isprintable() else " " for char in text)
+
+
 class Term(NamedTuple):
     """The period in which one RCM leads: compared by counter, then by the RCM's instance."""
 

@@ -137,6 +137,12 @@ def test_completion_knows_the_commands_without_loading_them() -> None:
     assert asked.stdout.split() == ["plain,request", "plain,release", "plain,replay"]
     options = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout request --min", COMP_CWORD="2")
     assert options.stdout.split() == ["plain,--min-runtime"]
+    script = zscout("completion", "bash", "--program", "zscout-node")
+    assert "_ZSCOUT_NODE_COMPLETE=bash_complete" in script.stdout
+    variables = {"_ZSCOUT_NODE_COMPLETE": "bash_complete", "COMP_WORDS": "zscout-node --log", "COMP_CWORD": "1"}
+    command = [sys.executable, "-c", "import sys; from zscout.node import main; main(prog_name='zscout-node')"]
+    node = subprocess.run(command, env=os.environ | variables, capture_output=True, text=True, timeout=HANG)
+    assert (node.stdout.split(), node.stderr) == (["plain,--log-level"], "")
     unknown = zscout("completion", SHELL="/bin/tcsh")
     assert unknown.returncode == 2
     assert "write one of bash, zsh, fish" in unknown.stderr

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import getpass
 import json
 import os
 import re
 import select
+import socket
 import struct
 import subprocess
 import sys
@@ -19,7 +21,9 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from tests.hang import HANG
+from zscout.behaviors.client.identity import this_program
 from zscout.cli.main import main
+from zscout.keyexpr import valid_name
 
 COMMAND = (sys.executable, "-m", "zscout.cli.main")
 # Makes the terminal that it has as stdin its controlling one: what a terminal window does for its shell.
@@ -27,6 +31,8 @@ OWN_TERMINAL = (
     "import fcntl, os, sys, termios; os.setsid(); fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
     "os.execvp(sys.argv[1], sys.argv[1:])"
 )
+CLOCK = r"\d\d:\d\d(:\d\d)?"
+"""A time of this day."""
 _ESCAPE = re.compile(r"\x1b(\[[0-9;?]*[A-Za-z]|[=>])")
 
 
@@ -34,6 +40,23 @@ def zscout(*args: object, env: Mapping[str, str] | None = None, stdin: str = "")
     """Runs it in a pipe, to its end."""
     command = [*COMMAND, *map(str, args)]
     return subprocess.run(command, env=env, input=stdin, capture_output=True, text=True, timeout=HANG)
+
+
+def by(command: str) -> str:
+    """Whose a request of such a command, started here, is said to be."""
+    host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
+    return f"{getpass.getuser()}@{host} ({command})"
+
+
+def named(name: str) -> str:
+    """Whose that of `zscout request --name NAME` without a command is."""
+    return by(f"zscout request --name {name}")
+
+
+def ours() -> str:
+    """Whose those of clients in this process are."""
+    who = this_program("test")
+    return f"{who.user}@{who.host} ({who.command})"
 
 
 def zscout_here(*args: object) -> int:

@@ -51,7 +51,7 @@ BAD = {
     ),
     radio(activation="1"): (
         'rc[0].activation (radio/r): the driver "radio" has none; '
-        'remove it, or write driver = "exclusive" or "capacity"'
+        'remove it, or write driver = "exclusive", "capacity" or "command"'
     ),
     table("radio/r", driver="capacity", capacity="{ a = 1 }", port='"/dev/x"'): (
         'rc[0].port (radio/r): the driver "capacity" has none; remove it, or write driver = "radio"'

@@ -18,7 +18,7 @@ from zscout.config.fleet import (
     load_fleet,
 )
 from zscout.config.scheduling_policy import SchedulingPolicy
-from zscout.config.strict import BadInput
+from zscout.config.strict import DURATIONS, BadInput
 from zscout.types import SECOND
 
 SYNTAX = "mend the TOML there or just before"
@@ -38,7 +38,7 @@ BAD_FLEETS = {
     "[limits]\nmax_needed = 1": "limits.max_needed: unknown key; did you mean max_needs or max_queued?",
     "[fleet]\nzzz = 1": "fleet.zzz: unknown key; known here: candidates, name, operator_priority, "
     "patience, preempt, promise, strategy",
-    '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: fleet, limits, mesh, placement, timing',
+    '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: devices, fleet, limits, mesh, placement, timing',
     'fleet = "lab"': 'fleet: is the text "lab"; write a table, under [fleet]',
     "[[fleet]]": "fleet: is a list; write a table, under [fleet]",
     # [fleet]
@@ -77,7 +77,10 @@ BAD_FLEETS = {
     "[mesh]\nlease = 0.1": "mesh.lease: is 0.1; write a number from 0.2 to 30",
     "[mesh]\nlease = nan": "mesh.lease: is not a finite number; write a number from 0.2 to 30",
     "[mesh]\nlease = 1979-05-27": "mesh.lease: is a date or a time; write a number from 0.2 to 30",
-    '[mesh]\nlease = "1"': 'mesh.lease: is the text "1"; write a number from 0.2 to 30',
+    '[mesh]\nlease = "soon"': f'mesh.lease: "soon" is not a duration; write {DURATIONS}',
+    '[mesh]\nlease = "100ms"': "mesh.lease: is 0.100; write a number from 0.2 to 30",
+    '[fleet]\nmin_runtime = "0s"': "fleet.min_runtime: is 0 s; write 0.001 to 31622400 seconds",
+    '[limits]\nmax_runtime = "2 h"': f'limits.max_runtime: "2 h" is not a duration; write {DURATIONS}',
     '[mesh]\nlisten = ["tcp/127.0.0.1"]': (f'mesh.listen[0]: "tcp/127.0.0.1" is not an endpoint; {ENDPOINT_RULE}'),
     '[mesh]\nlisten = ["tcp/a:0", "ipx/a:1"]': (f'mesh.listen[1]: "ipx/a:1" is not an endpoint; {ENDPOINT_RULE}'),
     '[mesh]\nconnect = ["tcp/1.2.3:7"]': (f'mesh.connect[0]: "tcp/1.2.3:7" is not an endpoint; {ENDPOINT_RULE}'),
@@ -144,6 +147,7 @@ def test_an_empty_fleet_file_means_the_defaults() -> None:
         listen=(), connect=(), multicast=True, multicast_address="224.0.0.224:7446", interface="auto", lease=1.0
     )
     assert made.limits == RcmLimits(10_000, 64, 256, 65_536)
+    assert made.min_runtime == 60 * SECOND
     assert made.timing == Timing(500_000_000, 3_000_000_000, 250_000_000, 200_000_000)
 
 
@@ -158,6 +162,7 @@ def test_every_key_of_a_fleet_file() -> None:
         preempt = "after_min_runtime"
         patience = 2.5
         promise = "all"
+        min_runtime = "1m30s"
         [mesh]
         listen = ["tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"]
         connect = ["quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"]
@@ -171,6 +176,7 @@ def test_every_key_of_a_fleet_file() -> None:
         max_requests_per_client = 3
         max_payload = 4096
         max_running_per_host = 5
+        max_runtime = "1d12h"
         [timing]
         heartbeat = 0.1
         hold_lease = 5
@@ -182,7 +188,7 @@ def test_every_key_of_a_fleet_file() -> None:
         name="lab",
         candidates=("anvil", "bench"),
         strategy="adaptive",
-        scheduling=SchedulingPolicy("after_min_runtime", 7, 5 * SECOND // 2, "all", 5),
+        scheduling=SchedulingPolicy("after_min_runtime", 7, 5 * SECOND // 2, "all", 5, 129_600 * SECOND),
         mesh=MeshConfig(
             listen=("tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"),
             connect=("quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"),
@@ -191,10 +197,20 @@ def test_every_key_of_a_fleet_file() -> None:
             interface="eth0,wlan0",
             lease=2.0,
         ),
-        limits=RcmLimits(1, 2, 3, 4096, 5),
+        limits=RcmLimits(1, 2, 3, 4096, 5, 129_600 * SECOND),
         timing=Timing(SECOND // 10, 5 * SECOND, 3 * SECOND // 10, 5 * SECOND // 4),
+        min_runtime=90 * SECOND,
     )
     assert isinstance(made.mesh.lease, float)
+
+
+def test_durations_are_numbers_or_texts() -> None:
+    made = fleet('[mesh]\nlease = "2s"\n[timing]\nhold_lease = "1m"\nheartbeat = "300ms"\nrebuild = 0.5')
+    assert (made.mesh.lease, made.timing) == (2.0, Timing(3 * SECOND // 10, 60 * SECOND, SECOND // 4, SECOND // 2))
+
+
+def test_nobody_is_protected_for_longer_than_a_hold_lasts() -> None:
+    assert fleet('[limits]\nmax_runtime = "30s"').min_runtime == 30 * SECOND
 
 
 def test_the_fleet_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

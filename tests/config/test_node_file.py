@@ -43,10 +43,8 @@ BAD_NODES = {
     '[[rc]]\nname = "robot/a"': "rc[0].driver (robot/a): is missing; add it",
     '[[rc]]\nname = "robot"\ndriver = "exclusive"': (f'rc[0].name: "robot" is not the name of an RC; {RC_RULE}'),
     '[[rc]]\nname = "a/b/c"\ndriver = "exclusive"': (f'rc[0].name: "a/b/c" is not the name of an RC; {RC_RULE}'),
-    '[[rc]]\nname = "robot/a"\ndriver = "fast"': (
-        'rc[0].driver (robot/a): is the text "fast"; '
-        'write "capacity", "exclusive", "framegrabber", "radio", "robot" or "video"'
-    ),
+    '[[rc]]\nname = "robot/a"\ndriver = "very fast"': f'rc[0].driver (robot/a): "very fast" is not a name; {NAME_RULE}',
+    '[[rc]]\nname = "robot"\ndriver = "fast"': f'rc[0].name: "robot" is not the name of an RC; {RC_RULE}',
     ROBOT + RADIO + "capacity = { a = 1 }\n" + ROBOT: (
         'rc[2].name: "robot/a" stands at rc[0] already; rename or remove one of the two'
     ),

@@ -69,6 +69,24 @@ def test_seconds_out_of_range(seconds: str) -> None:
     assert str(caught.value) == f"f: at: is {Decimal(seconds)} s; write 0 to 1000000000 seconds"
 
 
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("5", "5"), ("1.5", "1.5"), (".5", "0.5"), ("90s", "90"), ("300ms", "0.3"), ("5m", "300"), ("2h", "7200"),
+        ("1d12h", "129600"), ("1d", "86400"), ("2h30m", "9000"), ("1.5h", "5400"), ("1m3s", "63"), ("5m3ms", "300.003"),
+    ],
+)  # fmt: skip
+def test_a_duration(text: str, seconds: str) -> None:
+    assert strict.parse_duration(text) == Decimal(seconds)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "s", "soon", "5 m", "5min", "1m1h", "1h1h", "1d12", "-1", "+1", "1e3", "inf", "m5", "٣s", "5m\n"]
+)
+def test_no_duration(text: str) -> None:
+    assert strict.parse_duration(text) is None
+
+
 def test_a_place_is_written_as_toml_writes_keys() -> None:
     where = ((Where("f") / "arc").item(2, "arc2") / "needs" / "robot/scout33" / 'a"b\\c') / "rate"
     assert where.key == r'arc[2].needs."robot/scout33"."a\"b\\c".rate'

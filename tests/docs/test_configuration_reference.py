@@ -7,13 +7,13 @@ import tomllib
 from collections.abc import Iterator
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
 from msgspec import inspect
 
-from zscout.config import fleet, node
+from zscout.config import devices, fleet, node
 
 REFERENCE = (Path(__file__).parents[2] / "docs" / "reference" / "configuration.md").read_text()
 FLEET, NODE = REFERENCE.split("\n## Node file\n")
@@ -42,6 +42,9 @@ def keys(table: Any, path: str = "") -> Iterator[tuple[str, inspect.Field]]:
         inner = _plain(field.type)
         if isinstance(inner, inspect.VarTupleType):
             inner = inner.item_type
+        if isinstance(_plain(field.type), inspect.DictType) and not path:  # a table whose keys are names of hosts
+            yield f"{field.encode_name}.host", field
+            continue
         options = inner.types if isinstance(inner, inspect.UnionType) else (inner,)
         tables = [option for option in options if isinstance(option, inspect.StructType)]
         for struct in tables:
@@ -55,6 +58,9 @@ def keys(table: Any, path: str = "") -> Iterator[tuple[str, inspect.Field]]:
 @pytest.mark.parametrize(("file", "text"), [(fleet.FleetFile, FLEET), (node.NodeFile, NODE)])
 def test_every_key_stands_in_the_reference_with_its_default(file: type, text: str) -> None:
     written, known = documented(text), dict(keys(inspect.type_info(file)))
+    if rc := known.pop("rc", None):  # what its driver says
+        for driver in get_args(devices.BuiltInRc):
+            known |= {"rc.driver": rc, **dict(keys(inspect.type_info(driver), "rc."))}
     assert written.keys() == known.keys()
     for key, field in known.items():
         if written[key] == "required":

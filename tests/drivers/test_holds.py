@@ -286,7 +286,7 @@ def heard(grants: Grants) -> Prepare:
         pytest.param(heard(said(3, TWO)), Grant(TERM, 2), "h/one", "ended", id="replaced"),
         pytest.param(heard(said(3)), Grant(TERM, 2), "h/one", "ended", id="revoked"),
         pytest.param(heard(said(3)), Grant(TERM, 1), "h/one", "free", id="nobody holds it"),
-        pytest.param(lambda rc: rc.fail("smoke"), Grant(TERM, 2), "h/one", "ended", id="failed"),
+        pytest.param(lambda rc: rc.fail("smoke", NOW), Grant(TERM, 2), "h/one", "ended", id="failed"),
         pytest.param(lambda rc: rc.expire(NOW + LEASE), Grant(TERM, 2), "h/one", "ended", id="the lease is over"),
         pytest.param(heard(said(1, ONE, term=NEW)), Grant(TERM, 2), "h/one", None, id="carried on"),
     ],

@@ -116,7 +116,7 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             for name, params, word in (
                 ("late", {"command_rate": 1}, "radio/rf0 refuses: a packet could wait 0.267 s, the bound is 0.25 s"),
                 ("fast", {"command_rate": 50}, "refuses: its holders would send 110 of 86.4 packets/s of 10 bytes"),
-                ("vague", {}, "refuses: vague: command_rate is missing"),
+                ("vague", {}, "radio/rf0 refuses: a packet could wait 0.267 s"),
             ):
                 asked = await client.request(name, {"radio/rf0": params}, min_runtime=600)
                 await comes_to(asked, "queued", word)

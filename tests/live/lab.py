@@ -67,7 +67,7 @@ class Lab:
             f'interface = "lo"\nlease = {lease}\n{extra}'
         )
         self.fleet: Fleet = load_fleet(self.fleet_file)
-        self.env = os.environ | {"ZSCOUT_FLEET": str(self.fleet_file)}
+        self.env = os.environ | {"ZSCOUT_FLEET": str(self.fleet_file), "XDG_STATE_HOME": str(folder / "state")}
 
     def node(self, host: str, *rcs: str, extra: str = "") -> subprocess.Popen[bytes]:
         """Starts a node. `rcs` are names, or `name:param=bound` for a sharable one with a capacity."""

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import psutil
 import pytest
@@ -91,7 +95,38 @@ def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
         "/load/bellows",
         "/load/crucible",
     }
-    assert "arc2 is preempted by arc4, priority 10, and waits again" in events(path)
+    told = re.compile(r"arc2 is preempted by \w+ \(arc4\), priority 10, and waits again")
+    assert any(map(told.fullmatch, events(path)))
+
+
+def test_it_is_shown_live_from_its_first_second_and_finished_on_the_same_page(tmp_path: Path) -> None:
+    demo = start(tmp_path, "--web")
+    assert demo.stdout is not None
+    assert demo.stderr is not None
+    lines: list[str] = []
+    for line in demo.stdout:
+        lines.append(line)
+        if line.startswith("Live: open "):
+            break
+    # Nothing has happened yet.
+    assert not any(" s  " in line for line in lines)
+    address = lines[-1].removeprefix("Live: open ").strip()
+    query = parse_qs(urlsplit(address).query)
+    assert query["theme"] == ["dark"]
+    (stream,) = (urlsplit(url) for url in query["url"])
+    with urllib.request.urlopen(address, timeout=HANG) as answer:  # noqa: S310 - our own page
+        assert b"Rerun" in answer.read()
+    socket.create_connection((stream.hostname or "", stream.port or 0), timeout=HANG).close()
+    read_until(demo, "Look at it:")
+    assert address in demo.stderr.readline()
+    # What was live is served from the file now, and nothing else of the demo is left.
+    socket.create_connection((stream.hostname or "", stream.port or 0), timeout=HANG).close()
+    others = children(demo)
+    assert [other.name() for other in others] == ["rerun"]
+    demo.send_signal(signal.SIGINT)
+    demo.communicate(timeout=HANG)
+    assert demo.returncode == 130
+    assert gone(others)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGKILL])

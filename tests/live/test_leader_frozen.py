@@ -41,7 +41,7 @@ def test_a_frozen_leader_is_followed_and_steps_down_when_it_wakes(tmp_path: Path
             await crew.assemble(lab, ROBOTS, waiting=WAITING)
             await lab.candidates(client, "b")
             # Its time is over while the leader sleeps; at its waking the leader would give the RC away.
-            short = await client.request("short", {"robot/short": {}}, min_runtime=0.3)
+            short = await client.request("short", {"robot/short": {}}, min_runtime=0.3, keep=False)
             heir = await client.request("heir", {"robot/short": {}}, min_runtime=600)
             assert (short.state, heir.state) == ("running", "queued")
             before = await lab.state(client, lambda state: len(state.queue) == WAITING + 1)

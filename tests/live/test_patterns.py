@@ -59,7 +59,7 @@ def test_each_gets_a_free_one_and_who_waits_the_first_that_is_given_back(tmp_pat
                     await two.command(mine, {"name": "echo", "value": 1})
 
                 late = await third.request("three", {ANY: {}}, min_runtime=600)
-                await comes_to(late, "queued", f"no {ANY} is to be had: needs framegrabber/")
+                await comes_to(late, "queued", "waits for one of framegrabber/")
                 state = await lab.state(client, lambda state: waits_for(state) == [("three", [ANY])])
                 assert {view.arc: (sorted(view.needs), view.bound) for view in state.holds} == {
                     "one": (one.rcs, {ANY: mine}),
@@ -221,7 +221,7 @@ def test_a_client_written_from_the_document_asks_by_pattern(tmp_path: Path) -> N
         await running(client, "operator", BOTH[1], priority=10)
         queued = await plain.told_of("notice", id="q1", state="queued", ahead=0)
         assert (queued["rcs"], "bound" in queued) == (["robot/r"], False)
-        assert queued["reason"].startswith(f"no {ANY} is to be had: ")
+        assert queued["reason"].startswith(f"waits for one of {BOTH[0]} (held by ")
         await client.end(first)
         again = await plain.told_of("entered", id="q1")
         assert (again["rcs"], again["bound"]) == ([BOTH[0], "robot/r"], {ANY: BOTH[0]})

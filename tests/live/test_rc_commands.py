@@ -80,7 +80,7 @@ def test_every_refusal(tmp_path: Path) -> None:
                 await lab.held_by(client, "robot/bench")
                 assert await answer(echo(grant)) == "ended"
                 await until(lambda: bench.calls == ["begin one", "safe"])
-                _, brief = await running(client, "brief", "robot/bench", min_runtime=0.2)
+                _, brief = await running(client, "brief", "robot/bench", min_runtime=0.2, keep=False)
                 await until(lambda: not rc.holds.held)
                 assert await answer(echo(brief)) == "ended"
                 assert warm.calls == ["begin warm"]
@@ -160,7 +160,7 @@ def test_a_failing_device_ends_the_whole_gang_which_waits_for_it(tmp_path: Path)
                 assert "smoke comes out of it" in arc.ending.reason
                 assert bench.calls == ["begin gang", "safe"]
                 waits = await lab.state(client, lambda state: [wait.arc for wait in state.queue] == ["gang"])
-                assert waits.queue[0].reason == "robot/bench not on the mesh"
+                assert waits.queue[0].reason == "robot/bench is lost: smoke comes out of it"
                 await lab.held_by(client, "robot/a")
                 for name in ("robot/a", "robot/bench"):
                     assert await answer(client.command(name, grant, ECHO)) == "ended"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -97,6 +98,10 @@ def loads_in(path: Path) -> list[tuple[str, float, Any]]:
     return list(rows(path, "/load/**", "Scalars:scalars"))
 
 
+def presence(path: Path) -> list[str]:
+    return [text for _, _, texts in rows(path, "/presence", "TextLog:text") for text in texts]
+
+
 def words(path: Path, arc: str) -> list[str]:
     """The states of an ARC, one after the other, without their details."""
     return [state for state, _ in groupby(text.split(" · ")[0] for (text,) in lane(path, f"/arc/{arc}"))]
@@ -122,11 +127,11 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
             both = {"robot/a": {}, "robot/b": {}, "radio/a": {"rate": 4}}
             survey = await client.request("survey", both, min_runtime=60)
             listen = await client.request("listen", {"radio/a": {"rate": 5}}, min_runtime=60)
-            later = await client.request("later", {"robot/b": {}}, min_runtime=0.3)
+            later = await client.request("later", {"robot/b": {}}, min_runtime=0.3, keep=False)
             # On a busy machine a vote may be overdue at first.
             await until(lambda: (survey.state, listen.state, later.state) == ("running", "running", "queued"))
             await told_why.wait()
-            async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=0.5):
+            async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=0.5, keep=False):
                 await lab.state(client, lambda state: {wait.arc for wait in state.queue} == {"survey"})
                 await asyncio.Event().wait()
             await lab.state(client, lambda state: "survey" in {held.arc for held in state.holds})
@@ -137,7 +142,7 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
             await ended(lab, "b")
             await lab.state(client, lambda state: "robot/b" not in {rc.rc for rc in state.rcs if rc.present})
             notices.close()
-            await recorded(runs, lambda path: {"node b is gone", "robot/b is gone from b"} <= {*events(path)})
+            await recorded(runs, lambda path: {"node b is gone", "robot/b is gone from b"} <= {*presence(path)})
             await ended(lab, "a")
 
     asyncio.run(story())
@@ -158,21 +163,24 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
     assert words(path, "operator") == ["running", "done"]
     waiting = next(text for (text,) in lane(path, "/arc/later") if text.startswith("waiting"))
     assert "robot/b" in waiting
-    assert "survey" in waiting
-    assert any("operator" in text for (text,) in lane(path, "/arc/survey") if text.startswith("preempted"))
+    assert re.match(r"waiting · for \S+@\S+ \(.+\): ", waiting)
+    assert any(", priority 1" in text for (text,) in lane(path, "/arc/survey") if text.startswith("preempted"))
 
-    told = events(path)
+    owner = r" of \S+@\S+ \([^)]*\)"
+    assert any(re.fullmatch(rf"survey{owner} runs on .*", text) for text in events(path))
+    told = [re.sub(owner, "", text) for text in events(path)]
+    for text in ("survey runs on radio/a, robot/a, robot/b", "later completed: its minimum runtime is over"):
+        assert text in told
     for text in (
         "node b is there",
         "robot/b is offered by b",
         "client test/crew joined",
-        "survey runs on radio/a, robot/a, robot/b",
-        "later completed: its minimum runtime is over",
         "node b is gone",
         "robot/b is gone from b",
     ):
-        assert text in told
-    assert any(text.startswith("survey is preempted by operator") for text in told)
+        assert text in presence(path)
+        assert text not in told
+    assert any(re.match(r"survey is preempted by \S+@\S+ \(.+\), priority ", text) for text in told)
     assert any(text in ("a leads", "b leads") for text in told)
 
     loads = loads_in(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from decimal import Decimal
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def test_a_gang_over_two_nodes_is_granted_commanded_and_preempted(tmp_path: Path
             operator: asyncio.Task[None] | None = None
 
             async def take() -> None:
-                async with hold(client, "operator", {"robot/b": {}}, priority=10, min_runtime=0.2):
+                async with hold(client, "operator", {"robot/b": {}}, priority=10, min_runtime=0.2, keep=False):
                     await asyncio.Event().wait()
 
             async def survey() -> None:
@@ -69,8 +70,8 @@ def test_what_would_come_is_foretold_and_nothing_is_changed_by_asking(tmp_path: 
             assert wait is not None
             assert wait.starts_in is not None
             assert wait.starts_in > view.starts_in + 4
-            assert "robot/a (held by mine" in wait.reason
-            never = await client.foresee("never", {"robot/b": {}}, priority=0, min_runtime=Decimal(1))
+            assert re.fullmatch(r"waits for \S+@\S+ \(.+\): robot/a", wait.reason)
+            never = await client.foresee("never", {"robot/b": {}}, min_runtime=Decimal(1), wait_for_device=True)
             assert never is not None
             assert (never.starts_in, never.reason) == (None, "robot/b not on the mesh")
             after = await client.state()

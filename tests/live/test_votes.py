@@ -11,7 +11,7 @@ import pytest
 from tests.live.bench import ECHO, SharedBench, Stand, answer, comes_to, running
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.client.request import OpenArc
+from zscout.behaviors.client.request import OpenArc, RequestRefused
 from zscout.mesh import clock
 from zscout.messages import ProposedHolder
 from zscout.types import SECOND
@@ -51,9 +51,9 @@ def test_a_capacity_is_filled_and_never_exceeded(tmp_path: Path) -> None:
             await comes_to(one, "running")
             await comes_to(two, "running")
             three = await ask(client, "three", "0.1")
-            await comes_to(three, "queued", "radio/rf refuses: rate would be 0.4 of 0.3")
-            much = await ask(client, "too-much", "0.31", priority=9)
-            await comes_to(much, "queued", "radio/rf refuses: rate would be 0.31 of 0.3")
+            await comes_to(three, "queued", ": radio/rf refuses more: rate would be 0.4 of 0.3")
+            with pytest.raises(RequestRefused, match=r"can never start: rate 0\.31 of 0\.3 at radio/rf; ask for less"):
+                await ask(client, "too-much", "0.31", priority=9)
             # What asks for nothing that is scarce fits beside them.
             await comes_to(await ask(client, "idle", "0"), "running")
             await lab.held_by(client, "radio/rf", "idle", "one", "two")
@@ -85,7 +85,7 @@ def test_answers_stand_until_the_rules_change(tmp_path: Path) -> None:
                 await lab.ready(client, "video/v", "robot/a")
                 await running(client, "one", "video/v")
                 two = await client.request("two", {"video/v": {}}, min_runtime=600)
-                await comes_to(two, "queued", "video/v refuses: it carries 1")
+                await comes_to(two, "queued", ": video/v refuses more: it carries 1")
                 asked = list(picky.asked)
                 assert asked[0] == ["one"]
                 assert asked[-1] == ["one", "two"]

@@ -8,11 +8,12 @@ report HOST ...                         from now on it reports so        silent 
 kind KIND cpu=X [memory=MB]             what a kind is known to use
 place NAME [kind=K] [restart=R] [hosts=A,B] [labels=A,B] [memory=MB] [policy=P] [metric=M] [n=ANY]
 end NAME       move NAME [HOST]         drain HOST       uncordon HOST       tick
-start NAME INC HOST ok|refused|failed|unknown [movable] [final] [REASON]
+start NAME INC HOST ok|refused|failed|unknown [movable] [final] [bad_params] [REASON]
 stop NAME INC HOST done|said|unknown    `done`: and its token is gone; `said`: that is all
 moved NAME INC HOST moved|refused|unknown [dead=S] [REASON]
 appeared NAME INC HOST                  vanished NAME INC HOST
-told HOST [only=NAME] NAME:INC:PHASE[:movable][:WHY] ...   PHASE: starting standby running, or an end
+told HOST [only=NAME] [kinds=A,B] NAME:INC:PHASE[:movable][:bad_params][:WHY] ...   PHASE: starting standby running,
+                                        or an end
 seen HOST      lost HOST                its node, without a report
 """
 
@@ -190,8 +191,9 @@ class PlacerPlayer:
                 return TokenVanished(name, int(incarnation), host)
             case "told", host, *rest:
                 only = next((word[5:] for word in rest if word.startswith("only=")), None)
-                told = [self.seen(host, word) for word in rest if not word.startswith("only=")]
-                return ComponentsListed(host, tuple(told), only)
+                kinds = next((frozenset(_names(word[6:])) for word in rest if word.startswith("kinds=")), None)
+                told = [self.seen(host, word) for word in rest if not word.startswith(("only=", "kinds="))]
+                return ComponentsListed(host, tuple(told), only, kinds)
             case "seen", host:
                 return HostJoined(host)
             case "lost", host:
@@ -214,7 +216,8 @@ class PlacerPlayer:
             phase=phase if lives else "ended",  # type: ignore[arg-type]
             movable=movable,
             ended=None if lives or phase == "lost" else phase,  # type: ignore[arg-type]
-            reason=" ".join(part for part in rest if part != "movable").replace("_", " "),
+            reason=" ".join(part for part in rest if part not in ("movable", "bad_params")).replace("_", " "),
+            bad_params="bad_params" in rest,
         )
 
     def print(self, effect: PlacerEffect) -> str:
@@ -253,7 +256,7 @@ def _print(record: Placement) -> str:
 def _start_answered(name: str, incarnation: int, host: str, result: str, rest: list[str]) -> StartAnswered:
     if result not in {"ok", "refused", "failed", "unknown"}:
         raise ValueError(f"no such result: {result}")
-    words = [word for word in rest if word not in {"movable", "final"}]
+    words = [word for word in rest if word not in {"movable", "final", "bad_params"}]
     return StartAnswered(
         name,
         incarnation,
@@ -262,6 +265,7 @@ def _start_answered(name: str, incarnation: int, host: str, result: str, rest: l
         reason=" ".join(words),
         movable="movable" in rest,
         again="final" not in rest,
+        bad_params="bad_params" in rest,
     )
 
 

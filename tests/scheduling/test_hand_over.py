@@ -34,7 +34,7 @@ def test_votes_go_with_an_arc_that_is_handed_over() -> None:
     assert not only(Propose, moved)
     answered = core.handle(2, Vote(question(asked), accept=False, reason="full"))
     assert not granted(answered)
-    assert str(core.status().queued[0].reason) == "radio/0 refuses: full"
+    assert str(core.status().queued[0].reason) == "waits for one-2: radio/0 refuses more: full"
     # So does the veto after another move: what frees the way is the end of the one beside it.
     again = core.handle(3, HandedOver("one-2", "host/third", "one-3"), HandedOver("two-2", "host/third", "2"))
     assert not only(Propose, again)

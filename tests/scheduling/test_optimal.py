@@ -52,9 +52,7 @@ def proposed(effects: list[Effect]) -> list[Propose]:
 def test_two_that_use_more_go_before_one_of_better_rank() -> None:
     core, _ = core_of("abcd", arc("narrow", "bc", runtime=1), arc("left", "ab"), arc("right", "cd"))
     assert core._state.running.keys() == {"left", "right"}
-    assert (
-        str(core._state.queued["narrow"].reason) == "needs b (held by left, priority 0), c (held by right, priority 0)"
-    )
+    assert str(core._state.queued["narrow"].reason) == "waits for left: b; for right: c"
 
 
 def test_who_runs_is_not_ended_for_more_pairs_of_its_own_priority() -> None:

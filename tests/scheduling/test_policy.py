@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -14,19 +16,26 @@ from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
 from zscout.lab.replay import replay
 from zscout.lab.workload import Arrival, Workload, WorkloadRc
+from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
     ArcRequest,
     Effect,
+    Event,
     Granted,
+    HandedOver,
     HoldEnded,
     LeadTaken,
     Outcome,
+    Propose,
     RcJoined,
     RecoveredHold,
     Released,
     Requested,
     Tick,
+    Vote,
+    WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import SECOND, Grant, Ns, Place, Term
@@ -187,6 +196,108 @@ def test_no_host_ever_has_more_than_its_quota(strategy: StrategyName, seed: int)
 
     policy = SchedulingPolicy(max_running_per_host=2, patience=PATIENCE)
     assert not replay(work, watch, strategy=STRATEGIES[strategy](), policy=policy).unserved
+
+
+def limited(strategy: StrategyName, *rcs: str, seconds: int = 20) -> Core:
+    return core_of(strategy, SchedulingPolicy(max_runtime=seconds * SECOND), *rcs)
+
+
+def ended(effects: list[Effect]) -> list[tuple[str, Outcome, str, bool]]:
+    found = [effect for effect in effects if isinstance(effect, HoldEnded)]
+    return [(one.arc, one.outcome, one.reason.code, one.requeued) for one in found]
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_the_longest_time_ends_what_is_kept_though_nobody_waits(strategy: StrategyName) -> None:
+    core = limited(strategy, "robot/a")
+    core.handle(SECOND, Requested(replace(request("kept", "robot/a", priority=11), keep=True)))
+    assert not ended(core.handle(11 * SECOND, Tick()))
+    wakes = [effect.at for effect in core.handle(12 * SECOND, Tick()) if isinstance(effect, WakeAt)]
+    assert not wakes, "it was told already when to wake"
+    assert core._wake == 21 * SECOND
+    assert not ended(core.handle(21 * SECOND - 1, Tick()))
+    assert ended(core.handle(21 * SECOND, Tick())) == [("kept", Outcome.COMPLETED, "limit", False)]
+    assert running(core) == set()
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_nobody_is_given_more_than_the_longest_time(strategy: StrategyName) -> None:
+    core = limited(strategy, "robot/a")
+    core.handle(0, Requested(request("long", "robot/a", seconds=60)), Requested(request("next", "robot/a", seconds=30)))
+    effects = core.handle(20 * SECOND, Tick())
+    assert ended(effects) == [("long", Outcome.COMPLETED, "limit", False)]
+    assert running(core) == {"next"}
+
+
+def test_the_longest_time_is_counted_from_the_beginning_of_the_hold_whoever_leads_and_has_it() -> None:
+    core = Core(policy=SchedulingPolicy(max_runtime=20 * SECOND))
+    term, old = Term(2, "rcm/b"), Term(1, "rcm/a")
+    kept = replace(request("kept", "robot/a"), keep=True)
+    stands = RecoveredHold(kept, Place(old, 1), Grant(old, 1), 5 * SECOND, 15 * SECOND)
+    core.handle(16 * SECOND, RcJoined("robot/a", sharable=False), LeadTaken(term, (stands,)))
+    core.handle(17 * SECOND, HandedOver("kept", "h/other", "moved"))
+    assert not ended(core.handle(25 * SECOND - 1, Tick()))
+    assert ended(core.handle(25 * SECOND, Tick())) == [("moved", Outcome.COMPLETED, "limit", False)]
+
+
+def test_a_hold_that_is_too_long_already_ends_with_the_first_who_says_so() -> None:
+    core = Core(policy=SchedulingPolicy(max_runtime=20 * SECOND))
+    term, old = Term(2, "rcm/b"), Term(1, "rcm/a")
+    stands = RecoveredHold(request("long", "robot/a", seconds=60), Place(old, 1), Grant(old, 1), 0, 60 * SECOND)
+    effects = core.handle(30 * SECOND, RcJoined("robot/a", sharable=False), LeadTaken(term, (stands,)))
+    assert ended(effects) == [("long", Outcome.COMPLETED, "limit", False)]
+
+
+@pytest.mark.parametrize("strategy", ALL)
+@pytest.mark.parametrize("seed", range(times(20)))
+def test_no_hold_is_ever_longer_than_the_longest_time(strategy: StrategyName, seed: int) -> None:
+    work = workload(seed, kept=0.5)
+    longest = 2 * SECOND
+    arrivals = tuple(replace(one, request=_shorter(one.request, longest)) for one in work.arrivals)
+    ledger = Ledger(work.rcs, [one.request for one in arrivals])
+    since: dict[str, Ns] = {}
+    reached = 0
+
+    def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
+        nonlocal reached
+        ledger.take(now, core, effects)
+        for effect in effects:
+            if isinstance(effect, Granted):
+                since[effect.arc] = now
+            elif isinstance(effect, HoldEnded):
+                assert now - since.pop(effect.arc) <= longest
+                reached += effect.reason.code == "limit"
+        assert all(now - start < longest for start in since.values())
+
+    # As the RCM does, it looks again when the core says so.
+    core = Core(STRATEGIES[strategy](), SchedulingPolicy(patience=PATIENCE, max_runtime=longest))
+    play(core, Workload(work.rcs, arrivals), watch)
+    assert reached
+    assert not core._state.queued
+
+
+def _shorter(one: ArcRequest, longest: Ns) -> ArcRequest:
+    return replace(one, min_runtime=min(one.min_runtime, longest))
+
+
+def play(core: Core, work: Workload, watch: Callable[[Ns, Core, list[Effect]], None]) -> None:
+    """A workload to its end, by the wakes of the core alone."""
+    capacity = {rc.name: rc.capacity for rc in work.rcs if rc.sharable}
+
+    def vote(asked: Propose) -> Vote:
+        return Vote(asked.proposal, accept=not excess(capacity[asked.rc], asked.holders.items()))
+
+    def step(now: Ns, events: list[Event]) -> None:
+        for effects in play_instant(core, now, events, vote):
+            watch(now, core, effects)
+
+    step(0, [RcJoined(rc.name, rc.sharable) for rc in work.rcs])
+    left = sorted(work.arrivals, key=lambda one: one.at)
+    while left or core._state.running:
+        at = min([*(one.at for one in left[:1]), *([core._wake] if core._wake is not None else [])])
+        events: list[Event] = [Requested(one.request) for one in left if one.at == at]
+        left = [one for one in left if one.at > at]
+        step(at, events or [Tick()])
 
 
 def replay_rcs(*names: str) -> tuple[WorkloadRc, ...]:

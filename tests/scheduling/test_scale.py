@@ -232,9 +232,9 @@ def test_the_words_for_who_asks_are_those_of_now() -> None:
     core = Core()
     core.handle(0, RcJoined("robot/a", sharable=False))
     core.handle(0, *[Requested(ArcRequest(f"a{number}", "h/c", {"robot/a": {}}, 0, SECOND)) for number in range(20)])
-    assert reason_of(core) == str(last_of(core).reported) == "needs robot/a (held by a0, priority 0)"
+    assert reason_of(core) == str(last_of(core).reported) == "waits for a0: robot/a"
     core.handle(1, Released("a0"))
-    assert reason_of(core) == "needs robot/a (held by a1, priority 0)"
+    assert reason_of(core) == "waits for a1: robot/a"
     assert last_of(core).ahead == 17
     core.handle(2, RcLost("robot/a"))
     assert reason_of(core) == str(last_of(core).reported) == "robot/a not on the mesh"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from fractions import Fraction
 
 import pytest
@@ -25,8 +26,9 @@ POLICY = SchedulingPolicy(patience=PATIENCE)
 RADIO = WorkloadRc("radio/rf", sharable=True, capacity={"rate": Fraction(10)})
 
 
-def workload(seed: int) -> Workload:
-    """A busy stream of one priority: ARCs of any width, some of all RCs there are, half the time a radio."""
+def workload(seed: int, kept: float = 0.0) -> Workload:
+    """A busy stream of one priority: ARCs of any width, some of all RCs there are, half the time a radio. So large a
+    share of them is kept past its minimum runtime."""
     draw = random.Random(seed)  # noqa: S311
     robots = [f"robot/r{number}" for number in range(draw.randint(2, 5))]
     radio = draw.random() < 0.5
@@ -41,7 +43,10 @@ def workload(seed: int) -> Workload:
         arrivals.append(Arrival(at, request))
         at += draw.randint(0, 2 * runtime * width // len(robots) // SECOND * SECOND // 2 + SECOND // 2)
     rcs = (*map(WorkloadRc, robots), *((RADIO,) if radio else ()))
-    return Workload(rcs, tuple(arrivals))
+    keeps = random.Random(f"kept {seed}")  # noqa: S311
+    return Workload(
+        rcs, tuple(replace(one, request=replace(one.request, keep=keeps.random() < kept)) for one in arrivals)
+    )
 
 
 def check_bound(workload: Workload, played: Replay, patience: Ns) -> int:
@@ -82,6 +87,37 @@ def test_nobody_waits_longer_than_promised(part: int) -> None:
         assert not played.unserved, seed
         tried += check_bound(work, played, PATIENCE)
     assert tried > RUNS // PARTS, "hardly anybody had to wait for his patience: these runs prove nothing"
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_nobody_waits_longer_than_promised_for_what_is_kept(part: int) -> None:
+    """As `zscout request` asks by default: whoever waits, the kept ones of equal priority are gone in time."""
+    tried = outstayed = 0
+    for seed in range(part, RUNS, PARTS):
+        work = workload(seed, kept=(0.3, 0.7, 1.0)[seed % 3])
+        played = replay(work, strategy=Adaptive(), policy=POLICY)
+        assert not played.unserved, seed
+        tried += check_bound(work, played, PATIENCE)
+        runtime = {one.request.arc: one.request.min_runtime for one in work.arrivals}
+        outstayed += sum(hold.end - hold.start > runtime[hold.arc] for hold in played.holds)
+    assert tried > RUNS // PARTS, "hardly anybody had to wait for his patience: these runs prove nothing"
+    assert outstayed > RUNS // PARTS, "hardly anything was kept"
+
+
+def test_a_kept_hold_of_higher_priority_is_waited_for_as_long_as_the_fleet_lets_it_last() -> None:
+    policy = SchedulingPolicy(patience=PATIENCE, promise="all", max_runtime=2 * PATIENCE)
+    core = Core(Adaptive(), policy)
+    core.handle(0, RcJoined("robot/a", sharable=False), RcJoined("robot/b", sharable=False))
+    kept = ArcRequest("kept", "h/d", {"robot/b": {}}, 2, SECOND // 10, keep=True)
+    core.handle(0, Requested(kept), Requested(ArcRequest("busy", "h/d", {"robot/a": {}}, 2, PATIENCE)))
+    core.handle(1, Requested(ArcRequest("wide", "h/c", {"robot/a": {}, "robot/b": {}}, 1, SECOND)))
+    core.handle(PATIENCE + 1, Tick())
+    assert core._state.running.keys() == {"kept"}
+    # Its place is kept for the time at which that hold ends.
+    core.handle(PATIENCE + 2, Requested(ArcRequest("late", "h/d", {"robot/a": {}}, 2, PATIENCE)))
+    assert core._state.running.keys() == {"kept"}
+    core.handle(2 * PATIENCE, Tick())
+    assert core._state.running.keys() == {"wide"}
 
 
 def test_the_bound_is_one_that_priority_breaks() -> None:

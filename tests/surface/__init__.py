@@ -1,1 +1,1 @@
-"""What programs and people see of zscout, as it was before the rebuild, compared with today's."""
+"""What programs and people see of zscout, held against what was recorded."""

@@ -1,7 +1,7 @@
 """What commands print for programs on a mesh: each field of `--json`, and what stands in it.
 
-    python -m tests.surface.live           plays the story once and says what is not as before
-    python -m tests.surface.live --record  writes `live.json` from ten runs; done once, on the commit before
+    python -m tests.surface.live           plays the story once and says what is not as recorded
+    python -m tests.surface.live --record  writes `live.json` from ten runs
 
 A field is recorded with its values where these are the same in each run, numbers and random names aside. What
 not every run has may be missing. Of the texts for people each line that every run has is wanted.
@@ -294,7 +294,7 @@ def main() -> int:
         RECORDED.write_text(as_text(recorded([play() for _ in range(RUNS)])) + "\n")
         return 0
     found = differences(json.loads(RECORDED.read_text()), play())
-    print("\n".join(map(str, found)) or "All as before.")
+    print("\n".join(map(str, found)) or "All as recorded.")
     return 1 if found else 0
 
 

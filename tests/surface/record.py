@@ -1,15 +1,12 @@
-"""What programs and people see of zscout, as one JSON text: `python -m tests.surface.record`.
+"""Writes what programs and people see of zscout, as one JSON text, into `surface.json` beside this. Its difference
+in a commit is what that commit changes for them: read it before you commit it.
 
-It is printed, or with `--into FILE` written. `surface.json` beside this was recorded on the commit before
-the rebuild (0df377c) and is not recorded again: what changes on purpose is listed in `changes.py`. To record
-another commit, copy this folder into a checkout of it and run it there.
+    python -m tests.surface.record
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -66,14 +63,7 @@ def flat(value: Any, path: str) -> Iterator[tuple[str, object]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tests.surface.record", description=__doc__)
-    parser.add_argument("--into", type=Path, metavar="FILE", help="write it into FILE")
-    given = parser.parse_args()
-    found = text({name: collect() for name, collect in SECTIONS.items()}) + "\n"
-    if given.into is None:
-        sys.stdout.write(found)
-    else:
-        given.into.write_text(found)
+    RECORDED.write_text(text({name: collect() for name, collect in SECTIONS.items()}) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""500 random workloads under each strategy, against what came of them before the rebuild.
+"""500 random workloads under each strategy, against what came of them when they were recorded.
 
     python -m tests.surface.replays              compares with `replays.json` in two minutes
     python -m tests.surface.replays --each FILE  writes a digest of each replay, to find which differs
-    python -m tests.surface.replays --record     writes `replays.json`; done once, on the commit before
+    python -m tests.surface.replays --record     writes `replays.json`
 
 Three families: what `zscout replay --json` prints, what it prints for people, and the same workloads with
 kept holds, few clients and other policies, which no workload file has. A digest is the SHA-256 of what came

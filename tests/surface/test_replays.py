@@ -1,4 +1,4 @@
-"""Replays come out as before the rebuild: a block of each; `python -m tests.surface.replays` plays all."""
+"""Replays come out as they were recorded: a block of each; `python -m tests.surface.replays` plays all."""
 
 from __future__ import annotations
 

@@ -1,13 +1,11 @@
-"""Becomes another command that ends with its parent, as that of `zscout request`: run as a program, in a
-process group of its own already.
+"""Becomes another command that ends with its parent: run as a program.
 
-    python -I -S launch.py PARENT TTY COMMAND [ARG]...
+    python -I -S launch.py PARENT COMMAND [ARG]...
 
-Asks the kernel to end it when its parent (PARENT, a pid) dies, so that no command outlives its grant; takes
-the terminal (TTY, an open descriptor, or -1); then executes COMMAND. It imports nothing of zscout.
+Asks the kernel to end it when its parent (PARENT, a pid) dies, then executes COMMAND. It imports nothing of zscout.
+What holds devices has a guardian instead (`guardian.py`): its children must end as well.
 """
 
-import contextlib
 import ctypes
 import os
 import signal
@@ -25,17 +23,10 @@ def main() -> None:
     signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    parent, tty, command = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
+    parent, command = int(sys.argv[1]), sys.argv[2:]
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
         sys.exit(128 + signal.SIGTERM)
-    if tty >= 0:
-        # Its group is still a background one: it would be stopped for touching the terminal.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTOU})
-        with contextlib.suppress(OSError):
-            os.tcsetpgrp(tty, os.getpgrp())
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTTOU})
-        os.close(tty)
     try:
         os.execvp(command[0], command)  # noqa: S606 - this is what it is for
     except OSError as error:

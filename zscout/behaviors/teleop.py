@@ -27,6 +27,9 @@ LONGEST: Final = 0.6
 RETRY_AFTER: Final = 1.0
 """Seconds before the robot is asked for again after a refusal."""
 
+AT_LEAST: Final = 1.0
+"""Seconds before another operator may take over."""
+
 ASKS_AGAIN: Final = frozenset({"preempted", "lost"})
 """Ends of a hold after which the robot is still wanted; others mean that somebody ended it on purpose."""
 FIRST: Final = 0.6
@@ -222,7 +225,8 @@ class Teleop:
             raise results[0]
 
     async def _drive(self) -> None:
-        async with hold(self.client, self._name, self.needs.needs(), priority=self.priority, keep=True) as held:
+        how: dict[str, Any] = {"priority": self.priority, "min_runtime": AT_LEAST}
+        async with hold(self.client, self._name, self.needs.needs(), **how) as held:
             robot = self.robot = HeldRobot(held, self.needs)
             self.held = held
             self._set_state("driving", "")

@@ -10,18 +10,19 @@ import difflib
 import os
 import signal
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
-from contextlib import ExitStack, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from decimal import Decimal
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
 import click
+from msgspec.structs import replace
 
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
 from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import Role, Token, check_name, new_instance
-from zscout.messages import RcmState
+from zscout.keyexpr import check_name, new_instance
+from zscout.messages import RcmState, Who
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
@@ -132,6 +133,7 @@ async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = T
     from zscout.behaviors.client.client import Client
 
     async with await Client.connect(f"{role}-{new_instance()}", fleet=fleet or the_fleet()) as client:
+        client.who = replace(client.who or Who(), command=f"zscout {role}")
         if need_rcm:
             await see_rcm(client)
         yield client
@@ -139,31 +141,12 @@ async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = T
 
 async def see_rcm(client: Client) -> None:
     """Returns as soon as an RCM is seen. Raises NobodyThere."""
-    mesh, seen = client.mesh, asyncio.Event()
-    candidates: set[Token] = set()
+    from zscout.behaviors.client.client import NoRcm
 
-    def on_token(token: Token, alive: bool) -> None:
-        if token.role == Role.CANDIDATE:
-            (candidates.add if alive else candidates.discard)(token)
-        elif alive:
-            seen.set()
-
-    with ExitStack() as stack:
-        for role in (Role.RCM, Role.CANDIDATE):
-            stack.callback(mesh.watch(mesh.keys.alive_any(role), on_token).close)
-        if await until(seen.is_set, seen, LOOK_FOR_RCM):
-            return
-        if candidates and await until(seen.is_set, seen, LOOK_FOR_TAKEOVER - LOOK_FOR_RCM):
-            return
-    nobody = f"no RCM is on the mesh of fleet {client.fleet.name}"
-    if candidates:
-        names = ", ".join(sorted(token.host for token in candidates)[:5])
-        raise NobodyThere(f"{nobody}, though {names} could lead; see the log of zscout-node")
-    who = f"{mesh.links()} links to other programs" if mesh.links() else "no other program either"
-    raise NobodyThere(
-        f"{nobody} ({who}); start zscout-node on a host, or check the fleet's name, `interface` and `connect` in its "
-        "file (--fleet)"
-    )
+    try:
+        await client.see_rcm(LOOK_FOR_RCM, LOOK_FOR_TAKEOVER)
+    except NoRcm as nobody:
+        raise NobodyThere(str(nobody)) from None
 
 
 async def state_of(client: Client, arc: str | None = None, *, forecast: bool = False) -> RcmState:
@@ -216,14 +199,18 @@ async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
 def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> Failed:
     """What to raise where nobody knows a `name`: it lists names like it, or those that are known (the word is
     `listed`) and how many `more` there are, or it says that there is `nothing`."""
+    return Failed(f"no {what} {quoted(name)} is known{hint_at(name, known, nothing, listed, more)}")
+
+
+def hint_at(name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> str:
+    """The end of a line that says that nobody knows `name`: what was meant, perhaps."""
     names = sorted(set(known))
-    hint = f", {nothing}"
     if near := difflib.get_close_matches(name, names, n=3):
-        hint = f"; did you mean {' or '.join(near)}?"
-    elif names:
-        rest = len(names) - MAX_NAMED + more
-        hint = f"; {listed}: {', '.join(names[:MAX_NAMED])}" + (f" and {rest} more" if rest > 0 else "")
-    return Failed(f"no {what} {quoted(name)} is known{hint}")
+        return f"; did you mean {' or '.join(near)}?"
+    if not names:
+        return f", {nothing}"
+    rest = len(names) - MAX_NAMED + more
+    return f"; {listed}: {', '.join(names[:MAX_NAMED])}" + (f" and {rest} more" if rest > 0 else "")
 
 
 class Parsed(click.ParamType[T]):

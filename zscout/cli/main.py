@@ -128,6 +128,11 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         return error.exit_code, f"zscout: {_line(error.format_message())}"
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
         return INTERRUPTED, ""
+    if isinstance(error, ImportError):
+        from zscout.config.packages import how_to_get
+
+        missing = how_to_get(error)
+        return (COULD_NOT, f"zscout: this command {missing}") if missing else None
     # Only a failing command pays for these imports, and most have made them already.
     from zscout.behaviors.client.client import CommandRefused, RequestRefused
     from zscout.behaviors.client.placer_client import PlacerSilent
@@ -136,6 +141,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     from zscout.keyexpr import BadName
     from zscout.lab import LabError
     from zscout.mesh import MeshError
+    from zscout.messages import DOOR_CODES
 
     words = f"zscout: {_line(str(error))}"
     match error:
@@ -147,6 +153,8 @@ def explain(error: BaseException) -> tuple[int, str] | None:
             return BAD_INPUT, words
         case PlacerSilent():
             return NOBODY, words
+        case RequestRefused(code=code) if code in DOOR_CODES:
+            return BAD_INPUT, words
         case RequestRefused() | CommandRefused() | MeshError() | LabError():
             return COULD_NOT, words
     return None
@@ -200,7 +208,7 @@ def main(verbose: bool, **_: Any) -> None:
 
     \b
     Examples:
-      zscout request robot/scout33 radio/rf0:command_rate=5 -- ./survey.py
+      zscout request robot/scout33 radio/rf0:command_rate=5 -- bash
       zscout take robot/scout33
       zscout status --watch
       zscout why survey

@@ -1,14 +1,16 @@
-"""The [[rc]] tables of a node file: one struct for each driver, told apart by the key `driver`."""
+"""The [[rc]] tables of a node file: one struct for each driver that comes with zscout, told apart by the key `driver`.
+
+What other drivers may be told is known where they are loaded: `drivers/registry.py`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from decimal import Decimal
-from typing import Annotated, Final, TypeAlias
+from typing import Annotated, Any, Final, TypeAlias, get_args
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
-from zscout.config.strict import Where, amounts, check_name, check_rc_name, key, quoted, seconds
+from zscout.config.strict import Where, amounts, check_name, check_rc_name, convert, key, quoted, seconds
 from zscout.types import MAX_CHANNEL, MAX_ROBOT, SECOND, Ns
 
 MAX_CHANNELS: Final = 64
@@ -17,19 +19,41 @@ MAX_SOURCE: Final = 1_000
 """Characters of a port or source."""
 MAX_PARAMETERS: Final = 64
 """Capacities of one RC."""
+MAX_WORDS: Final = 64
+"""Of one command."""
 
 A_PORT: Final = 'port = "/dev/ttyUSB0"'
 AN_ID: Final = "that its packets carry, as in id = 33"
 A_RADIO: Final = 'that carries its halt, as in radio = "radio/rf0"'
+A_COMMAND: Final = 'safe = ["psu", "off"]'
 A_SOURCE: Final = 'source = "/dev/video0", or a table sources'
 
+Words: TypeAlias = tuple[str, ...]
+"""A program and its arguments; no shell reads them."""
+SETTLE: Final[Ns] = 5 * SECOND
 Activation: TypeAlias = Annotated[Ns, seconds("0", "3600", "From a grant until the device can be used.")]
 
 
-class RcTable(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="driver"):
-    """An RC that the node runs."""
+class AnyRc(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What every RC that a node runs is told, whatever its driver."""
 
     name: Annotated[str, key("`kind/name`.", example="robot/scout33")]
+    settle: Annotated[
+        Ns, seconds("0.5", "60", "A program that touches the device past its RC must end within, and a safe state.")
+    ] = SETTLE
+
+
+class RcTable(AnyRc, frozen=True, tag_field="driver"):
+    """An RC whose driver comes with zscout."""
+
+
+class PluginRc(AnyRc, frozen=True):
+    """An RC whose driver is installed beside zscout, which alone knows what it may be told."""
+
+    driver: str
+    options: Mapping[str, Any]
+    """As they stand in the file, unchecked."""
+    at: Where
 
 
 class ExclusiveRc(RcTable, frozen=True, tag="exclusive"):
@@ -73,6 +97,20 @@ class RobotRc(RcTable, frozen=True, tag="robot"):
     )
 
 
+class CommandRc(RcTable, frozen=True, tag="command"):
+    """A device that is switched by commands of one's own, run on the node, as the node's user."""
+
+    start: Annotated[Words, key("When somebody begins to hold it.", example=["psu", "on"])] = ()
+    stop: Annotated[Words, key("When that ends.", example=["psu", "save"])] = ()
+    safe: Annotated[Words, key("When nobody holds it, and as the node begins and ends.", example=["psu", "off"])] = ()
+    health: Annotated[Words, key("Whether it works: exit code 0.", example=["psu", "ping"])] = ()
+    every: Annotated[Ns, seconds("0.5", "3600", "From the end of one `health` to the next.")] = 10 * SECOND
+    timeout: Annotated[Ns, seconds("0.1", "600", "After which a command is killed, with all that it started.")] = (
+        5 * SECOND
+    )
+    activation: Activation = 0
+
+
 class VideoRc(RcTable, frozen=True, tag="video"):
     """A video channel."""
 
@@ -94,10 +132,30 @@ class FramegrabberRc(RcTable, frozen=True, tag="framegrabber"):
         return {"": self.source} if self.source is not None else self.sources or {}
 
 
-RcConfig: TypeAlias = ExclusiveRc | CapacityRc | RadioRc | RobotRc | VideoRc | FramegrabberRc
+BuiltInRc: TypeAlias = ExclusiveRc | CapacityRc | CommandRc | RadioRc | RobotRc | VideoRc | FramegrabberRc
+RcConfig: TypeAlias = BuiltInRc | PluginRc
+
+_BUILT_IN: Final[Any] = BuiltInRc
+BUILT_IN: Final = frozenset(str(rc.__struct_config__.tag) for rc in get_args(BuiltInRc))
+"""The names of the drivers that come with zscout."""
 
 
-def check_rc(rc: RcConfig, at: Where) -> None:
+def read_rc(table: Mapping[str, Any], at: Where) -> RcConfig:
+    """An [[rc]] table, checked as far as can be without its driver. Raises BadInput."""
+    driver = table.get("driver")
+    if isinstance(driver, str) and driver not in BUILT_IN:
+        common = {field.encode_name for field in structs.fields(AnyRc)}
+        told = convert({name: value for name, value in table.items() if name in common}, AnyRc, at)
+        options = {name: value for name, value in table.items() if name not in common | {"driver"}}
+        check_rc_name(told.name, at / "name")
+        check_name(driver, at / "driver")
+        return PluginRc(**structs.asdict(told), driver=driver, options=options, at=at)
+    rc: BuiltInRc = convert(table, _BUILT_IN, at)
+    _check_rc(rc, at)
+    return rc
+
+
+def _check_rc(rc: BuiltInRc, at: Where) -> None:
     """Refuses what no type can: names of another kind, sources that stand twice. Raises BadInput."""
     check_rc_name(rc.name, at / "name")
     if isinstance(rc, RadioRc | RobotRc | VideoRc | FramegrabberRc):
@@ -115,6 +173,11 @@ def check_rc(rc: RcConfig, at: Where) -> None:
             for parameter in rc.capacity:
                 check_name(parameter, at / "capacity")
             amounts(rc.capacity, at / "capacity")
+        case CommandRc():
+            if not (rc.start or rc.stop or rc.safe or rc.health):
+                raise (at / "safe").bad("is missing, and every other command too", f"add one, as in {A_COMMAND}")
+            for name in ("start", "stop", "safe", "health"):
+                _check_words(getattr(rc, name), at / name)
         case RadioRc():
             _check_source(rc.port, at / "port", A_PORT)
         case RobotRc():
@@ -143,3 +206,15 @@ def check_rc(rc: RcConfig, at: Where) -> None:
 def _check_source(text: str, at: Where, example: str) -> None:
     if not text or len(text) > MAX_SOURCE or not text.isprintable():
         raise at.bad(f"{quoted(text)} can't be opened", f"name what to open, as in {example}")
+
+
+def _check_words(words: Words, at: Where) -> None:
+    if len(words) > MAX_WORDS:
+        raise at.bad(f"has {len(words):,} words", f"at most {MAX_WORDS} are allowed; put them into a script")
+    if words and not words[0]:
+        raise at.bad("has no program", f"name one first, as in {A_COMMAND}")
+    for number, word in enumerate(words):
+        if "\0" in word or len(word) > MAX_SOURCE:
+            raise at.item(number).bad(
+                f"{quoted(word)} can't be an argument", f"write {MAX_SOURCE:,} characters at most"
+            )

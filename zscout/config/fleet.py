@@ -5,19 +5,36 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
 from zscout.config.scheduling_policy import DEFAULT, PATIENCE, Preempt, Promise, SchedulingPolicy, StrategyName
-from zscout.config.strict import BadInput, Where, check_name, check_names, check_unique, key, quoted, read_toml, seconds
+from zscout.config.strict import (
+    BadInput,
+    Where,
+    check_name,
+    check_names,
+    check_rc_name,
+    check_unique,
+    key,
+    quoted,
+    read_toml,
+    seconds,
+)
 from zscout.types import SECOND, Ns
 
 FLEET_VARIABLE: Final = "ZSCOUT_FLEET"
 """Environment variable with the path of the fleet file, for the CLI."""
 MAX_CANDIDATES: Final = 1_000
 MAX_ENDPOINTS: Final = 256
+MIN_RUNTIME: Final[Ns] = 60 * SECOND
+"""Default, in ns."""
+MAX_HOSTS: Final = 1_000
+MAX_DEVICES: Final = 1_000
+"""That a fleet file expects of one host."""
 
 _ENDPOINT: Final = re.compile(
     r"(?P<protocol>[a-z]+)/(?P<host>\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9_.-]+):(?P<port>[0-9]{1,5})"
@@ -49,6 +66,9 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
     max_payload: Annotated[int, key("Of one request.", 1_024, 16_777_216, unit="bytes")] = 65_536
     max_running_per_host: Annotated[
         int, key("Running ARCs of all clients of one host, but for an operator's; 0: any number.", 0, 100_000)
+    ] = 0
+    max_runtime: Annotated[
+        Ns, seconds("0", "31622400", "After this long every hold ends as completed, whoever's it is; 0: never.")
     ] = 0
 
 
@@ -105,6 +125,10 @@ class Fleet(Struct, frozen=True):
     limits: RcmLimits
     timing: Timing
     placement: PlacementPolicy = DEFAULT_PLACEMENT
+    min_runtime: Ns = MIN_RUNTIME
+    """For how long a hold is protected where its program says nothing."""
+    devices: Mapping[str, tuple[str, ...]] = {}
+    """The RCs that are expected, by their host."""
 
     @property
     def operator_priority(self) -> int:
@@ -134,6 +158,9 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     promise: Annotated[
         Promise, key("Whom an ARC that is due goes before: equal and lower priority, or all but operators.")
     ] = DEFAULT.promise
+    min_runtime: Annotated[
+        Ns, seconds("0.001", "31622400", "For how long a hold is protected where its program says nothing.")
+    ] = MIN_RUNTIME
 
 
 class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
@@ -144,6 +171,10 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
     limits: RcmLimits = RcmLimits()
     timing: Timing = Timing()
     placement: PlacementPolicy = DEFAULT_PLACEMENT
+    devices: Annotated[
+        Mapping[str, Annotated[tuple[str, ...], Meta(max_length=MAX_DEVICES)]],
+        key("The RCs that are expected there, by host.", most=MAX_HOSTS, example={"anvil": ["robot/scout33"]}),
+    ] = {}
 
 
 def load_fleet(path: Path, named_by: str = "") -> Fleet:
@@ -172,6 +203,7 @@ def _fleet(file: FleetFile, top: Where) -> Fleet:
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")
     _check_timing(file.timing, mesh.lease, top / "timing")
+    _check_devices(file.devices, top / "devices")
     if table.promise != "equals" and (table.strategy != "adaptive" or not table.patience):
         raise (at / "promise").bad(
             f'is "{table.promise}", but only "adaptive" with some patience promises anything',
@@ -183,8 +215,32 @@ def _fleet(file: FleetFile, top: Where) -> Fleet:
         patience=table.patience or None,
         promise=table.promise,
         max_running_per_host=file.limits.max_running_per_host or None,
+        max_runtime=file.limits.max_runtime or None,
     )
-    return Fleet(table.name, table.candidates, table.strategy, policy, mesh, file.limits, file.timing, file.placement)
+    return Fleet(
+        name=table.name,
+        candidates=table.candidates,
+        strategy=table.strategy,
+        scheduling=policy,
+        mesh=mesh,
+        limits=file.limits,
+        timing=file.timing,
+        placement=file.placement,
+        devices=file.devices,
+        min_runtime=min(table.min_runtime, policy.max_runtime or table.min_runtime),
+    )
+
+
+def _check_devices(devices: Mapping[str, tuple[str, ...]], at: Where) -> None:
+    homes: dict[str, str] = {}
+    for host, rcs in devices.items():
+        check_name(host, at / host)
+        for number, rc in enumerate(rcs):
+            here = (at / host).item(number)
+            check_rc_name(rc, here)
+            if rc in homes:
+                raise here.bad(f"{quoted(rc)} stands at {homes[rc]} already", "name its one home")
+            homes[rc] = host
 
 
 def _check_timing(timing: Timing, lease: float, at: Where) -> None:

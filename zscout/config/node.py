@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, Struct, structs
 
-from zscout.config.devices import RcConfig, check_rc
+from zscout.config.devices import RcConfig, read_rc
 from zscout.config.fleet import Endpoints, Fleet, check_links, default_fleet, ip_of, load_fleet
 from zscout.config.strict import Where, check_name, check_names, check_unique, key, quoted, read_toml
 from zscout.keyexpr import valid_name
@@ -23,6 +23,10 @@ MAX_STARTED: Final = 256
 FRAMES: Final = 2.0
 """Pictures a second that a recorder shows of each camera, by default."""
 
+STATE: Final = 'state = "/var/lib/zscout"'
+RECORDED: Final = 5_000
+"""Megabytes of recordings that are kept, by default."""
+
 LoadKind = bool | Literal["tree"]
 
 
@@ -36,6 +40,8 @@ class RecorderConfig(Struct, frozen=True):
     port: int
     frames: float = FRAMES
     """Frames a second shown of each camera; 0: none."""
+    limit: int = RECORDED
+    """Megabytes (10^6 bytes) of this fleet's recordings that are kept."""
 
 
 class ComponentsConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,6 +68,8 @@ class Node(Struct, frozen=True):
     """None: this node does not record."""
     labels: tuple[str, ...] = ()
     components: ComponentsConfig = ComponentsConfig()
+    state: Path | None = None
+    """The folder of what must outlive the node (`state_folder.py`); None: where such folders usually are."""
 
 
 # The file as it is written
@@ -77,6 +85,9 @@ class NodeTable(Struct, frozen=True, forbid_unknown_fields=True):
         LoadKind, key('Whether it reports its load; "tree": only that of this node and what it started.')
     ] = True
     labels: Annotated[tuple[str, ...], key("For components that need them.", most=MAX_LABELS, example=["gpu"])] = ()
+    state: Annotated[
+        str | None, key("The folder of what must outlive the node, relative to this file.", example="/var/lib/zscout")
+    ] = None
 
 
 class RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -87,6 +98,9 @@ class RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
     port: Annotated[int, key("TCP port of the live view.", 1, 65_535)] = 9876
     allow_remote: Annotated[bool, key("Whether `bind` may let other hosts in.")] = False
     frames: Annotated[float, key("Shown of each camera; 0: none.", 0, 30, unit="frames/s")] = FRAMES
+    limit: Annotated[
+        int, key("Kept of this fleet's recordings in `path`; the oldest go first.", 300, 1_000_000, unit="MB")
+    ] = RECORDED
 
 
 class NodeMeshTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,7 +116,8 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
 
     node: NodeTable = NodeTable()
     mesh: NodeMeshTable = NodeMeshTable()
-    rc: Annotated[tuple[RcConfig, ...], Meta(max_length=MAX_RCS)] = ()
+    rc: Annotated[tuple[dict[str, Any], ...], Meta(max_length=MAX_RCS)] = ()
+    """Each is read by itself: which keys it may have is its driver's."""
     recorder: RecorderTable | None = None
     components: ComponentsConfig = ComponentsConfig()
 
@@ -129,24 +144,30 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     check_names(file.node.labels, top / "node" / "labels")
     for number, kind in enumerate(file.components.kinds or ()):
         check_name(kind, (top / "components" / "kinds").item(number))
-    check_unique((rc.name for rc in file.rc), top / "rc", "name")
-    for number, rc in enumerate(file.rc):
-        check_rc(rc, (top / "rc").item(number, rc.name))
+    rcs = tuple(read_rc(table, (top / "rc").item(number, table.get("name"))) for number, table in enumerate(file.rc))
+    check_unique((rc.name for rc in rcs), top / "rc", "name")
     return Node(
         host=host,
         fleet=structs.replace(fleet, mesh=mesh),
         candidate=file.node.candidate,
         load=file.node.load,
-        rcs=file.rc,
+        rcs=rcs,
         recorder=None if file.recorder is None else _recorder(file.recorder, folder, top / "recorder"),
         labels=file.node.labels,
         components=file.components,
+        state=None if file.node.state is None else _folder(file.node.state, folder, top / "node" / "state", STATE),
     )
 
 
+def _folder(text: str, folder: Path, at: Where, example: str) -> Path:
+    """The folder of this name, relative to that of the file. Raises BadInput."""
+    if not text or "\0" in text:
+        raise at.bad(f"{quoted(text)} is no folder", f"name one, as in {example}")
+    return folder / text
+
+
 def _recorder(table: RecorderTable, folder: Path, at: Where) -> RecorderConfig:
-    if not table.path or "\0" in table.path:
-        raise (at / "path").bad(f"{quoted(table.path)} is no folder", 'name one, as in path = "runs"')
+    path = _folder(table.path, folder, at / "path", 'path = "runs"')
     address = ip_of("127.0.0.1" if table.bind == "localhost" else table.bind)
     if address is None:
         raise (at / "bind").bad(f"{quoted(table.bind)} is not an IP address", 'write one, as in "127.0.0.1"')
@@ -155,4 +176,4 @@ def _recorder(table: RecorderTable, folder: Path, at: Where) -> RecorderConfig:
             f"{quoted(table.bind)} shows the recording to other hosts",
             'write "127.0.0.1", or add allow_remote = true if that is meant',
         )
-    return RecorderConfig(folder / table.path, str(address), table.port, table.frames)
+    return RecorderConfig(path, str(address), table.port, table.frames, table.limit)

@@ -40,6 +40,13 @@ _AT: Final = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document
 _PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _DEEP_KEY: Final = re.compile(rf"""(?<![\w"'\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MAX_DEPTH}}}""")
 """A dotted key that is longer than any here. tomllib takes hours over one that fills the file."""
+_NUMBER: Final = r"([0-9]{1,19}(?:\.[0-9]{1,18})?|\.[0-9]{1,18})"
+_DURATION: Final = re.compile(
+    f"{_NUMBER}|(?:{_NUMBER}d)?(?:{_NUMBER}h)?(?:{_NUMBER}m(?!s))?(?:{_NUMBER}s)?(?:{_NUMBER}ms)?"
+)
+_UNITS: Final = tuple(map(Decimal, ("1", "86400", "3600", "60", "1", "0.001")))
+DURATIONS: Final = "a number of seconds, or with units: 1.5, 300ms, 90s, 5m, 2h, 1d12h"
+"""How people write durations."""
 _NAME_RULE: Final = f'1 to {MAX_NAME} letters A to Z, digits, "_", "." or "-"'
 
 
@@ -122,7 +129,7 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
     """Reads TOML into a struct type; `source` names the file in errors. Raises BadInput.
 
     Numbers with a point are read as Decimal, exactly; struct fields may be Decimal, float, int, str, bool,
-    Literal, lists and tables of these, and structs (let them forbid unknown fields)."""
+    Literal, lists and tables of these, Any, structs and dataclasses. A key that they do not have is refused."""
     where = Where(source)
     if deep := _DEEP_KEY.search(text):
         line = text.count("\n", 0, deep.start()) + 1
@@ -146,7 +153,7 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
 
 
 def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msgspec's word
-    """What TOML or JSON gave, as a struct. Raises BadInput."""
+    """What TOML or JSON gave, as a struct or dataclass. Raises BadInput, TypeError for a type that is none of these."""
     try:
         return msgspec.convert(_checked(inspect.type_info(type), data, where), type)
     except msgspec.ValidationError as error:  # what only msgspec knows of, as other bounds than `key` gives
@@ -212,8 +219,16 @@ def key(
     return Meta(**bounds, description=description, examples=examples, extra=extra or None)
 
 
+def parse_duration(text: str) -> Decimal | None:
+    """Seconds from `5`, `1.5`, `90s`, `300ms`, `5m`, `2h` or `1d12h`; None for what is no duration."""
+    found = _DURATION.fullmatch(text)
+    if found is None or not any(found.groups()):
+        return None
+    return sum((Decimal(part) * unit for part, unit in zip(found.groups(), _UNITS, strict=True) if part), Decimal(0))
+
+
 def seconds(low: str, high: str, description: str) -> Meta:
-    """The same for a duration: written in seconds, held as whole nanoseconds."""
+    """The same for a duration: written in seconds or as `parse_duration` has it, held as whole nanoseconds."""
     return Meta(description=description, extra={"unit": "s", "low": Decimal(low), "high": Decimal(high)})
 
 
@@ -247,8 +262,11 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
     """`value`, as TOML gave it, with durations in ns. Raises BadInput where it is not of this kind."""
     match kind:
         case inspect.Metadata(extra={"low": low, "high": high}):
+            value = _seconds(value, where)
             _check_leaf(inspect.DecimalType(), value, where)
             return seconds_to_ns(Decimal(str(value)), where, low=low, high=high)
+        case inspect.Metadata(type=inspect.FloatType() as of, extra={"unit": "s"}):
+            return _checked(of, _seconds(value, where), where)
         case inspect.Metadata(type=of):
             return _checked(of, value, where)
         case inspect.LiteralType(values=values):
@@ -259,16 +277,21 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
             table = _expect(dict, value, where, "a table")
             return _checked_struct(_tagged(structs, table, where), table, where)
         case inspect.UnionType(types=kinds):  # else only X | None: absent in TOML, or X
-            return _checked(next(kind for kind in kinds if not isinstance(kind, inspect.NoneType)), value, where)
-        case inspect.StructType():
+            kind, *others = (kind for kind in kinds if not isinstance(kind, inspect.NoneType))
+            if others:
+                raise TypeError(f"{where.key} may be of several types, which no file can be read into")
+            return _checked(kind, value, where)
+        case inspect.StructType() | inspect.DataclassType():
             wanted = "a table" if where.key.endswith("]") else f"a table, under [{where.key}]"
             return _checked_struct(kind, _expect(dict, value, where, wanted), where)
         case inspect.DictType(value_type=of):
             table = _expect(dict, value, where, "a table")
             _check_count(len(table), kind.max_length, where)
             return {key: _checked(of, inner, where / key) for key, inner in table.items()}
+        case inspect.AnyType():
+            return value
         case inspect.ListType(item_type=of) | inspect.VarTupleType(item_type=of):
-            tables = isinstance(of, inspect.StructType | inspect.UnionType)
+            tables = isinstance(of, inspect.StructType | inspect.DataclassType | inspect.UnionType | inspect.DictType)
             items = _expect(list, value, where, f"tables, each under [[{where.key}]]" if tables else "a list")
             _check_count(len(items), kind.max_length, where)
             return [
@@ -278,6 +301,16 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
         case _:
             _check_leaf(kind, value, where)
     return value
+
+
+def _seconds(value: object, where: Where) -> object:
+    """A duration that is written as a text, in seconds; all else as it is."""
+    if not isinstance(value, str):
+        return value
+    found = parse_duration(value)
+    if found is None:
+        raise where.bad(f"{quoted(value)} is not a duration", f"write {DURATIONS}")
+    return found
 
 
 def _tagged(structs: Iterable[inspect.Type], table: Mapping[str, object], where: Where) -> inspect.StructType:
@@ -298,13 +331,17 @@ def _tagged(structs: Iterable[inspect.Type], table: Mapping[str, object], where:
     return known[str(tag)]
 
 
-def _checked_struct(kind: inspect.StructType, table: Mapping[str, object], where: Where) -> dict[str, object]:
+def _checked_struct(
+    kind: inspect.StructType | inspect.DataclassType, table: Mapping[str, object], where: Where
+) -> dict[str, object]:
     fields = {field.encode_name: field for field in kind.fields}
-    found: dict[str, object] = {kind.tag_field: kind.tag} if kind.tag_field else {}
+    found: dict[str, object] = {}
+    if isinstance(kind, inspect.StructType) and kind.tag_field:
+        found[kind.tag_field] = kind.tag
     for key in table:
         if key not in fields and key not in found:
             near = difflib.get_close_matches(key[:MAX_NAME], fields, n=3)
-            known = ", ".join(sorted((*fields, *found)))
+            known = ", ".join(sorted((*fields, *found))) or "none"
             raise (where / key).bad("unknown key", f"did you mean {_either(near)}?" if near else f"known here: {known}")
     for name, field in fields.items():
         if name in table:
@@ -336,6 +373,8 @@ def _check_choice(values: Iterable[object], value: object, where: Where) -> None
 
 def _check_leaf(kind: inspect.Type, value: object, where: Where) -> None:
     """Beyond the type and the bounds, refuses NaN, infinities and what is unreasonably long when exact."""
+    if type(kind) not in _LEAVES:
+        raise TypeError(f"{where.key} has a type that no file can be read into: {kind}")
     types, wanted = _LEAVES[type(kind)]
     low, high = getattr(kind, "ge", None), getattr(kind, "le", None)
     if low is not None and high is not None:

@@ -38,6 +38,8 @@ BITS_PER_BYTE: Final = 10
 """On the line: a start bit, eight of data, a stop bit."""
 RESERVE: Final = Fraction(1, 10)
 """Share of the line that is kept for halts, stops and what is sent again."""
+DEFAULT_RATE: Final = Fraction(5)
+"""Packets a second, of the full size."""
 MAX_RATE: Final = Fraction(5_000)
 """Bytes a second that are counted on at most: a faster line is not what holds commands up."""
 
@@ -59,12 +61,21 @@ class Share:
         return self.rate * self.size
 
 
-def share_of(params: Mapping[str, Decimal]) -> Share:
-    """The share that bandwidth parameters ask for. Raises ValueError with a reason in words."""
+def room(rate: Fraction) -> Fraction:
+    """Bytes a second that the holders of a line of `rate` bytes a second may send."""
+    return rate * (1 - RESERVE)
+
+
+def default_rate(rate: Fraction) -> Fraction:
+    """Packets a second that a holder books on such a line who does not say."""
+    return min(DEFAULT_RATE, room(rate) / MAX_PACKET)
+
+
+def share_of(params: Mapping[str, Decimal], default: Fraction = DEFAULT_RATE) -> Share:
+    """The share that bandwidth parameters ask for; `default` is the rate where they have none. Raises ValueError with a
+    reason in words."""
     amounts = exact_amounts(params)
-    rate = amounts.get("command_rate")
-    if rate is None:
-        raise ValueError("command_rate is missing: say how many packets a second, as in command_rate = 5")
+    rate = amounts.get("command_rate", default)
     size = amounts.get("packet_size", Fraction(MAX_PACKET))
     if size < OVERHEAD:
         raise ValueError(f"packet_size is {_text(size)}; the shortest packet has {OVERHEAD} bytes")
@@ -79,20 +90,20 @@ def urgent_burst(holders: int) -> int:
 def longest_wait(rate: Fraction, shares: Iterable[Share]) -> Fraction:
     """Seconds from when a packet enters the queue until it is through the line: the delay bound above."""
     sizes = [share.size for share in shares]
-    return (MAX_PACKET + sum(sizes) + urgent_burst(len(sizes))) / (rate * (1 - RESERVE))
+    return (MAX_PACKET + sum(sizes) + urgent_burst(len(sizes))) / room(rate)
 
 
 def objection(rate: Fraction, bound: Fraction, shares: Iterable[Share]) -> str:
     """Why a line of `rate` bytes a second can't carry these shares, no packet waiting longer than `bound`
     seconds; empty if it can."""
     shares = list(shares)
-    room = rate * (1 - RESERVE)
+    most = room(rate)
     wanted = sum((share.bytes_per_second for share in shares), Fraction(0))
-    if wanted > room:
+    if wanted > most:
         sizes = {share.size for share in shares if share.rate}
         size = sizes.pop() if len(sizes) == 1 else Fraction(1)
         unit = "bytes/s" if size == 1 else f"packets/s of {_text(size)} bytes"
-        return f"its holders would send {_text(wanted / size)} of {_text(room / size)} {unit}"
+        return f"its holders would send {_text(wanted / size)} of {_text(most / size)} {unit}"
     wait = longest_wait(rate, shares) if shares else Fraction(0)
     if wait > bound:
         return f"a packet could wait {_text(wait)} s, the bound is {_text(bound)} s"

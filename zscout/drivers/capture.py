@@ -40,6 +40,9 @@ MISSES: Final = 3
 """Reads in a row that may fail: FFmpeg gives up a picture that it can't make out, and reads on."""
 EXIT_WAIT: Final = 2.5
 """Seconds that the end of the process waits for threads that OpenCV holds up: longer than their timeouts."""
+NOT_OPEN: Final = "not open yet"
+NO_PICTURE: Final = "open, no picture yet"
+"""The health of a source that may come yet."""
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
@@ -64,7 +67,7 @@ class Capture:
     def __init__(self, source: str, *, open_timeout: float = 2.0, read_timeout: float = 1.5) -> None:
         self.source = source
         self.kind = kind_of(source)
-        self.health = "not open yet"
+        self.health = NOT_OPEN
         """`ok` while pictures come; or in words what is wrong, without passwords that are in a URL."""
         self.number = 0
         """Of the newest picture; 0 while there was none."""
@@ -92,6 +95,11 @@ class Capture:
         with self._new_picture:
             self._new_picture.notify_all()
         self._thread.join(wait)
+
+    @property
+    def failed(self) -> bool:
+        """Whether its source could not be opened, or gives no pictures any more."""
+        return self.health not in (NOT_OPEN, NO_PICTURE, "ok")
 
     @property
     def alive(self) -> bool:
@@ -135,7 +143,7 @@ class Capture:
                 return
             self.opened += 1
             if self.number == 0:
-                self.health = "open, no picture yet"
+                self.health = NO_PICTURE
             period = _file_period(video) if self.kind == "file" else 0.0
             misses = 0
             while not self._stop.is_set():

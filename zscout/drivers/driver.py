@@ -1,15 +1,21 @@
-"""What a driver does for its device, and what its RC gives it. `resource_controller.py` has that RC."""
+"""What a driver does for its device, and what its RC gives it. `resource_controller.py` has that RC.
+
+All that the author of a driver needs can be imported from here; docs/how-to/write-a-driver.md tells how."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol, Self
+
+from msgspec import Struct
 
 from zscout.drivers.holds import HoldTable
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import Declaration, Mesh, Refused, Supervisor
-from zscout.messages import Amounts, Figures, Holder, ProposedHolder
+from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder
 from zscout.types import SECOND, Ns
+
+__all__ = ["Driver", "Figures", "Holder", "Parameter", "ProposedHolder", "RcDirectory", "RcHandle", "Refused"]
 
 NODE: Final = "node"
 """The client name of a node."""
@@ -41,11 +47,18 @@ class RcHandle(Protocol):
         """The driver votes by other rules from now on: earlier votes are void."""
 
 
+class NoOptions(Struct, frozen=True):
+    """Of a driver that is told nothing."""
+
+
 class Driver:
     """What a device does. The defaults are those of an exclusive device without commands of its own.
 
     Everything runs in the node's event loop, one call at a time; nothing may block."""
 
+    Options: ClassVar[type] = NoOptions
+    """What its table in the node file holds besides what every RC has: a msgspec struct or a dataclass. A key that is
+    not in it, a wrong type and a missing value end the node before it begins, in one line."""
     sharable = False
     """Whether it takes several holders, by its vote."""
     relays = False
@@ -53,6 +66,16 @@ class Driver:
     robot's does so at its radio."""
     activation: float = 0.0
     """Seconds after a grant until the device has its full use, like a camera that warms up."""
+
+    def __init__(self, options: Any = None) -> None:
+        """`options`, of the type `Options`. Raise ValueError, with one line that says what to mend, for bad ones; the
+        device itself is opened in `open`."""
+        self.options = options
+
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        """The driver of a device that has these `Options`."""
+        return cls(options)
 
     async def open(self, rc: RcHandle) -> None:
         """The RC is about to be offered. A device that is not there is no error: call `rc.fail`, go on
@@ -84,6 +107,11 @@ class Driver:
     def vote(self, holders: list[ProposedHolder]) -> str:
         """Why a sharable device can't carry these holders; empty if it can, and any subset of them."""
         return ""
+
+    def parameters(self) -> list[Parameter] | None:
+        """The bandwidth parameters that it knows: who asks for another one, or for more than the bound of one, is
+        refused at once. None: it does not say, and votes on whatever comes."""
+        return None
 
     def capacity(self) -> Amounts:
         """Bounds to show to people, by bandwidth parameter."""

@@ -2,8 +2,8 @@
 
 It is tuned to the video RC that is in the gang of its holder. Three things happen side by side: a capture reads the
 source (`capture.py`), a pump encodes and publishes in a thread of its own, and the event loop supervises both: a
-framegrabber that has no picture for LOST_AFTER while it is held reports itself lost, goes on trying, and is back with
-the first picture."""
+framegrabber that has no picture as its node begins, or for LOST_AFTER while it is held, reports itself lost, goes on
+trying, and is back with the first picture."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ import threading
 from collections import Counter, deque
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import cv2
 import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from zscout.config.devices import FramegrabberRc
 from zscout.drivers.airtime import Bucket
 from zscout.drivers.capture import Capture, CapturedFrame, seconds
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.mesh import Refused
-from zscout.messages import MAX_FRAME, Figures, FrameHead, Holder
+from zscout.messages import MAX_FRAME, Figures, FrameHead, Holder, Parameter
 from zscout.types import SECOND
 
 if TYPE_CHECKING:
@@ -38,6 +39,9 @@ LOST_AFTER: Final = 5.0
 """Seconds without a picture after which a framegrabber that is held is lost."""
 TRY_NEXT: Final = 5.0
 """Seconds that a lost framegrabber tries one of several sources."""
+OPENING: Final = 1.0
+"""Seconds that a node waits for a first picture before it offers the RC as lost."""
+LOOK: Final = 0.02
 CHECK: Final = 0.2
 """Seconds from one look at the source to the next."""
 MAX_AGE: Final = 1.0
@@ -61,6 +65,8 @@ class FramegrabberDriver(Driver):
 
     Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state)."""
 
+    Options = FramegrabberRc
+
     def __init__(self, sources: Mapping[str, str], *, rate: float, quality: int) -> None:
         if not sources or not 0 < rate < math.inf or not 1 <= quality <= 100:
             raise ValueError("a framegrabber has a source, a rate above 0 and a quality of 1 to 100")
@@ -82,10 +88,31 @@ class FramegrabberDriver(Driver):
         self._before: Counter[str] = Counter()
         """What the captures have counted that were let go."""
 
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(options.by_video, rate=options.rate, quality=options.quality)
+
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc
         self._publisher = rc.mesh.frame_publisher(rc.mesh.keys.frame(rc.name))
         self._publisher.follow(lambda _watched: self._close_unless_needed())
+        await self._try_sources()
+
+    async def _try_sources(self) -> None:
+        """Opens its sources until one has a picture. Where none has, it is lost from the beginning."""
+        end, missing = seconds() + OPENING, list[str]()
+        self._lost = True
+        for source in sorted(self._sources):
+            capture = self._open(source)
+            while capture.number == 0 and not capture.failed and seconds() < end:  # noqa: ASYNC110 - a thread's
+                await asyncio.sleep(LOOK)
+            if capture.number:
+                self._lost = False
+                self._close_unless_needed()
+                self._before.clear()
+                return
+            missing.append(capture.health)
+        self._rc.fail(f"no picture: {'; '.join(missing)}")
 
     async def close(self) -> None:
         self._lost = False
@@ -139,6 +166,9 @@ class FramegrabberDriver(Driver):
             "height": meter.height,
             "bytes": meter.size,
         }
+
+    def parameters(self) -> list[Parameter]:
+        return []
 
     def _totals(self) -> Counter[str]:
         own = {name: getattr(self._capture, name, 0) for name in ("number", "dropped", "opened", "stalls")}

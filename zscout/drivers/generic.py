@@ -5,18 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any
+from typing import Any, ClassVar, Self
 
+from zscout.config.devices import CapacityRc, ExclusiveRc, VideoRc
 from zscout.drivers.driver import Driver, RcHandle
-from zscout.messages import Amounts, Figures, Holder, ProposedHolder, exact, exact_amounts
+from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder, exact, exact_amounts
 from zscout.scheduling.capacity import excess
+from zscout.types import SECOND
 
 
 class ExclusiveDriver(Driver):
     """A device that is held, and nothing more."""
 
+    Options: ClassVar[type] = ExclusiveRc
+
     def __init__(self, *, activation: float = 0.0) -> None:
         self.activation = activation
+
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(activation=options.activation / SECOND)
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
         """Knows `echo`, which returns its `value`."""
@@ -24,15 +32,23 @@ class ExclusiveDriver(Driver):
             return do.get("value")
         return await super().command(holder, do)
 
+    def parameters(self) -> list[Parameter] | None:
+        return []
+
 
 class CapacityDriver(ExclusiveDriver):
     """A sharable device that carries holders as long as no bandwidth parameter's sum exceeds its bound."""
 
+    Options = CapacityRc
     sharable = True
 
     def __init__(self, capacity: Mapping[str, Fraction], *, activation: float = 0.0) -> None:
         super().__init__(activation=activation)
         self._capacity = dict(capacity)
+
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(exact_amounts(options.capacity), activation=options.activation / SECOND)
 
     def vote(self, holders: list[ProposedHolder]) -> str:
         return excess(self._capacity, ((holder.id, exact_amounts(holder.params)) for holder in holders))
@@ -40,11 +56,15 @@ class CapacityDriver(ExclusiveDriver):
     def capacity(self) -> Amounts:
         return {name: Decimal(repr(float(bound))) for name, bound in self._capacity.items()}
 
+    def parameters(self) -> list[Parameter]:
+        return [Parameter(name, bound=bound, default=Decimal(0)) for name, bound in self.capacity().items()]
+
 
 class VideoDriver(Driver):
     """A video channel, which is a frequency: any number may listen, one may transmit. Bandwidth parameter:
     `transmitters`, 1 unless given; 0 only listens."""
 
+    Options = VideoRc
     sharable = True
 
     async def open(self, rc: RcHandle) -> None:
@@ -74,6 +94,9 @@ class VideoDriver(Driver):
 
     def capacity(self) -> Amounts:
         return {"transmitters": Decimal(1)}
+
+    def parameters(self) -> list[Parameter]:
+        return [Parameter("transmitters", bound=Decimal(1), default=Decimal(1))]
 
     def figures(self) -> Figures:
         held = self._holders()

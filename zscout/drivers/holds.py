@@ -11,6 +11,9 @@ The rules, all of them:
 - A command is obeyed only under exactly a grant that is held now, from the client that holds it.
 - A hold ends here by itself when its time is over, or when nothing of an RCM was received for the hold lease.
 - A promise given to a term is kept: no lower one is obeyed again.
+- The program of a direct hold touches the device past this RC. When such a hold, once confirmed here, ends in any way
+  but its own client's release or a hand-over, the RC settles: nothing is obeyed under grants that began after that end,
+  until the old client says that its program has left, or it must have been killed.
 """
 
 from __future__ import annotations
@@ -18,13 +21,16 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 from msgspec import structs
 
 from zscout.messages import EndedHold, Grants, Holder, Problem, RcmState, absurd
+from zscout.scheduling.reason import ended, named
 from zscout.types import NO_TERM, SECOND, Grant, HostName, Ns, Place, Term
 
+BEFORE: Final = Grant(NO_TERM, 0)
+"""Stands for the hold of whoever had this RC before it started."""
 REMEMBERED = 64
 """Grants that ended lately, kept to say why a command under one of them is refused."""
 MAX_HOLDERS = 1_024
@@ -36,6 +42,18 @@ class HoldEntry:
 
     holder: Holder
     end: Ns
+    since: int = 0
+    """Counts beginnings and ends: a hold is held back by what settles since before it."""
+    gone_by: Ns | None = None
+    """Of a direct one that was confirmed: by then its program is gone, if it is not confirmed again."""
+
+
+class Settling(NamedTuple):
+    """A direct hold that has ended, and whose program may still touch the device."""
+
+    client: str
+    since: int
+    gone_by: Ns
 
 
 @dataclass(slots=True)
@@ -56,6 +74,10 @@ class HoldChange:
     """Its host, where that was said."""
     announce: bool = False
     """The RCM does not know what this RC holds, or is behind its term: publish its state."""
+    settled: bool = False
+    """A program that the RC settled for is gone: its device is made safe once more, and whom that held back begins."""
+    entries: list[HoldEntry] = field(default_factory=list)
+    """Of the removed."""
 
     def __bool__(self) -> bool:
         return bool(self.began or self.removed)
@@ -73,21 +95,32 @@ class HoldChange:
         return not self.stayed and self.removed_not_handed_over == self.removed
 
 
+def _is_handed_over(before: Holder, after: Holder) -> bool:
+    return _arc(before) == _arc(after) and before.client != after.client
+
+
 def _arc(holder: Holder) -> tuple[str, Place]:
     """What an ARC keeps, whichever client has it."""
     return holder.id, holder.place
 
 
+def _named(holder: Holder) -> str:
+    return named(holder.who, holder.client, holder.arc)
+
+
 class HoldTable:
-    def __init__(self, rc: str, *, hold_lease: Ns, instance: str = "") -> None:
+    def __init__(self, rc: str, *, hold_lease: Ns, settle: Ns = 0, instance: str = "") -> None:
         self.rc, self.instance = rc, instance
-        self.hold_lease = hold_lease
+        self.hold_lease, self.settle = hold_lease, settle
         self.term: Term = NO_TERM
         """The newest term received or promised."""
         self.seq = 0
         self.last_contact: Ns = 0
         """When an RCM that is obeyed last published, as received here."""
         self.held: dict[Grant, HoldEntry] = {}
+        self.settling: dict[Grant, Settling] = {}
+        self._events = 0
+        """Beginnings and ends of holds, so far."""
         self._ended: OrderedDict[Grant, str] = OrderedDict()
         self._awaited: set[Grant] = set()
         """Grants that a snapshot names while another hold is in force: their publication is still to come."""
@@ -107,16 +140,19 @@ class HoldTable:
         # An RCM that names none means whoever hears it.
         change.named = grants.instances.get(self.rc, self.instance)
         if change.named != self.instance:
-            self._end_all("another instance of this RC serves", change)
+            self._end_all("another instance of this RC serves", change, now)
             return change
         if len(holders) > 1 and not sharable:
             holders = [max(holders, key=lambda holder: holder.grant)]
             change.announce = True
-        reasons = {revoked.grant: f"{revoked.outcome}: {revoked.reason}" for revoked in grants.revoked}
+        reasons = {revoked.grant: ended(revoked.outcome, revoked.reason) for revoked in grants.revoked}
+        for revoked in grants.revoked:
+            if revoked.own:
+                self._leave(revoked.grant, change)
         wanted = {holder.grant: holder for holder in holders[:MAX_HOLDERS]}
         self._awaited.clear()
         for grant in [grant for grant in self.held if grant not in wanted]:
-            self._remove(grant, reasons.get(grant, "the RCM gave it to another"), change)
+            self._remove(grant, reasons.get(grant, "the RCM gave it to another"), change, now, to=wanted.values())
         for grant, holder in wanted.items():
             if grant in self._ended:
                 change.announce = True
@@ -136,7 +172,7 @@ class HoldTable:
             return change
         change.named, change.named_host = state.instances.get(self.rc, (None, None))
         if change.named not in (None, self.instance):
-            self._end_all("another instance of this RC serves", change)
+            self._end_all("another instance of this RC serves", change, now)
             return change
         known = {view.grant for view in state.holds if self.rc in view.needs}
         change.announce = any(grant not in known for grant in self.held)
@@ -155,7 +191,7 @@ class HoldTable:
                 self._awaited.add(view.grant)
                 continue
             for grant in older:
-                self._remove(grant, "it was granted anew", change)
+                self._remove(grant, "it was granted anew", change, now, to=[holder])
             self._begin(holder, change, now)
         return change
 
@@ -198,22 +234,74 @@ class HoldTable:
         lease_over = lease and self.held and now - self.last_contact >= self.hold_lease
         for grant, held in list(self.held.items()):
             if lease_over:
-                self._remove(grant, "lease: no RCM was heard for too long", change, expired="lease")
+                self._remove(grant, "lease: no RCM was heard for too long", change, now, expired="lease")
             elif now >= held.end and not held.holder.keep:
-                self._remove(grant, "its time is over", change, expired="time")
+                self._remove(grant, "its time is over", change, now, expired="time")
+        for grant in [grant for grant, settling in self.settling.items() if now >= settling.gone_by]:
+            self._leave(grant, change)
         return change
 
     def next_expiry(self) -> Ns | None:
         """When `expire` should be called next."""
-        if not self.held:
-            return None
         ends = [held.end for held in self.held.values() if not held.holder.keep]
-        return min([self.last_contact + self.hold_lease, *ends])
+        if self.held:
+            ends.append(self.last_contact + self.hold_lease)
+        return min([*ends, *(settling.gone_by for settling in self.settling.values())], default=None)
 
-    def fail(self, why: str) -> HoldChange:
+    def fail(self, why: str, now: Ns) -> HoldChange:
         change = HoldChange()
-        self._end_all(why, change, expired="failed")
+        self._end_all(why, change, now, expired="failed")
         return change
+
+    # Settling
+
+    def confirmed(self, grant: Grant, now: Ns) -> None:
+        """A client has confirmed a hold in force: if it is direct, its program may run from now on."""
+        held = self.held[grant]
+        if held.holder.direct:
+            held.gone_by = now + self.hold_lease + self.settle
+
+    def leaving(self, grant: Grant, client: str, now: Ns) -> HoldChange | Problem:
+        """The client has heard of the end of its hold, and its program is gone a `settle` from now."""
+        return self._bound(grant, client, now, now + self.settle)
+
+    def left(self, grant: Grant, client: str, now: Ns) -> HoldChange | Problem:
+        """The client's program is gone."""
+        return self._bound(grant, client, now, now)
+
+    def _bound(self, grant: Grant, client: str, now: Ns, gone_by: Ns) -> HoldChange | Problem:
+        change, held, settling = HoldChange(), self.held.get(grant), self.settling.get(grant)
+        if held is not None and held.holder.client == client:
+            if held.gone_by is not None:
+                held.gone_by = min(held.gone_by, gone_by)
+        elif settling is not None and settling.client == client:
+            self.settling[grant] = settling._replace(gone_by=min(settling.gone_by, gone_by))
+            if gone_by <= now:
+                self._leave(grant, change)
+        else:
+            return self.check(grant, client, now) or change
+        return change
+
+    def settle_at_start(self, now: Ns) -> None:
+        """Somebody may have held this RC directly before it started."""
+        self.settling[BEFORE] = Settling("", 0, now + self.hold_lease + self.settle)
+
+    def settles(self, grant: Grant) -> Ns | None:
+        """Until when, at the latest, a hold in force is held back; None: it is not."""
+        since = self.held[grant].since
+        return max((one.gone_by for one in self.settling.values() if one.since < since), default=None)
+
+    def may_be_direct(self, now: Ns) -> bool:
+        """Whether somebody's program may touch the device past this RC."""
+        return bool(self.settling) or any(
+            held.gone_by is not None and held.gone_by > now for held in self.held.values()
+        )
+
+    def _leave(self, grant: Grant, change: HoldChange) -> None:
+        if self.settling.pop(grant, None) is not None:
+            change.settled = True
+        elif grant in self.held:
+            self.held[grant].gone_by = None
 
     # Commands
 
@@ -223,7 +311,7 @@ class HoldTable:
         held = self.held.get(grant)
         newer = (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term)
         if held is not None and held.holder.client != client:
-            code, why = "wrong_client", f"{self.rc} is held by {held.holder.client}, not by {client}"
+            code, why = "wrong_client", f"{self.rc} is held by {_named(held.holder)}, not by {client}"
         elif held is not None and now >= held.end and not held.holder.keep:
             code, why = "ended", f"the hold of {self.rc} is over: its time is up"
         elif held is not None:
@@ -235,7 +323,7 @@ class HoldTable:
         elif not self.held:
             code, why = "free", f"{self.rc} is held by nobody; ask the RCM for it"
         else:
-            holders = ", ".join(sorted(held.holder.arc for held in self.held.values()))
+            holders = ", ".join(sorted(_named(held.holder) for held in self.held.values()))
             code, why = "not_holder", f"{self.rc} is held by {holders}"
         return Problem(code, why, self.term)
 
@@ -246,17 +334,39 @@ class HoldTable:
     # Changes
 
     def _begin(self, holder: Holder, change: HoldChange, now: Ns) -> None:
-        self.held[holder.grant] = HoldEntry(holder, now + round(holder.remaining * SECOND))
+        self._events += 1
+        entry = HoldEntry(holder, now + round(holder.remaining * SECOND), self._events)
+        for before in change.entries:
+            if _is_handed_over(before.holder, holder):
+                # It goes on: it is held back by no more than it was, and its program may be the one of before.
+                entry.since, entry.gone_by = before.since, before.gone_by
+        self.held[holder.grant] = entry
         change.began.append(holder)
         change.stayed = len(self.held) > len(change.began)
 
-    def _end_all(self, why: str, change: HoldChange, expired: str | None = None) -> None:
+    def _end_all(self, why: str, change: HoldChange, now: Ns, expired: str | None = None) -> None:
         for grant in list(self.held):
-            self._remove(grant, why, change, expired)
+            self._remove(grant, why, change, now, expired=expired)
 
-    def _remove(self, grant: Grant, why: str, change: HoldChange, expired: str | None = None) -> None:
-        holder = self.held.pop(grant).holder
+    def _remove(
+        self,
+        grant: Grant,
+        why: str,
+        change: HoldChange,
+        now: Ns,
+        *,
+        expired: str | None = None,
+        to: Collection[Holder] = (),
+    ) -> None:
+        """`to`: who holds the RC afterwards."""
+        entry = self.held.pop(grant)
+        holder = entry.holder
         change.removed.append(holder)
+        change.entries.append(entry)
+        self._events += 1
+        handed_over = any(_is_handed_over(holder, other) for other in to)
+        if entry.gone_by is not None and entry.gone_by > now and not handed_over:
+            self.settling[grant] = Settling(holder.client, self._events, entry.gone_by)
         change.stayed = len(self.held) > len(change.began)
         if expired is not None:
             change.expired_locally.append(EndedHold(id=holder.id, grant=grant, why=expired))

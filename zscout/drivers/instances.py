@@ -43,6 +43,8 @@ class Instances:
         self.state = InstanceState.SERVES
         self._serves = instance
         """The instance that serves, as far as this one knows."""
+        self._host: HostName | None = None
+        """Its host, if that is known."""
         self._others: dict[str, Token] = {}
         """The other ones that have a token."""
         self._waiting: asyncio.TimerHandle | None = None
@@ -52,8 +54,7 @@ class Instances:
         """For which one it stands by, in words; empty if it serves."""
         if self.state is InstanceState.SERVES:
             return ""
-        other = self._others.get(self._serves)
-        return f"{self._rc} at {other.host}" if other is not None else f"{self._rc} elsewhere"
+        return f"{self._rc} at {self._host}" if self._host is not None else f"{self._rc} elsewhere"
 
     def watch(self) -> Declaration:
         return self._mesh.watch(self._mesh.keys.alive_rc(self._rc), self._supervisor.guard(self._on_token))
@@ -69,7 +70,10 @@ class Instances:
         if named == self.instance:
             self._become(InstanceState.SERVES)
         elif (self._others[named].host if named in self._others else host) != self._mesh.me.host:
-            self._serves = named
+            before, other = self.duplicate_of, self._others.get(named)
+            self._serves, self._host = named, other.host if other is not None else host
+            if self.state is InstanceState.STANDS_BY and before != self.duplicate_of:
+                log.warning("%s stands by: duplicate of %s", self._rc, self.duplicate_of)
             if named not in self._others:
                 self._wait()
             self._become(InstanceState.STANDS_BY)
@@ -80,6 +84,7 @@ class Instances:
         if alive:
             self._others[token.instance] = token
             if token.instance == self._serves:
+                self._host = token.host
                 self._cancel()
         else:
             self._others.pop(token.instance, None)

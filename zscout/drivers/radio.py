@@ -11,9 +11,10 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any, Final
+from typing import Any, Final, Self
 
-from zscout.drivers.airtime import RESERVE, Share, line_rate, objection, share_of
+from zscout.config.devices import RadioRc
+from zscout.drivers.airtime import Share, default_rate, line_rate, objection, room, share_of
 from zscout.drivers.commands import RadioHalt, RadioStop, radio_command
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.drivers.packets import MAX_PACKET, HaltPacket, StopPacket, encode
@@ -22,7 +23,7 @@ from zscout.drivers.transmit_queue import TransmitQueue
 from zscout.keyexpr import RANDOM, Sender
 from zscout.mesh import Refused, Supervisor
 from zscout.mesh.supervision import done_within
-from zscout.messages import Amounts, Figures, Holder, ProposedHolder
+from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder
 from zscout.types import SECOND, Grant, Place
 
 RECENT: Final = 64
@@ -35,6 +36,7 @@ LONGEST_SLEEP: Final = 60.0
 class RadioDriver(Driver):
     """The RC of a radio. It carries stops and halts for the node of any robot, the rest for its holders."""
 
+    Options = RadioRc
     sharable = True
     relays = True
 
@@ -42,6 +44,7 @@ class RadioDriver(Driver):
         """`port` for `serial.serial_for_url`; `bound` in seconds: the delay bound of a packet."""
         self._port, self._baud = port, baud
         self._rate = line_rate(baud)
+        self._default = default_rate(self._rate)
         self._bound = Fraction(str(bound))
         # Not 0: the last radio of these robots may have begun there.
         self._air = TransmitQueue(self._rate, first_number=RANDOM.get().randrange(256))
@@ -57,6 +60,10 @@ class RadioDriver(Driver):
         self._losses = 0
         self._counts = Counter(packets=0, bytes=0, repeats=0, halts=0)
         self._waits: deque[Fraction] = deque(maxlen=RECENT)
+
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(options.port, baud=options.baud, bound=options.bound / SECOND)
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc
@@ -80,19 +87,28 @@ class RadioDriver(Driver):
         shares: list[Share] = []
         for holder in holders:
             try:
-                shares.append(share_of(holder.params))
+                shares.append(share_of(holder.params, self._default))
             except ValueError as error:
                 return f"{holder.arc}: {error}"
         return objection(self._rate, self._bound, shares)
 
     def capacity(self) -> Amounts:
         """`command_rate`: packets of the full size a second, all holders together."""
-        room = self._rate * (1 - RESERVE)
-        return {"command_rate": Decimal(repr(float(room / MAX_PACKET))), "bytes_per_second": Decimal(repr(float(room)))}
+        most = room(self._rate)
+        return {"command_rate": _decimal(most / MAX_PACKET), "bytes_per_second": _decimal(most)}
+
+    def parameters(self) -> list[Parameter]:
+        most = room(self._rate) / MAX_PACKET
+        size = Decimal(MAX_PACKET)
+        return [
+            # Shorter packets, and more of them, fit as well.
+            Parameter("command_rate", "packets/s", _decimal(most), _decimal(self._default), unless=["packet_size"]),
+            Parameter("packet_size", "bytes", default=size),
+        ]
 
     async def begin(self, holder: Holder) -> None:
         try:
-            share = share_of(holder.params)
+            share = share_of(holder.params, self._default)
         except ValueError:  # it was never voted for
             share = Share(Fraction(0), Fraction(MAX_PACKET))
         self._air.join(holder.place, share, self._rc.mesh.now())
@@ -206,3 +222,7 @@ class RadioDriver(Driver):
         waits = {name: float(getattr(self._air, name)) for name in ("replaced", "dropped", "waiting")}
         longest = round(float(max(self._waits, default=Fraction(0)) / SECOND * 1000), 1)
         return counts | waits | {"longest_wait_ms": longest, "unplugged": float(self._losses)}
+
+
+def _decimal(value: Fraction) -> Decimal:
+    return Decimal(repr(float(value)))

@@ -1,34 +1,117 @@
-"""Which driver an RC of a node file has. A new one is a table in `config/devices.py` and a case here."""
+"""Which driver an RC of a node file has: one that comes with zscout, or one that is installed beside it.
+
+Such a one is an entry point of the group `zscout.drivers`; docs/how-to/write-a-driver.md tells how to write it."""
 
 from __future__ import annotations
 
-from zscout.config.devices import CapacityRc, ExclusiveRc, FramegrabberRc, RadioRc, RcConfig, RobotRc, VideoRc
+import difflib
+import logging
+from collections.abc import Mapping
+from importlib import import_module, metadata
+from types import MappingProxyType
+from typing import Any, Final
+
+from zscout.config.devices import PluginRc, RcConfig
+from zscout.config.packages import how_to_get
+from zscout.config.strict import BadInput, Where, convert, quoted
 from zscout.drivers.driver import Driver
-from zscout.drivers.generic import CapacityDriver, ExclusiveDriver, VideoDriver
-from zscout.messages import exact_amounts
-from zscout.types import SECOND
+
+log = logging.getLogger(__name__)
+
+GROUP: Final = "zscout.drivers"
+
+BUILT_IN: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "capacity": "zscout.drivers.generic:CapacityDriver",
+        "command": "zscout.drivers.command_driver:CommandDriver",
+        "exclusive": "zscout.drivers.generic:ExclusiveDriver",
+        "framegrabber": "zscout.drivers.framegrabber:FramegrabberDriver",
+        "radio": "zscout.drivers.radio:RadioDriver",
+        "robot": "zscout.drivers.robot:RobotDriver",
+        "video": "zscout.drivers.generic:VideoDriver",
+    }
+)
+"""Name: module and class. What a device needs is loaded where there is one: pyserial, OpenCV."""
 
 
 def driver_for(rc: RcConfig) -> Driver:
-    # What a device needs is loaded where there is one: pyserial, OpenCV.
-    match rc:
-        case RadioRc():
-            from zscout.drivers.radio import RadioDriver
+    """The driver of an RC, with its options. Raises BadInput: one line that says what to install or to mend."""
+    if isinstance(rc, PluginRc):
+        return _make(rc, _plugin(rc))
+    name = driver_name(rc)
+    module, _, attribute = BUILT_IN[name].partition(":")
+    try:
+        found: type[Driver] = getattr(import_module(module), attribute)
+    except ImportError as error:
+        if missing := how_to_get(error):
+            raise BadInput(f"{rc.name}: its driver {missing}") from error
+        raise
+    return found.configured(rc)
 
-            return RadioDriver(rc.port, baud=rc.baud, bound=rc.bound / SECOND)
-        case RobotRc():
-            from zscout.drivers.robot import RobotDriver
 
-            return RobotDriver(
-                rc.id, radio=rc.radio, channels=rc.channels, warm_up=rc.warm_up / SECOND, dead_man=rc.dead_man / SECOND
-            )
-        case VideoRc():
-            return VideoDriver()
-        case FramegrabberRc():
-            from zscout.drivers.framegrabber import FramegrabberDriver
+def driver_name(rc: RcConfig) -> str:
+    """As it stands in the node file."""
+    return rc.driver if isinstance(rc, PluginRc) else str(rc.__struct_config__.tag)
 
-            return FramegrabberDriver(rc.by_video, rate=rc.rate, quality=rc.quality)
-        case CapacityRc():
-            return CapacityDriver(exact_amounts(rc.capacity), activation=rc.activation / SECOND)
-        case ExclusiveRc():
-            return ExclusiveDriver(activation=rc.activation / SECOND)
+
+def installed() -> dict[str, list[metadata.EntryPoint]]:
+    """The drivers that are installed beside zscout, by name; more than one where packages are at odds."""
+    found: dict[str, list[metadata.EntryPoint]] = {}
+    for entry in sorted(metadata.entry_points(group=GROUP)):
+        places = found.setdefault(entry.name, [])
+        if entry.value not in (known.value for known in places):
+            places.append(entry)
+    return found
+
+
+def _plugin(rc: PluginRc) -> type[Driver]:
+    at, known = rc.at / "driver", installed()
+    places = known.get(rc.driver, [])
+    if not places:
+        names = sorted({*known, *BUILT_IN})
+        near = difflib.get_close_matches(rc.driver, names, n=1)
+        meant = f"did you mean {quoted(near[0])}? " if near else ""
+        there = ", ".join(map(quoted, names))
+        raise at.bad(
+            f"no driver {quoted(rc.driver)} is installed here",
+            f"{meant}Install the package that brings it into this environment, or write one of {there}",
+        )
+    if len(places) > 1:
+        packages = " and ".join(map(_origin, places))
+        raise at.bad(f"{quoted(rc.driver)} is brought by {packages}", "uninstall one of them")
+    (entry,) = places
+    try:
+        found = entry.load()
+    except (Exception, SystemExit) as error:
+        raise _unfit(at, f"{_origin(entry)} can't be loaded", error) from error
+    if not (isinstance(found, type) and issubclass(found, Driver)):
+        raise at.bad(f"{_origin(entry)} is no driver", "name a subclass of zscout.drivers.driver.Driver there")
+    return found
+
+
+def _make(rc: PluginRc, driver: type[Driver]) -> Driver:
+    try:
+        options: Any = convert(dict(rc.options), driver.Options, rc.at)
+    except TypeError as error:
+        what = f"the options of {driver.__module__}.{driver.__qualname__} can't be read: {error}"
+        raise (rc.at / "driver").bad(what, "mend its class Options") from error
+    try:
+        return driver.configured(options)
+    except ValueError as error:
+        raise rc.at.bad(str(error) or "a value that its driver does not take", "mend it") from error
+    except Exception as error:
+        raise _unfit(rc.at / "driver", f"{driver.__module__}.{driver.__qualname__} can't be made", error) from error
+
+
+def _origin(entry: metadata.EntryPoint) -> str:
+    package = f" of package {entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""
+    return f"{entry.value}{package}"
+
+
+def _unfit(at: Where, what: str, error: BaseException) -> BadInput:
+    log.debug("%s: %s", at.key, what, exc_info=error)
+    remedy = f"it {missing}" if isinstance(error, ImportError) and (missing := how_to_get(error)) else ""
+    words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return at.bad(
+        f"{what}: {words}", remedy or "mend that package, or install what it needs; --log-level debug shows more"
+    )

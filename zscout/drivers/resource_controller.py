@@ -9,20 +9,23 @@ import asyncio
 import logging
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection
-from typing import Any, TypeAlias
+from contextlib import suppress
+from typing import Any, Final, TypeAlias
 
 from msgspec import structs
 
 from zscout import messages, trace
+from zscout.config import devices
 from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.instances import Instances, InstanceState
+from zscout.drivers.last_holder import LastHolder
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.terms import LastTerms
-from zscout.types import NO_TERM, SECOND, Ns, Term
+from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +38,12 @@ REREAD_TIMEOUT = 0.5
 """Seconds that one query for `rcm/state` waits for an answer."""
 REREADS = 4
 """Queries in a row when publications overtake the answers."""
+SETTLE: Final = devices.SETTLE / SECOND
+"""Seconds from the end of a direct hold, as its client heard of it, in which its program must be gone; and within which
+a device must be safe."""
+AT_ONCE: Final = 0.1
+"""Seconds for which what comes next waits for a device that is being made safe; then it is answered `settling`."""
+NEVER_HELD_BACK: Final = ("stop", "halt")
 COMMAND_QUEUE = 64
 EARLY_PER_HOST = 16
 """Commands of one host that may be set aside."""
@@ -104,7 +113,7 @@ class WorkQueue:
 
 class ResourceController:
     """One RC: its keys, its holds and its driver. Where it fails, not its driver, it leaves the mesh, makes
-    its device safe and calls `on_failure`. `hold_lease` is in seconds."""
+    its device safe and calls `on_failure`. `hold_lease` and `settle` are in seconds; `last_holder` outlives it."""
 
     def __init__(
         self,
@@ -114,11 +123,15 @@ class ResourceController:
         *,
         hold_lease: float,
         stall: StallWatch,
+        settle: float = SETTLE,
+        last_holder: LastHolder | None = None,
         on_failure: Callable[[Exception], object] = lambda _error: None,
     ) -> None:
         self.mesh, self.name, self.driver = mesh, name, driver
         self.instance = new_instance()
-        self.holds = HoldTable(name, hold_lease=round(hold_lease * SECOND), instance=self.instance)
+        lease, self._settle = round(hold_lease * SECOND), round(settle * SECOND)
+        self.holds = HoldTable(name, hold_lease=lease, settle=self._settle, instance=self.instance)
+        self._last_holder, self._noting = last_holder or LastHolder(), asyncio.Lock()
         self.rules = 0
         self.health = "ok"
         self.queue = WorkQueue()
@@ -139,6 +152,15 @@ class ResourceController:
         """What it answers, by its standing among the instances of this RC."""
         self._declared: list[Declaration] = []
         self._warm_at: Ns = 0
+        self._at_driver: set[Grant] = set()
+        """Holds that have begun at the driver."""
+        self._held_back: dict[Grant, messages.Holder] = {}
+        """Those that have not yet: a former holder's program may be there still, or the device is being made safe."""
+        self._making_safe: asyncio.Task[None] | None = None
+        self._safe_by: Ns = 0
+        """When that must be done."""
+        self._safe_again = False
+        """Whether it is to be done once more when it is done."""
         self._last_terms = LastTerms(mesh, self.supervisor, self.holds.catch_up, timeout=REREAD_TIMEOUT)
         self._reading: asyncio.Task[None] | None = None
         self._missed = False
@@ -154,6 +176,10 @@ class ResourceController:
         self._state = mesh.publisher(keys.rc_state(self.name), messages.RcState)
         self._declared.append(mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)))
         self._declared.append(self.instances.watch())
+        if self._last_holder.may_be_direct:
+            log.warning("%s settles: it may have been held directly before it started", self.name)
+            self.holds.settle_at_start(mesh.now())
+            self._set_timer()
         self._declared.append(mesh.subscribe(keys.grants, messages.Grants, guard(self._on_grants)))
         await asyncio.wait({self._read_state()})
         if self.directory is not None:
@@ -196,8 +222,9 @@ class ResourceController:
         for declared in (*self._served, *reversed(self._declared)):
             declared.close()
         await self.supervisor.close()
-        await self._guard(self.driver.safe())
-        self._state.put(self._rc_state([], leaving=True))
+        await self._guard(self._make_safe_in_time())
+        # Where a program may still touch the device, another instance is not taken at once.
+        self._state.put(self._rc_state([], leaving=not self._last_holder.may_be_direct))
         await self._guard(self.driver.close())
         self._state.close()
 
@@ -213,14 +240,18 @@ class ResourceController:
         self.publish()
 
     def fail(self, why: str) -> None:
+        if why != self.health:
+            log.warning("%s is lost: %s", self.name, why)
         self.health = why
-        change = self.holds.fail(why)
+        change = self.holds.fail(why, self.mesh.now())
         if change:
             self._trace("end")
         self._apply(change)
         self.publish()
 
     def recover(self) -> None:
+        if self.health != "ok":
+            log.info("%s is well", self.name)
         self.health = "ok"
         self.publish()
 
@@ -293,6 +324,8 @@ class ResourceController:
             figures={} if leaving else self.driver.figures(),
             duplicate_of=self.instances.duplicate_of,
             leaving=leaving,
+            settle=self._settle / SECOND,
+            parameters=None if leaving else self.driver.parameters(),
         )
 
     def _on_proposal(self, query: IncomingQuery[messages.Proposal]) -> None:
@@ -337,15 +370,57 @@ class ResourceController:
             raise Refused("stale", f"the command waited {waited}, longer than its ttl {command.ttl:g} s")
         if command.grant is None:
             return await self.driver.command_without_grant(sender, command.do)
-        if problem := self._refusal(query):
-            raise Refused(problem.code, problem.message, problem.term)
+        if (name := command.do.get("name")) in ("leaving", "left"):
+            return self._hear_program(command.grant, str(sender), gone=name == "left")
+        self._raise_refusal(query)
+        if name == "confirm":
+            # What is written to disk for it is waited for by nothing else.
+            direct = self.holds.held[command.grant].holder.direct
+            return asyncio.ensure_future(self._confirm_direct(query)) if direct else self._confirm(command.grant)
         self._trace("command", grant=command.grant)
         warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
-        if command.do.get("name") == "confirm":
-            return messages.Done(warming=warming)
         if warming and not self.driver.usable_cold(command.do):
             raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
         return await self.driver.command(self.holds.held[command.grant].holder, command.do)
+
+    def _hear_program(self, grant: Grant, client: str, *, gone: bool) -> messages.Done:
+        """What the client of a direct hold says of its program. Raises Refused."""
+        hear = self.holds.left if gone else self.holds.leaving
+        heard = hear(grant, client, self.mesh.now())
+        if isinstance(heard, messages.Problem):
+            raise Refused.by(heard)
+        self._apply(heard)
+        return messages.Done()
+
+    def _confirm(self, grant: Grant) -> messages.Done:
+        self._trace("command", grant=grant)
+        warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
+        return messages.Done(warming=warming, settle=self._settle / SECOND)
+
+    async def _confirm_direct(self, query: CommandQuery) -> messages.Done:
+        """A direct holder is noted before it may rely on its hold. Raises Refused."""
+        grant = query.message.grant
+        async with self._noting:
+            if not self._last_holder.may_be_direct:
+                try:
+                    await self._last_holder.note(direct=True)
+                except OSError as error:
+                    why = f"{self.name} can't note that it is held directly ({error}): see to its node's state folder"
+                    raise Refused("failed", why) from None
+            self._raise_refusal(query)
+            assert grant is not None  # noqa: S101 - or it had been refused
+            self.holds.confirmed(grant, self.mesh.now())
+        return self._confirm(grant)
+
+    async def _forget_direct(self) -> None:
+        async with self._noting:
+            if self._last_holder.may_be_direct and not self.holds.may_be_direct(self.mesh.now()):
+                with suppress(OSError):  # then it settles once more than it need
+                    await self._last_holder.note(direct=False)
+
+    def _raise_refusal(self, query: CommandQuery) -> None:
+        if problem := self._refusal(query):
+            raise Refused.by(problem)
 
     def _refusal(self, query: CommandQuery) -> messages.Problem | None:
         """Why a command is not obeyed under its grant; None: it is, or has none."""
@@ -359,6 +434,11 @@ class ResourceController:
         if self._missed and problem is not None and problem.code in ("free", "not_holder"):
             # What is being read may name it.
             return structs.replace(problem, code="not_yet", message=f"{self.name} has missed something, and reads it")
+        if problem is None and grant in self._held_back and query.message.do.get("name") not in NEVER_HELD_BACK:
+            until = max(self.holds.settles(grant) or 0, 0 if self._making_safe is None else self._safe_by)
+            left = max(0.0, (until - self.mesh.now()) / SECOND)
+            words = f"{self.name} settles: a former holder's program may still touch it; {left:.1f} s are left at most"
+            return messages.Problem("settling", words, left=left)
         return problem
 
     def _waited(self, query: CommandQuery) -> Ns:
@@ -389,13 +469,69 @@ class ResourceController:
     # Holds
 
     async def _carry_out_change(self, change: HoldChange) -> None:
-        for holder in change.removed_not_handed_over:
-            await self._guard(self.driver.end(holder))
+        ended = change.removed_not_handed_over
+        for holder in ended:
+            if holder.grant in self._at_driver:
+                await self._guard(self.driver.end(holder))
+        before = {one.grant for one in change.removed} & self._at_driver
+        go_on = {(one.id, one.place) for one in change.removed if one not in ended and one.grant in before}
+        self._at_driver -= before
+        for holder in change.removed:
+            self._held_back.pop(holder.grant, None)
         # A device that still serves others, or goes on in another client, stays as it is.
-        if change.removed and change.interrupts:
-            await self._guard(self.driver.safe())
+        if (before and change.interrupts) or (change.settled and not self._at_driver):
+            await self._make_safe()
         for holder in change.began:
-            await self._guard(self.driver.begin(holder))
+            if (holder.id, holder.place) in go_on:
+                await self._begin(holder)
+            else:
+                self._held_back[holder.grant] = holder
+        await self._begin_held_back(at_once=change.began)
+        if self._last_holder.may_be_direct and not self.holds.may_be_direct(self.mesh.now()):
+            self.supervisor.spawn(self._forget_direct())
+
+    async def _begin_held_back(self, *, at_once: Collection[messages.Holder]) -> None:
+        """Has those begin at the driver for whom nothing is in the way any more. One that has ended by now is left out,
+        and so is its end."""
+        if self._making_safe is not None:
+            return
+        for grant, holder in list(self._held_back.items()):
+            if grant in self.holds.held and self.holds.settles(grant) is None:
+                del self._held_back[grant]
+                if not self._at_driver and holder not in at_once:
+                    # The device warms up from now on, though it was granted before.
+                    self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
+                await self._begin(holder)
+
+    async def _begin(self, holder: messages.Holder) -> None:
+        self._at_driver.add(holder.grant)
+        await self._guard(self.driver.begin(holder))
+
+    async def _make_safe(self) -> None:
+        """Makes the device safe. Where that takes its time, it goes on beside what comes next, which it holds back."""
+        if self._making_safe is not None:
+            self._safe_again = True
+            return
+        self._safe_by = self.mesh.now() + self._settle
+        self._making_safe = self.supervisor.spawn(self._make_safe_in_time())
+        await asyncio.wait({self._making_safe}, timeout=AT_ONCE)
+        if self._making_safe.done():
+            self._making_safe = None
+        else:
+            self._making_safe.add_done_callback(self._on_safe)
+
+    def _on_safe(self, _task: asyncio.Task[None]) -> None:
+        self._making_safe = None
+        again, self._safe_again = self._safe_again, False
+        # What it held back begins.
+        self.queue.put_change(HoldChange(settled=again))
+
+    async def _make_safe_in_time(self) -> None:
+        try:
+            async with asyncio.timeout(self._settle / SECOND):
+                await self._guard(self.driver.safe())
+        except TimeoutError:
+            self.fail(f"its device was not safe after {self._settle / SECOND:g} s; is its `settle` too short?")
 
     async def _guard(self, action: Awaitable[None]) -> None:
         try:
@@ -407,7 +543,7 @@ class ResourceController:
     def _apply(self, change: HoldChange) -> None:
         if change.named is not None:
             self.instances.take(change.named, change.named_host)
-        if change:
+        if change or change.settled:
             if change.began and change.interrupts:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
             self.queue.put_change(change)

@@ -10,15 +10,16 @@ import statistics
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import msgspec
 
+from zscout.config.devices import RobotRc
 from zscout.drivers import commands
 from zscout.drivers.driver import Driver, RcDirectory, RcHandle
 from zscout.mesh import Declaration, Refused, Reply
 from zscout.mesh.supervision import done_within
-from zscout.messages import Command, Done, Figures, Holder, RcState
+from zscout.messages import Command, Done, Figures, Holder, Parameter, RcState
 from zscout.types import SECOND, Grant, Ns
 
 ANSWER: Final = 0.5
@@ -55,6 +56,8 @@ class _Waiting:
 class RobotDriver(Driver):
     """The RC of a robot, whose halt is carried by the RC `radio`."""
 
+    Options = RobotRc
+
     def __init__(self, robot: int, *, radio: str, channels: Mapping[str, int], warm_up: float, dead_man: float) -> None:
         """`robot`: its id on the air. `channels`: of its camera, by video RC. `warm_up`: seconds until the
         camera works. `dead_man`: seconds after which it is stopped where no drive command follows, however
@@ -74,6 +77,16 @@ class RobotDriver(Driver):
         self._counts = Counter(commands=0, refused=0, halts=0, dead_man_stops=0)
         self._latencies: deque[float] = deque(maxlen=RECENT)
 
+    @classmethod
+    def configured(cls, options: Any) -> Self:
+        return cls(
+            options.id,
+            radio=options.radio,
+            channels=options.channels,
+            warm_up=options.warm_up / SECOND,
+            dead_man=options.dead_man / SECOND,
+        )
+
     async def open(self, rc: RcHandle) -> None:
         self._rc, self._mesh = rc, rc.mesh
         rc.fail(f"{self._radio} has not taken its halt yet")
@@ -86,6 +99,9 @@ class RobotDriver(Driver):
     async def close(self) -> None:
         for declared in self._declared:
             declared.close()
+
+    def parameters(self) -> list[Parameter]:
+        return []
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
         """Only the camera warms up, and not before a command switches it on."""

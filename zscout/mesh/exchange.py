@@ -31,6 +31,12 @@ class Refused(Exception):
         super().__init__(message)
         self.problem = Problem(code, message, term)
 
+    @classmethod
+    def by(cls, problem: Problem) -> Refused:
+        refused = cls(problem.code, problem.message)
+        refused.problem = problem
+        return refused
+
 
 @dataclass(frozen=True, slots=True)
 class Reply(Generic[R]):

@@ -57,11 +57,13 @@ class Message(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Problem(Message, frozen=True):
-    """Why something was refused. `term` is the term that the replier has promised, where that is why."""
+    """Why something was refused. `term` is the term that the replier has promised, where that is why; `left` the
+    seconds for which an RC that answers `settling` may go on to do so."""
 
     code: str
     message: str
     term: Term | None = None
+    left: Seconds | None = None
 
 
 T = TypeVar("T")

@@ -160,14 +160,17 @@ class ComponentView(Message, frozen=True):
     """Of an end, in words; or which limit this host can't set."""
     tail: str = ""
     """Of one that failed: the end of its output."""
+    bad_params: bool = False
+    """It failed because its parameters are no good, on whichever host."""
 
 
 class ComponentList(Message, frozen=True):
-    """All components of a host. `kinds` are those that it can start, MAX_KINDS of them at most."""
+    """All components of a host. `kinds` are those that it can start, MAX_KINDS of them at most; None: it does not
+    tell."""
 
     host: str
     components: list[ComponentView] = []
-    kinds: list[str] = []
+    kinds: list[str] | None = None
 
 
 class Checkpoint(Message, frozen=True):

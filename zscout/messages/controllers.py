@@ -6,8 +6,8 @@ from typing import Annotated, Any, TypeAlias
 
 from msgspec import Meta
 
-from zscout.messages.base import Amounts, Message, Seconds
-from zscout.messages.scheduling import Holder
+from zscout.messages.base import Amounts, Elapsed, Message, Seconds
+from zscout.messages.scheduling import Holder, Parameters
 from zscout.types import NO_TERM, Grant, Term
 
 MAX_FIGURES = 32
@@ -40,8 +40,8 @@ class Ballot(Message, frozen=True):
 class Command(Message, frozen=True):
     """An action `do` under `grant`, to be refused once it has waited longer than `ttl` seconds.
 
-    `do` has the action in `name`; the rest is the driver's. Every RC knows `confirm`. Without a grant only what stops a
-    robot is done, by a radio, for the node of that robot's RC."""
+    `do` has the action in `name`; the rest is the driver's. Every RC knows `confirm`, `leaving` and `left`. Without a
+    grant only what stops a robot is done, by a radio, for the node of that robot's RC."""
 
     do: dict[str, Any]
     grant: Grant | None = None
@@ -53,6 +53,8 @@ class Done(Message, frozen=True):
 
     result: Any = None
     warming: Seconds = 0.0
+    settle: Elapsed | None = None
+    """To a `confirm`: the seconds that the RC settles at most once its client has said `leaving`."""
 
 
 class RcAsk(Message, frozen=True):
@@ -98,6 +100,10 @@ class RcState(Message, frozen=True):
     """For which other instance of the RC this one stands by, in words: it holds nothing and is not granted."""
     leaving: bool = False
     """Its device is in its safe state for good: another instance may be taken at once."""
+    settle: Elapsed | None = None
+    """Seconds that it settles at most after `leaving`; absent: it does not know how to settle."""
+    parameters: Parameters | None = None
+    """All bandwidth parameters that it knows; None: it does not say."""
 
 
 class FrameHead(Message, frozen=True):

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from zscout.messages.base import MAX_COUNTER, MAX_INCARNATION, Bytes, Figure, Message, ShortText
+from zscout.messages.base import MAX_COUNTER, MAX_INCARNATION, Bytes, Elapsed, Figure, Message, ShortText
 from zscout.types import Metric, Policy
 
 MAX_RANKED = 256
@@ -64,6 +64,8 @@ class RankAsk(Message, frozen=True):
     memory: Bytes = 0
     at_most: Annotated[int, msgspec.Meta(ge=1, le=MAX_RANKED)] = 16
     """How many hosts are named."""
+    reports: bool = False
+    """Whether the last load report of each host that is named, ranked or left out, is wanted too."""
 
 
 class RankedHost(Message, frozen=True):
@@ -72,6 +74,13 @@ class RankedHost(Message, frozen=True):
     host: str
     score: float
     reason: str
+
+
+class KnownLoad(Message, frozen=True):
+    """The last report of a host, which came `age` seconds ago."""
+
+    age: Elapsed
+    report: LoadReport
 
 
 class HostRanking(Message, frozen=True):
@@ -84,3 +93,19 @@ class HostRanking(Message, frozen=True):
     left_out: dict[str, str] = {}
     more: int = 0
     """Ranked hosts that are not named."""
+    reports: list[KnownLoad] | None = None
+    """None: they were not asked for, or the balancer does not know of that."""
+
+
+class RecordedAsk(Message, frozen=True):
+    """Asks a recorder where its recording is."""
+
+
+class Recorded(Message, frozen=True):
+    """Where a recorder writes, and serves the same live. `file` and `inode` tell whether that is the asker's host."""
+
+    file: Annotated[str, msgspec.Meta(max_length=4096)]
+    inode: int
+    bind: Annotated[str, msgspec.Meta(max_length=45)]
+    """IP address that the live view listens on."""
+    port: Annotated[int, msgspec.Meta(ge=1, le=65_535)]

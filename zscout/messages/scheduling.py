@@ -10,8 +10,27 @@ import msgspec
 from zscout.messages.base import NAMES_ONCE, Amounts, Elapsed, Message, Seconds, State
 from zscout.types import NO_TERM, Grant, Place, Term
 
+DOOR_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
+"""What a request is refused with that asked for a `check` and can never start."""
+MAX_KNOWN = 64
+"""Bandwidth parameters that one RC knows."""
 MAX_OTHERS = 255
 """ARCs that one hand-over takes along, beside the one that it names first."""
+
+
+MAX_WHO = 64
+"""Characters of a user's, a host's or a command's name."""
+MAX_COMMENT = 200
+
+
+class Who(Message, frozen=True):
+    """Who asks, by its own word: shown to people, never believed. `host` may be left out: it is that of the client
+    then. `command` is what it runs, `comment` what its user wants others to know."""
+
+    user: Annotated[str, msgspec.Meta(max_length=MAX_WHO)] = ""
+    host: Annotated[str, msgspec.Meta(max_length=MAX_WHO)] = ""
+    command: Annotated[str, msgspec.Meta(max_length=MAX_WHO)] = ""
+    comment: Annotated[str, msgspec.Meta(max_length=MAX_COMMENT)] = ""
 
 
 class _ArcParty(Message, frozen=True):
@@ -34,7 +53,15 @@ class _Wanted(Message, frozen=True):
     keep: bool = False
 
 
-class Ask(_Wanted, frozen=True, tag_field="op", tag="request"):
+class _Asked(_Wanted, frozen=True):
+    check: bool = False
+    """Refuse at once what can never start: a need that nobody knows, a parameter that its RC does not know, or more of
+    one than that ever carries. Not with a `place`."""
+    wait_for_device: bool = False
+    """With `check`: a need that nobody knows is waited for."""
+
+
+class Ask(_Asked, frozen=True, tag_field="op", tag="request"):
     """Asks for an ARC. `id` is the client's own and stays the same however often it asks; `place` is what an earlier
     RCM gave, and `waited` the seconds since it was last queued there."""
 
@@ -53,6 +80,11 @@ class Ask(_Wanted, frozen=True, tag_field="op", tag="request"):
     place."""
     reachable: bool = False
     """One of those has shown itself to the client anew: what was held back for them need wait no more."""
+    direct: bool = False
+    """Its program touches devices past their RCs, which settle when its hold ends."""
+    unserved: bool = False
+    """The time of `grant` went by while RCs of it settled: nobody made use of it."""
+    who: Who | None = None
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -60,6 +92,8 @@ class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
 
     id: str
     client: str | None = None
+    who: Who | None = None
+    """Who ends it, where that is not its owner."""
 
 
 class Release(Message, frozen=True, tag_field="op", tag="release"):
@@ -67,6 +101,7 @@ class Release(Message, frozen=True, tag_field="op", tag="release"):
 
     id: str
     client: str | None = None
+    who: Who | None = None
 
 
 class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
@@ -80,8 +115,38 @@ class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
     others: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
 
 
-class Foresee(_Wanted, frozen=True, tag_field="op", tag="foresee"):
+class Foresee(_Asked, frozen=True, tag_field="op", tag="foresee"):
     """Asks for the forecast of a request without making it. Answered with a Foresight."""
+
+
+class ReasonParty(_ArcParty, frozen=True):
+    """An ARC that is in another's way, or was preferred to it."""
+
+    priority: int
+    who: Who | None = None
+    yields_in: Seconds | None = None
+    """In a reason to wait: seconds until it holds no more, or may be preempted for it, at the latest; absent: not
+    known."""
+
+
+class ReasonInfo(Message, frozen=True):
+    """Why an ARC waits, or why a hold or a wait ended: what `reason` says, as data.
+
+    `count` counts `rcs`, of which the first three are named (with `patterns` eight), or is a quota; with `vetoed` it
+    counts who is in the way. `detail` is a host, a client or an RC's own words, as `code` has it (`docs/protocol.md`).
+    """
+
+    code: str
+    rcs: list[str] = []
+    by: list[ReasonParty] = []
+    detail: str = ""
+    count: int = 0
+    pattern: str | None = None
+    """The pattern of its needs that is not met; the rest is about one of the RCs that would meet it, or with `patterns`
+    about all of them."""
+    patterns: list[str] = []
+    """By each of `rcs` the pattern that it is a choice for, empty where the ARC names it; left out where it names all.
+    """
 
 
 class Foresight(Message, frozen=True):
@@ -94,31 +159,14 @@ class Foresight(Message, frozen=True):
     preempts: list[str] = []
     """Names of the ARCs that it would preempt at once."""
     reason: str = ""
+    victims: list[ReasonParty] = []
+    """The same ARCs, and whose they are."""
+    why: ReasonInfo | None = None
+    """What `reason` says, as data."""
 
 
 Operation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
 NAMES_ONCE.add(Operation)
-
-
-class ReasonParty(_ArcParty, frozen=True):
-    """An ARC that is in another's way, or was preferred to it."""
-
-    priority: int
-
-
-class ReasonInfo(Message, frozen=True):
-    """Why an ARC waits, or why a hold or a wait ended: what `reason` says, as data.
-
-    `count` counts `rcs`, of which the first three are named, or is a quota. `detail` is a host, a client or
-    an RC's own words, as `code` has it (`docs/protocol.md`)."""
-
-    code: str
-    rcs: list[str] = []
-    by: list[ReasonParty] = []
-    detail: str = ""
-    count: int = 0
-    pattern: str | None = None
-    """The pattern of its needs that is not met; the rest is about one of the RCs that would meet it."""
 
 
 class Notice(_ArcParty, frozen=True):
@@ -149,6 +197,8 @@ class Notice(_ArcParty, frozen=True):
     """While it is queued, where the client asked for estimates: seconds until it will start if nothing else
     comes; None where it will not as things stand, or not within what can be forecast."""
     why: ReasonInfo | None = None
+    who: Who | None = None
+    """Whose it is, while it is open."""
 
 
 class Holder(_ArcParty, frozen=True):
@@ -166,6 +216,9 @@ class Holder(_ArcParty, frozen=True):
     keep: bool = False
     params: Amounts = {}
     bound: dict[str, str] = {}
+    direct: bool = False
+    """As asked: its RCs settle when it ends."""
+    who: Who | None = None
 
 
 class Revocation(_ArcParty, frozen=True):
@@ -177,6 +230,8 @@ class Revocation(_ArcParty, frozen=True):
     reason: str
     by: str | None = None
     why: ReasonInfo | None = None
+    own: bool = False
+    """Whether its own client gave it back: its program is gone."""
 
 
 class Grants(Message, frozen=True):
@@ -202,6 +257,8 @@ class StateAsk(Message, frozen=True):
     holds_only: bool = False
     forecast: bool = False
     """Whether to estimate when queued ARCs will start."""
+    devices_only: bool = False
+    """Whether only `rcs` is wanted."""
 
 
 class HoldView(_ArcParty, frozen=True):
@@ -217,6 +274,8 @@ class HoldView(_ArcParty, frozen=True):
     remaining: Seconds
     keep: bool = False
     bound: dict[str, str] = {}
+    direct: bool = False
+    who: Who | None = None
 
 
 class WaitView(_ArcParty, frozen=True):
@@ -232,6 +291,23 @@ class WaitView(_ArcParty, frozen=True):
     starts_in: Seconds | None = None
     """An estimate, where one was asked for: as if nothing else were to come."""
     why: ReasonInfo | None = None
+    who: Who | None = None
+
+
+class Parameter(Message, frozen=True):
+    """A bandwidth parameter that an RC knows."""
+
+    name: str
+    unit: str = ""
+    bound: Decimal | None = None
+    """More than this is never carried, whoever holds the RC besides; None: any amount is."""
+    default: Decimal | None = None
+    """What an ARC books that does not say; None: nothing."""
+    unless: list[str] = []
+    """With one of these other parameters `bound` says nothing."""
+
+
+Parameters: TypeAlias = Annotated[list[Parameter], msgspec.Meta(max_length=MAX_KNOWN)]
 
 
 class RcView(Message, frozen=True):
@@ -240,6 +316,18 @@ class RcView(Message, frozen=True):
     sharable: bool
     holders: list[str] = []
     """Ids of the ARCs that hold it."""
+    host: str = ""
+    """Of the instance that is meant; while there is none, where it was last, or is expected."""
+    reason: str = ""
+    """Why it is not present, in words."""
+    gone: Elapsed | None = None
+    """For how many seconds it has not been seen."""
+    duplicates: list[str] = []
+    """Hosts that offer it as well, and stand by."""
+    unseen: dict[str, Elapsed] = {}
+    """Hosts that offered it as well, and have not been seen for so many seconds."""
+    parameters: Parameters | None = None
+    """All bandwidth parameters that it knows; None: it does not say."""
 
 
 class StoryLine(Message, frozen=True):
@@ -272,6 +360,8 @@ class OpenRequest(_Wanted, frozen=True):
     grant: Grant | None = None
     rcs: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
     """The RCs of `grant`."""
+    direct: bool = False
+    who: Who | None = None
 
 
 class ClientRequests(Message, frozen=True):

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 
 from zscout import messages
 from zscout.messages import Incarnation, Placement
-from zscout.types import ComponentId, HostName, Ns
+from zscout.types import ComponentId, HostName, Kind, Ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +32,15 @@ class StartAnswered(_OnHost):
     """Outcome of a StartComponent: `ok` (it runs, or stands by), `refused` (this host will not: another may),
     `failed` (it started and ended, or did not get ready), `unknown` (no answer: it may run or not).
 
-    `again`: whether another try could help; an unregistered kind or a bad parameter stays one."""
+    `again`: whether another try there could help; an unregistered kind stays one."""
 
     result: Literal["ok", "refused", "failed", "unknown"]
     reason: str = ""
     tail: str = ""
     movable: bool = False
     again: bool = True
+    bad_params: bool = False
+    """It failed because of its parameters, which are no better on another host."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +73,12 @@ class TokenVanished(_OnHost):
 @dataclass(frozen=True, slots=True)
 class ComponentsListed:
     """A host's list, as answer to a ListComponents or at a change of leader: all of its components, or, with
-    `only`, that one."""
+    `only`, that one. `kinds` are those that the host can start; None: it does not tell."""
 
     host: HostName
     components: Sequence[messages.ComponentView]
     only: ComponentId | None = None
+    kinds: frozenset[Kind] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from typing import Final
 
@@ -15,6 +16,8 @@ GRACE: Final[Ns] = 2 * SECOND
 """Within this a host must report what was inherited, or went on elsewhere."""
 MAX_PROBES: Final = 3
 """A component without token of which so many probes report nothing is lost."""
+ASK_KINDS: Final[Ns] = 2 * SECOND
+"""Within this hosts must say whether they have a kind by now that none had."""
 TRY_AGAIN: Final[Ns] = SECOND
 """After this a component without an eligible host is tried again."""
 AT_ONCE: Final = 100
@@ -22,6 +25,8 @@ AT_ONCE: Final = 100
 SHORTLY: Final[Ns] = SECOND // 100
 FIGURES: Final = re.compile(r"[\d.,]+ (?=s old|bytes available)")
 """In the reason why there is no eligible host."""
+KINDS_NAMED: Final = 8
+"""Where a kind is not known."""
 CAUSES_NAMED: Final = 4
 """In the reason why no host can start a component."""
 
@@ -38,7 +43,7 @@ class Lifecycle:
         state = self.state
         record = state.get(component)
         if record is None:
-            record = ComponentRecord(component, spec)
+            record = ComponentRecord(component, spec, asked_at=state.now)
             if not state.add(record):
                 state.refuse(component, "too_many", f"{len(state.components)} components are placed already")
                 return
@@ -59,6 +64,7 @@ class Lifecycle:
 
     def _reset(self, record: ComponentRecord, spec: ComponentSpec) -> None:
         record.spec, record.wanted, record.movable = spec, True, False
+        record.asked_at, record.asked_as = self.state.now, record.incarnation
         record.restarts = record.failed_rounds = record.moves = 0
         record.dead = None
         record.reason = record.restart_cause = record.tail = ""
@@ -106,6 +112,8 @@ class Lifecycle:
         untried = next((one for one in hosts if one.host not in tried), None)
         if untried is not None:
             self._start_on(record, untried)
+        elif not hosts and (lacking := self._without_kind(record)):
+            self._ask_for_kind(record, lacking)
         elif not hosts:
             tried.clear()
             # The figures change all the time: for them alone it is not published again.
@@ -128,6 +136,27 @@ class Lifecycle:
             record.failed_rounds += 1
             reason = f"no host started it; tried again after {pause / SECOND:g} s: {record.restart_cause}"
             self._back_off(record, reason, pause)
+
+    def _without_kind(self, record: ComponentRecord) -> set[HostName]:
+        """The hosts of which one would do for what was never started, if any known host had its kind."""
+        return self.state.lacking_everywhere(record.spec) if record.incarnation == record.asked_as else set()
+
+    def _ask_for_kind(self, record: ComponentRecord, hosts: set[HostName]) -> None:
+        """Gives it up, unless hosts told their kinds before it was asked for: its kind may be installed by now."""
+        state, kind = self.state, record.spec.kind
+        before = [host for host in sorted(hosts) if state.kinds[host][0] < record.asked_at]
+        if not before or state.now - record.asked_at >= ASK_KINDS:
+            there = sorted({one for host in hosts for one in state.kinds[host][1]})
+            near = difflib.get_close_matches(kind, there, n=CAUSES_NAMED)
+            more = f" and {len(there) - KINDS_NAMED} more" if len(there) > KINDS_NAMED else ""
+            known = f"there are {', '.join(there[:KINDS_NAMED])}{more}" if there else "nor any other"
+            hint = f"did you mean {' or '.join(near)}?" if near else known
+            self._finish(record, "given_up", f"no host has kind {kind}; {hint}")
+            return
+        for host in before[:AT_ONCE]:
+            self.probes.add(host, record.component)
+        record.reason = f"the hosts are asked whether they have kind {kind} by now"
+        state.wake(record, record.asked_at + ASK_KINDS)
 
     def _start_on(self, record: ComponentRecord, chosen: RankedHost) -> None:
         state, cause = self.state, record.restart_cause
@@ -156,7 +185,7 @@ class Lifecycle:
         """Of the record's own incarnation, not of a migration's target."""
         record.start_until = None
         if answer.result == "failed" and record.state != "starting":
-            self.ended(record, Termination("failed", answer.reason, answer.tail))
+            self.ended(record, Termination("failed", answer.reason, answer.tail, bad_params=answer.bad_params))
         elif answer.result == "ok":
             record.movable, record.confirmed = answer.movable, True
             self.runs(record)
@@ -179,7 +208,8 @@ class Lifecycle:
             record.tried[host] = "" if answer.again else cause
             self.place_again(record, cause)
         else:
-            self._start_failed(record, Termination("failed", answer.reason, answer.tail), again=answer.again)
+            end = Termination("failed", answer.reason, answer.tail, bad_params=answer.bad_params)
+            self._start_failed(record, end, again=answer.again)
 
     def _start_failed(self, record: ComponentRecord, end: Termination, *, again: bool = True) -> None:
         """It ended before it ran: the next host at once, a few times."""
@@ -190,7 +220,9 @@ class Lifecycle:
         cause = f"it did not start on {host}: {end.reason or end.cause}"
         record.tried[host] = "" if again else cause
         record.restarts += 1
-        if not self._exhausted(record, cause):
+        if end.bad_params:
+            self._finish(record, "given_up", cause)
+        elif not self._exhausted(record, cause):
             self.place_again(record, cause)
 
     def runs(self, record: ComponentRecord, *, anew: bool = False) -> None:
@@ -260,7 +292,9 @@ class Lifecycle:
             self._back_off(record, f"it went on elsewhere ({end.cause}), it is not known where", GRACE)
             return
         cause = _cause(end, host)
-        if end.cause == "completed" and record.spec.restart != "always":
+        if end.bad_params:
+            self._finish(record, "given_up", cause)
+        elif end.cause == "completed" and record.spec.restart != "always":
             self._finish(record, "ended", cause)
         elif record.spec.restart == "never":
             self._finish(record, "given_up" if end.cause == "failed" else "ended", cause)

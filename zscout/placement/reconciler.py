@@ -127,6 +127,8 @@ class Reconciler:
         state, host, only = self.state, listing.host, listing.only
         # What a host sent before it was lost is no answer.
         answered = self.probes.answered(host, only) if host in state.alive else []
+        if listing.kinds is not None:
+            state.told_kinds(host, listing.kinds)
         for one in listing.components:
             if only in (None, one.component):
                 self._listed(host, one)
@@ -200,7 +202,7 @@ class Reconciler:
 
     def _listed_as_ended(self, record: ComponentRecord, host: HostName, listed: ComponentView) -> None:
         move, incarnation = record.migration, listed.incarnation
-        end = Termination(listed.ended or "lost", listed.reason, listed.tail)
+        end = Termination(listed.ended or "lost", listed.reason, listed.tail, bad_params=listed.bad_params)
         if self.surplus.has(record.component, incarnation):
             self.surplus.ended(record.component, incarnation)
             self.lifecycle.surplus_ended(record.component)

@@ -14,7 +14,7 @@ from typing import Final, Literal, TypeAlias
 from zscout import messages
 from zscout.config.fleet import PlacementPolicy
 from zscout.messages import LAST_TERMS, ComponentSpec, ComponentState, HowEnded, Incarnation, Placement, RankedHost
-from zscout.placement.balancer import LOAD_TIME, Balancer, RankingCache
+from zscout.placement.balancer import LOAD_TIME, MAX_HOSTS, Balancer, RankingCache
 from zscout.placement.events import ComponentChanged, HostCommand, PlacementRefused, PlacerEffect
 from zscout.placement.model import NO_REPORT, RankQuery
 from zscout.types import SECOND, ComponentId, HostName, Kind, Ns
@@ -60,12 +60,13 @@ SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
 @dataclass(frozen=True, slots=True)
 class Termination:
     """How an incarnation ended; `lost`: nobody knows how. `with_host`: with its host, so that it does not
-    count as its failure."""
+    count as its failure. `bad_params`: it failed because of its parameters, and would again."""
 
     cause: HowEnded | Literal["lost"]
     reason: str
     tail: str = ""
     with_host: bool = False
+    bad_params: bool = False
 
 
 def host_gone(host: HostName | None) -> Termination:
@@ -100,6 +101,10 @@ class ComponentRecord:
     state: ComponentState = "waiting"
     """Changed by `enter` alone."""
     incarnation: Incarnation = 0
+    asked_at: Ns = 0
+    """When it was asked for."""
+    asked_as: Incarnation = 0
+    """Its incarnation then: as long as it is the same, it was never started since."""
     superseded: bool = False
     """The incarnation belongs to what was placed before under this name, and must not live."""
     host: HostName | None = None
@@ -231,6 +236,8 @@ class PlacementState:
         """Placed at the end of this instant."""
         self.alive: set[HostName] = set()
         """Hosts whose node has its token."""
+        self.kinds: dict[HostName, tuple[Ns, frozenset[Kind]]] = {}
+        """What hosts can start, and when they said so; those that are gone included, for they may come back."""
         self.last_change: dict[HostName, Ns] = {}
         """When the placer last brought a component to a host or took one from it."""
         self.departed: dict[HostName, deque[tuple[Ns, float]]] = {}
@@ -347,16 +354,19 @@ class PlacementState:
         if only is not None:
             query = replace(query, hosts=frozenset({only}))
         ranking = self.rankings.rank(query)
-        found = tuple(one for one in ranking.hosts if one.host in self.alive and one.host != other_than)
+        lacking = {host for host in self.alive if self.lacks(host, spec.kind)} if self.kinds else set()
+        usable = self.alive - lacking if lacking else self.alive
+        found = tuple(one for one in ranking.hosts if one.host in usable and one.host != other_than)
         left_out = dict(ranking.left_out)
         if only is not None and spec.hosts is not None and only not in spec.hosts:
             left_out = {only: NOT_NAMED}
         elif found:
             return found, ""
         else:
-            left_out |= {one.host: GONE for one in ranking.hosts if one.host != other_than}
+            left_out |= {one.host: GONE for one in ranking.hosts if one.host not in (other_than, *lacking)}
             known = self.alive if query.hosts is None else self.alive & query.hosts
             left_out |= dict.fromkeys(known - self.balancer.reports.keys(), NO_REPORT)
+            left_out |= dict.fromkeys(known & lacking, f"it has no kind {spec.kind}")
             if other_than is not None:
                 left_out.pop(other_than, None)
         named = [f"{host}: {why}" for host, why in heapq.nsmallest(HOSTS_NAMED, left_out.items())]
@@ -364,6 +374,22 @@ class PlacementState:
             named.append(f"and {len(left_out) - HOSTS_NAMED} more")
         none = "there is no host" if other_than is None else "there is no other that it may use"
         return (), "; ".join(named) or none
+
+    def told_kinds(self, host: HostName, kinds: frozenset[Kind]) -> None:
+        self.kinds.pop(host, None)
+        self.kinds[host] = self.now, kinds
+        if len(self.kinds) > MAX_HOSTS:
+            del self.kinds[next(iter(self.kinds))]
+
+    def lacks(self, host: HostName, kind: Kind) -> bool:
+        """Whether a host has said what it can start, and this kind was not among it."""
+        told = self.kinds.get(host)
+        return told is not None and kind not in told[1]
+
+    def lacking_everywhere(self, spec: ComponentSpec) -> set[HostName]:
+        """The hosts that are there and could be used but for its kind, if no host that is known has that."""
+        known = self.alive | self.kinds.keys() if spec.hosts is None else set(spec.hosts)
+        return known & self.alive if all(self.lacks(host, spec.kind) for host in known) else set()
 
     def component_arrives(self, component: ComponentId, kind: Kind, host: HostName) -> None:
         """It is on its way to a host."""

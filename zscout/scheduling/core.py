@@ -62,7 +62,7 @@ class Core:
     def handle(self, now: Ns, *events: model.Event) -> list[model.Effect]:
         """Applies one instant's events and runs a pass. Raises ValueError where `now` goes backwards.
 
-        1. End the holds whose minimum runtime is over.
+        1. End the holds whose time is over.
         2. Apply the events, in the order given.
         3. Run a pass of the strategy, if anybody is queued (its steps: `priority.py`, `adaptive.py`).
         4. Say when to wake."""
@@ -140,7 +140,11 @@ class Core:
     def as_events(self, term: Term) -> tuple[list[model.Event], model.LeadTaken]:
         """The events that bring another core to the state of this one, in a term of its own."""
         state = self._state
-        joined: list[model.Event] = [model.RcJoined(rc.name, rc.sharable) for rc in state.rcs.values() if rc.present]
+        joined: list[model.Event] = [
+            model.RcJoined(rc.name, rc.sharable) if rc.present else model.RcLost(rc.name, why=rc.absence)
+            for rc in state.rcs.values()
+            if rc.present or rc.absence
+        ]
         recovered_holds = tuple(
             model.RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
             for arc in state.running.values()
@@ -199,8 +203,9 @@ class Core:
                         self._end_hold(self._state.running[arc], Outcome.LOST, Reason(ReasonCode.RC_ENDED, (rc,)))
                 if rules_changed:
                     self._votes.forget_rc(rc)
-            case model.RcLost(rc, reason):
-                self._lose_rc(rc, reason)
+            case model.RcLost(rc, reason, why):
+                self._lose_rc(rc, why or reason)
+                self._state.rc(rc).absence = why
             case model.ClientLost(client, reason):
                 for lost in self.arcs_of(client):
                     self._end_request(lost, Outcome.CLIENT_LOST, Reason(ReasonCode.CLIENT_LOST, detail=reason))
@@ -231,6 +236,10 @@ class Core:
             place = Place(self.term, self._arrivals)
         elif place.term == self.term:
             self._arrivals = max(self._arrivals, place.arrival)
+        longest = self.policy.max_runtime
+        if longest is not None and request.min_runtime > longest:
+            # Nobody gets more: what is reckoned with it (ranks, reservations) is the shorter.
+            request = replace(request, min_runtime=longest)
         patterns = tuple(filter(is_pattern, request.needs))
         named = self._state.mask([need for need in request.needs if need not in patterns])
         arc = Arc(request, place, named, patterns, named)
@@ -349,7 +358,7 @@ class Core:
         arc = self._new_arc(held.request, held.place)
         if arc.patterns:
             self._state.bind(arc, held.bound)
-        hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc))
+        hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc), self._state.longest(held.start))
         absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
         taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
         other = self._state.at_place(arc.place)
@@ -372,7 +381,9 @@ class Core:
 
     def _expire(self) -> None:
         for arc in self._state.expired_arcs():
-            if arc.request.keep:
+            if arc.hold is not None and arc.hold.last is not None and arc.hold.last <= self._state.now:
+                self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.LIMIT), requeue=False)
+            elif arc.request.keep:
                 self._state.min_runtime_over(arc)
             else:
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.EXPIRED), requeue=False)
@@ -381,7 +392,8 @@ class Core:
 
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())
-        hold = Hold(grant, self._state.now, self._state.now + arc.request.min_runtime, self._state.protected_below(arc))
+        now, state = self._state.now, self._state
+        hold = Hold(grant, now, now + arc.request.min_runtime, state.protected_below(arc), state.longest(now))
         self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold))
 

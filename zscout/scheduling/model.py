@@ -16,7 +16,8 @@ from enum import StrEnum
 from typing import Final, TypeAlias
 
 from zscout.keyexpr import check_need, is_pattern, matcher
-from zscout.scheduling.reason import Party, Reason
+from zscout.messages import Who
+from zscout.scheduling.reason import SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
 QUANTUM: Ns = SECOND
@@ -47,6 +48,10 @@ class ArcRequest:
     keep: bool = False
     label: str = ""
     """What people call it; the core only prints it."""
+    direct: bool = False
+    """Whether its program touches devices past their RCs; the core only keeps it."""
+    who: Who | None = None
+    """Who asked, as people are told; the core only prints it."""
 
     def __post_init__(self) -> None:
         if not self.needs:
@@ -71,6 +76,8 @@ class Hold:
     end: Ns
     protected_below: int | None = None
     """Below this priority nobody preempts it before `end`; None: any higher priority does."""
+    last: Ns | None = None
+    """When it ends though it is kept; None: nothing ends it but others and its client."""
 
 
 class ArcState(StrEnum):
@@ -186,7 +193,7 @@ class Arc:
         self.request, self.id, self.priority = request, request.arc, request.priority
         self.owner = request.client.partition("/")[0]
         self.rank = (-self.priority, request.min_runtime, self.place, self.id)
-        self.party = Party(self.id, request.name, self.priority)
+        self.party = Party(self.id, request.name, self.priority, request.who)
 
     def move_to(self, state: ArcState) -> None:
         """Raises ValueError for a move that is not in `TRANSITIONS`."""
@@ -196,8 +203,16 @@ class Arc:
 
     def known_end(self, other: Arc | None = None) -> float:
         """When its hold ends, or `other` may preempt it, by what is known now; infinite for what it keeps."""
+        if self.hold is None:
+            return math.inf
         kept = self.request.keep and (other is None or self.priority > other.priority)
-        return math.inf if self.hold is None or kept else self.hold.end
+        last = math.inf if self.hold.last is None else self.hold.last
+        return last if kept else min(self.hold.end, last)
+
+    def blocks(self, other: Arc) -> Party:
+        """How the reason names it for which `other` waits, that may not preempt it yet."""
+        end = self.known_end(other)
+        return self.party._replace(until=None if math.isinf(end) else int(end))
 
     def past_min_runtime(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may preempt it then."""
@@ -223,6 +238,8 @@ class Rc:
     bit: int
     present: bool = False
     sharable: bool = False
+    absence: str = ""
+    """While it is absent: why, if that is known."""
     holders: dict[ArcId, Arc] = field(default_factory=dict)
     demand: int = 0
     """How many of the queued ARCs name it."""
@@ -232,6 +249,13 @@ class Rc:
     def non_preemptible_holders(self, arc: Arc, now: Ns) -> list[Arc]:
         """Its holders that are not preempted for `arc`."""
         return [holder for holder in self.holders.values() if not holder.preemptible_by(arc, now)]
+
+
+def absences(rcs: Iterable[Rc]) -> str:
+    """Why these RCs are absent, as far as that is known, in words."""
+    known = [f"{rc.name}: {rc.absence}" for rc in rcs if rc.absence]
+    more = f"; {len(known) - SHOWN} more" if len(known) > SHOWN else ""
+    return "; ".join(known[:SHOWN]) + more
 
 
 def union(masks: Iterable[int]) -> int:
@@ -303,10 +327,12 @@ class RcReported:
 
 @dataclass(frozen=True, slots=True)
 class RcLost:
-    """An RC is gone, or can't carry its holders any longer."""
+    """An RC is gone, or can't carry its holders any longer; `why`, if that is known, stands in the reason of whoever
+    waits for it."""
 
     rc: RcName
     reason: str = "it left the mesh"
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)

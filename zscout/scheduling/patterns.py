@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from zscout.scheduling.model import Arc, Rc
+from zscout.scheduling.model import Arc, Rc, absences
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import SchedulerState
@@ -88,7 +88,8 @@ def no_match(state: SchedulerState, arc: Arc) -> Reason:
     there = {need: sum(rc.present for rc in state.matching(need)) for need in arc.patterns}
     # Those without any; else there are some for each, but not enough for all.
     short = sorted(need for need, count in there.items() if not count) or sorted(there)
-    return of_rcs(ReasonCode.NO_MATCH, short)
+    lost = [rc for need in short for rc in state.matching(need) if not rc.present]
+    return of_rcs(ReasonCode.NO_MATCH, short, absences(dict.fromkeys(lost)))
 
 
 def _distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:

@@ -47,9 +47,9 @@ from operator import attrgetter
 from typing import Final, Literal, TypeAlias
 
 from zscout.config.scheduling_policy import StrategyName
-from zscout.scheduling.model import Arc, ArcState, Rank, Rc, union
+from zscout.scheduling.model import Arc, ArcState, Rank, Rc, absences, union
 from zscout.scheduling.patterns import bind, no_match
-from zscout.scheduling.reason import SHOWN, Reason, ReasonCode, of_rcs
+from zscout.scheduling.reason import SHOWN, SHOWN_CHOICES, Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible, Reservations
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.votes import Answer, HolderSet
@@ -100,22 +100,47 @@ class AdmissionCheck:
         several that are held, one that is likely to stay held for long: that saves checks."""
         for rc in self.arc.rcs:
             if not rc.present:
-                absent = [rc.name for rc in self.arc.rcs if not rc.present]
-                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, absent))
+                absent = [rc for rc in self.arc.rcs if not rc.present]
+                why = rc.absence if len(absent) == 1 else absences(absent)
+                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, [one.name for one in absent], why))
         lasting: tuple[int, float, int] | None = None
         for number, (rc, holder) in enumerate(self.non_preemptible):
             if not off_limits or not rc.bit & off_limits:
                 lasting = max(lasting or (holder.priority, -1.0, 0), (holder.priority, holder.known_end(), number))
         if lasting is not None:
-            shown = self.non_preemptible[:SHOWN]
-            rcs, parties = tuple(rc.name for rc, _ in shown), tuple(holder.party for _, holder in shown)
-            reason = Reason(ReasonCode.HELD, rcs, parties, number=len(self.non_preemptible))
-            return Inadmissible(self.non_preemptible[lasting[2]][0], reason)
+            return Inadmissible(self.non_preemptible[lasting[2]][0], self._held())
         if off_limits:
             for rc in self._sharables:
                 if not rc.bit & off_limits and (answer := self._answer(rc)) is not None and not answer.accept:
-                    return _vetoed(rc, answer)
+                    return self._vetoed(rc, answer)
         return None
+
+    def _held(self) -> Reason:
+        """That it waits for holders who are not preempted: of an RC that it names, of all choices for a pattern."""
+        arc, number = self.arc, len(self.non_preemptible)
+        if not arc.patterns:
+            shown = self.non_preemptible[:SHOWN]
+            rcs, parties = tuple(rc.name for rc, _ in shown), tuple(holder.blocks(arc) for _, holder in shown)
+            return Reason(ReasonCode.HELD, rcs, parties, number=number)
+        bound = {rc: need for need, rc in arc.bound.items()}
+        told = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
+        known = {rc.bit for rc, _, _ in told}
+        for rc, _ in self.non_preemptible:
+            if rc.bit in known:  # two patterns may have the same choices
+                continue
+            need = bound[rc.name]
+            for choice in sorted(self.state.matching(need), key=attrgetter("name")):
+                if choice.present and not choice.sharable and not choice.bit & (union(known) | arc.named_mask):
+                    known.add(choice.bit)
+                    told += [(choice, one, need) for one in choice.non_preemptible_holders(arc, self.now)[:1]]
+        first = told[:SHOWN_CHOICES]
+        return Reason(
+            ReasonCode.HELD,
+            tuple(rc.name for rc, _, _ in first),
+            tuple(holder.blocks(arc) for _, holder, _ in first),
+            number=len(told),
+            patterns=tuple(need for _, _, need in first),
+        )
 
     def masked_obstacles(self) -> int:
         """Bits of the RCs that keep the ARC out at present, whether off limits or not."""
@@ -149,10 +174,26 @@ class AdmissionCheck:
         for rc in self._sharables:
             answer = self._answer(rc)
             if answer is not None and not answer.accept:
-                return _vetoed(rc, answer).reason
+                return self._vetoed(rc, answer).reason
             if answer is None and not unresponsive and rc.name in self.votes.unresponsive:
                 unresponsive = of_rcs(ReasonCode.SILENT, [rc.name])
         return unresponsive
+
+    def _vetoed(self, rc: Rc, answer: Answer) -> Inadmissible:
+        beside = rc.non_preemptible_holders(self.arc, self.now)
+        parties = tuple(holder.blocks(self.arc) for holder in beside[:SHOWN])
+        return Inadmissible(rc, Reason(ReasonCode.VETOED, (rc.name,), parties, answer.reason, len(beside)))
+
+    def refusing(self, pattern: Need) -> tuple[RcName, ...]:
+        """The RCs among the choices for a pattern of the ARC that are known to refuse it, the one that it is bound to
+        first."""
+        bound = self.arc.bound[pattern]
+        found = [bound]
+        for rc in self.state.matching(pattern):
+            if rc.present and rc.sharable and rc.name != bound and not rc.bit & self.arc.named_mask:
+                answer = self._answer(rc)
+                found += [rc.name] if answer is not None and not answer.accept else []
+        return tuple(found[:SHOWN_CHOICES])
 
     def _answer(self, rc: Rc) -> Answer | None:
         """What `rc` votes on the ARC beside its holders that are not preempted for it."""
@@ -180,12 +221,8 @@ class AdmissionCheck:
             if answer is None:
                 unknown.append((rc, holders))
             elif not answer.accept:
-                return _vetoed(rc, answer)
+                return self._vetoed(rc, answer)
         return VotesNeeded(unknown) if unknown else None
-
-
-def _vetoed(rc: Rc, answer: Answer) -> Inadmissible:
-    return Inadmissible(rc, Reason(ReasonCode.VETOED, (rc.name,), detail=answer.reason))
 
 
 VOTING: Final = Reason(ReasonCode.VOTING)
@@ -329,6 +366,8 @@ class Pass:
                 else:
                     # The ARC could do with another RC.
                     self.index.put(arc, ArcState.READY)
+                    if reason.code is ReasonCode.VETOED:
+                        reason = reason._replace(rcs=check.refusing(pattern))
                     self.actions.wait(arc, reason._replace(pattern=pattern))
             case "over quota":
                 # Whoever of its owner's ends may let it go: no RC shows that.

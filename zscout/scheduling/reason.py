@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
+from itertools import groupby
 from typing import Final, NamedTuple
 
-from zscout.types import ArcId, Need, RcName
+from zscout.messages import Who
+from zscout.types import ArcId, ClientId, Need, Ns, RcName, clean
 
 SHOWN = 3
 """How many RCs a reason names; it counts the rest."""
+SHOWN_CHOICES = 8
+"""The same where RCs are choices for a pattern."""
 
 
 class ReasonCode(StrEnum):
     # An ARC waits:
     ABSENT = "absent"
-    """`rcs` are not on the mesh."""
+    """`rcs` are not on the mesh, or can't carry anybody; `detail` says why, as far as that is known."""
     NO_MATCH = "no_match"
-    """No RC is left for the patterns in `rcs`."""
+    """No RC is left for the patterns in `rcs`; `detail` says why RCs that would do are lost."""
     HELD = "held"
-    """`rcs` are held by `by`, one each, who are not preempted for it."""
+    """`rcs` are held by `by`, one each, who are not preempted for it; of a pattern all its choices are told."""
     VETOED = "vetoed"
-    """The RC refuses it beside those who hold it; `detail` in the RC's own words."""
+    """The RC refuses it beside `by`, who hold it and are not preempted for it; `detail` in the RC's own words."""
     UNCONFIRMED = "unconfirmed"
     """`rcs` did not confirm a grant: it is not granted again for a while."""
     CLAIMED = "claimed"
@@ -39,6 +43,8 @@ class ReasonCode(StrEnum):
     # A hold, or a wait, ended:
     EXPIRED = "expired"
     """Its minimum runtime is over."""
+    LIMIT = "limit"
+    """It had the longest time that the fleet gives a hold."""
     PREEMPTED = "preempted"
     """By `by`."""
     DISPLACED = "displaced"
@@ -60,18 +66,40 @@ class ReasonCode(StrEnum):
 
 
 class Party(NamedTuple):
-    """An ARC that is in another's way, or was preferred to it."""
+    """An ARC that is in another's way, or was preferred to it; `str` of it says whose it is."""
 
     arc: ArcId
     name: str
     priority: int
+    who: Who | None = None
+    until: Ns | None = None
+    """When it holds no more, or may be preempted for the other, at the latest; None: not known."""
 
     def __str__(self) -> str:
-        return f"{self.name}, priority {self.priority}"
+        return named(self.who, self.arc.rpartition("/")[0], self.name)
+
+    @property
+    def comment(self) -> str:
+        """What its user wants others to know, as it ends a sentence."""
+        return f": {clean(self.who.comment)}" if self.who is not None and self.who.comment else ""
+
+
+def named(who: Who | None, client: ClientId, arc: str) -> str:
+    """Whose ARC that is, for people: `alice@ws1 (survey.py)`; the client and the ARC's name, `ws1/c7 (survey)`, where
+    nobody says more."""
+    if who is None or not (who.user or who.command):
+        return f"{client} ({arc})" if client else arc
+    host = who.host or client.partition("/")[0]
+    return clean(f"{who.user}@{host}" if who.user else host) + f" ({clean(who.command or arc)})"
+
+
+Until = Callable[[Ns], str]
+"""How the end of another's hold is told: `14:32`."""
 
 
 class Reason(NamedTuple):
-    """A reason; `str` of it is its text. `number` counts `rcs`, of which the first `SHOWN` are named, or is a quota."""
+    """A reason; `str` of it is its text. `number` counts `rcs`, of which the first `SHOWN` (with `patterns`
+    `SHOWN_CHOICES`) are named, or is a quota."""
 
     code: ReasonCode
     rcs: tuple[RcName, ...] = ()
@@ -79,42 +107,114 @@ class Reason(NamedTuple):
     detail: str = ""
     number: int = 0
     pattern: Need | None = None
-    """Which pattern of its needs keeps the ARC out; the rest is about one of the RCs that meet it."""
+    """Which pattern of its needs keeps the ARC out; the rest is about one of the RCs that meet it, or with `patterns`
+    about all of them."""
+    patterns: tuple[Need, ...] = ()
+    """By each of `rcs` the pattern that it is a choice for, empty where the ARC names it."""
 
     def __str__(self) -> str:
+        return self.text()
+
+    def text(self, until: Until | None = None) -> str:
+        """In words; with `until` also until when others hold what is waited for."""
+        if self.code is ReasonCode.HELD:
+            return _held(self, until)
+        if self.code is ReasonCode.VETOED:
+            return _vetoed(self, until)
         text = _TEXTS[self.code](self)
         return text if self.pattern is None else f"no {self.pattern} is to be had: {text}"
 
 
-def of_rcs(code: ReasonCode, rcs: Sequence[RcName]) -> Reason:
+def waits(reason: str) -> str:
+    """How something waits, after its name: `waits for alice@ws1 (survey.py): robot/a`, `waits: votes are out`."""
+    return reason if reason.startswith("waits ") else f"waits: {reason}"
+
+
+def ended(outcome: str, reason: str) -> str:
+    """How something ended: `preempted by ...`, `lost: robot/a ended the hold`."""
+    word = outcome.replace("_", " ")
+    return reason if reason.startswith(word) else f"{word}: {reason}" if reason else word
+
+
+def of_rcs(code: ReasonCode, rcs: Sequence[RcName], detail: str = "") -> Reason:
     """A reason that concerns all of `rcs`."""
-    return Reason(code, tuple(rcs[:SHOWN]), number=len(rcs))
+    return Reason(code, tuple(rcs[:SHOWN]), number=len(rcs), detail=detail)
 
 
-def _listed(reason: Reason, shown: Iterable[str] | None = None) -> str:
+def _last(party: Party, until: Until | None) -> str:
+    return "" if until is None or party.until is None else f", until {until(party.until)} at the latest"
+
+
+def _vetoed(reason: Reason, until: Until | None) -> str:
+    words, others = f": {reason.detail}" if reason.detail else "", reason.number - len(reason.by)
+    shown = [f"{party}{_last(party, until)}" for party in reason.by] + ([f"{others} more"] if others > 0 else [])
+    if len(reason.rcs) > 1:
+        return f"waits for one of {', '.join(_short(reason.rcs))}: {reason.rcs[0]} refuses{words}"
+    rc = reason.rcs[0] + (f" for {reason.pattern}" if reason.pattern is not None else "")
+    return f"waits for {' and '.join(shown)}: {rc} refuses more{words}" if shown else f"{rc} refuses{words}"
+
+
+def _short(rcs: Iterable[RcName]) -> Iterator[RcName]:
+    """RCs in a row: a kind is not said twice."""
+    last = ""
+    for rc in rcs:
+        kind = rc.partition("/")[0] + "/"
+        yield rc.removeprefix(kind) if kind == last else rc
+        last = kind
+
+
+def _held(reason: Reason, until: Until | None) -> str:
+    """Who holds what is waited for: first those in the way of what the ARC names, then for each pattern its choices."""
+    patterns = reason.patterns or ("",) * len(reason.rcs)
+    held = list(zip(reason.rcs, reason.by, patterns, strict=False))
+    parts = []
+    for party in dict.fromkeys(party for _, party, pattern in held if not pattern):
+        rcs = ", ".join(rc for rc, one, pattern in held if not pattern and one == party)
+        parts.append(f"{party}: {rcs}{_last(party, until)}")
+    for pattern, group in groupby((one for one in held if one[2]), key=lambda one: one[2]):
+        choices = list(group)
+        if len(choices) == 1 and reason.number <= len(held):
+            rc, party, _ = choices[0]
+            parts.append(f"{party}: {rc} for {pattern}{_last(party, until)}")
+            continue
+        names = _short(rc for rc, _, _ in choices)
+        shown = [f"{rc} (held by {one[1]}{_last(one[1], until)})" for rc, one in zip(names, choices, strict=True)]
+        parts.append(f"one of {', '.join(shown)}")
+    more = f" and {reason.number - len(held)} more" if reason.number > len(held) else ""
+    return f"waits for {'; for '.join(parts)}{more}"
+
+
+def _listed(reason: Reason) -> str:
     more = f" and {reason.number - SHOWN} more" if reason.number > SHOWN else ""
-    return ", ".join(shown or reason.rcs) + more
+    return ", ".join(reason.rcs) + more
+
+
+def _because(reason: Reason) -> str:
+    return f" ({reason.detail})" if reason.detail else ""
 
 
 _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
-    ReasonCode.ABSENT: lambda one: f"{_listed(one)} not on the mesh",
-    ReasonCode.NO_MATCH: lambda one: f"no RC on the mesh is left for {_listed(one)}",
-    ReasonCode.HELD: lambda one: (
-        "needs " + _listed(one, [f"{rc} (held by {by})" for rc, by in zip(one.rcs, one.by, strict=True)])
+    ReasonCode.ABSENT: lambda one: (
+        f"{one.rcs[0]} is lost: {one.detail}"
+        if one.detail and one.number == 1
+        else f"{_listed(one)} not on the mesh{_because(one)}"
     ),
-    ReasonCode.VETOED: lambda one: f"{one.rcs[0]} refuses" + (f": {one.detail}" if one.detail else ""),
+    ReasonCode.NO_MATCH: lambda one: f"no RC on the mesh is left for {_listed(one)}{_because(one)}",
     ReasonCode.SILENT: lambda one: f"{_listed(one)} does not answer",
     ReasonCode.UNCONFIRMED: lambda one: f"{_listed(one)} did not confirm the grant",
     ReasonCode.CLAIMED: lambda one: f"{one.detail} claims it as well",
     ReasonCode.RESERVED: lambda one: (
-        f"{one.rcs[0]} is kept for {one.by[0].name}, whose time to wait is over before this ends"
+        f"{one.rcs[0]} is kept for {one.by[0]}, whose time to wait is over before this ends"
     ),
     ReasonCode.QUOTA: lambda one: f"host {one.detail} has {one.number} ARCs running, its quota",
     ReasonCode.VOTING: lambda _: "votes are out",
     ReasonCode.SEARCHING: lambda _: "a better schedule is sought",
     ReasonCode.EXPIRED: lambda _: "its minimum runtime is over",
-    ReasonCode.PREEMPTED: lambda one: f"preempted by {one.by[0]}",
-    ReasonCode.DISPLACED: lambda one: f"its minimum runtime is over and {one.by[0]}, needs its RCs",
+    ReasonCode.LIMIT: lambda _: "it had the longest time that this fleet gives a hold (max_runtime)",
+    ReasonCode.PREEMPTED: lambda one: f"preempted by {one.by[0]}, priority {one.by[0].priority}{one.by[0].comment}",
+    ReasonCode.DISPLACED: lambda one: (
+        f"its minimum runtime is over and {one.by[0]}, priority {one.by[0].priority}, needs its RCs{one.by[0].comment}"
+    ),
     ReasonCode.CANCELLED: lambda one: f"cancelled by {one.detail}",
     ReasonCode.RELEASED: lambda one: f"released by {one.detail}",
     ReasonCode.CLIENT_LOST: lambda one: one.detail,

@@ -13,6 +13,8 @@ from dataclasses import replace
 from operator import itemgetter
 from typing import Protocol
 
+from msgspec import structs
+
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName
 from zscout.keyexpr import matcher
 from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc, union
@@ -123,7 +125,7 @@ class SchedulerState:
         """The instant of the latest batch of events."""
         self.votes = Votes()
         self._ends: list[tuple[Ns, ArcId]] = []
-        """A heap of the ends of minimum runtimes. Those of holds that ended otherwise are skipped."""
+        """A heap of the ends of minimum runtimes and longest times. Those of holds that ended otherwise are skipped."""
         self.rcs: dict[RcName, Rc] = {}
         self.queued: dict[ArcId, Arc] = {}
         self.running: dict[ArcId, Arc] = {}
@@ -214,7 +216,7 @@ class SchedulerState:
 
     def join(self, name: RcName, *, sharable: bool) -> None:
         rc = self.rc(name)
-        rc.present, rc.sharable = True, sharable
+        rc.present, rc.sharable, rc.absence = True, sharable, ""
         self.present |= rc.bit
         self.sharable = self.sharable | rc.bit if sharable else self.sharable & ~rc.bit
         self.index.freed |= rc.bit
@@ -314,13 +316,17 @@ class SchedulerState:
         self._rename(arc, to, renamed)
         arc.entry = self._next_entry()
         self._add_running(arc)
-        if arc.hold.end > self.now:
-            heapq.heappush(self._ends, (arc.hold.end, arc.id))
+        for end in (arc.hold.end, arc.hold.last):
+            if end is not None and end > self.now:
+                heapq.heappush(self._ends, (end, arc.id))
         self._clients.setdefault(to, {})[arc.id] = arc
 
     def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
         self._forget_client(arc)
-        arc.take(replace(arc.request, arc=name, client=client))
+        who = arc.request.who
+        if who is not None and who.host:
+            who = structs.replace(who, host="")  # it is the new client's
+        arc.take(replace(arc.request, arc=name, client=client, who=who))
 
     def start(self, arc: Arc, hold: Hold) -> None:
         self.dequeue(arc)
@@ -328,6 +334,8 @@ class SchedulerState:
         arc.hold, arc.reason, arc.since, arc.entry = hold, None, self.now, self._next_entry()
         self._add_running(arc)
         heapq.heappush(self._ends, (hold.end, arc.id))
+        if hold.last is not None:
+            heapq.heappush(self._ends, (hold.last, arc.id))
         self.index.touched |= arc.mask
         self.busy |= arc.mask & ~self.sharable
 
@@ -342,18 +350,20 @@ class SchedulerState:
         return hold
 
     def expired_arcs(self) -> Iterator[Arc]:
-        """The running ARCs whose minimum runtime is over by now, each once; the caller may end others meanwhile."""
+        """The running ARCs whose minimum runtime or longest time is over by now, each time once; the caller may end
+        others meanwhile."""
         while self._ends and self._ends[0][0] <= self.now:
-            arc = self.running.get(heapq.heappop(self._ends)[1])
-            if arc is not None and arc.hold is not None and arc.hold.end <= self.now:
+            at, arc_id = heapq.heappop(self._ends)
+            arc = self.running.get(arc_id)
+            if arc is not None and arc.hold is not None and at in (arc.hold.end, arc.hold.last):
                 yield arc
 
     def next_end(self) -> Ns | None:
-        """When the next minimum runtime is over."""
+        """When the next minimum runtime or longest time is over."""
         while self._ends:
             at, arc_id = self._ends[0]
             arc = self.running.get(arc_id)
-            if arc is not None and arc.hold is not None and arc.hold.end == at:
+            if arc is not None and arc.hold is not None and at in (arc.hold.end, arc.hold.last):
                 return at
             heapq.heappop(self._ends)
         return None
@@ -371,6 +381,11 @@ class SchedulerState:
         """The band of a priority: ARCs whose priorities share a band respect each other's reservations."""
         alone = self.policy.promise == "equals" or self.operator(priority)
         return priority if alone else self.policy.operator_priority - 1
+
+    def longest(self, start: Ns) -> Ns | None:
+        """When a hold from `start` on ends at the latest."""
+        limit = self.policy.max_runtime
+        return None if limit is None else start + limit
 
     def protected_below(self, arc: Arc) -> int | None:
         """Below which priority nobody takes a hold that `arc` is granted now, before its minimum runtime is

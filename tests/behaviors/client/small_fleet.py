@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 
 from tests.mesh.kit import until
 from zscout.behaviors.client.client import Client
-from zscout.config.fleet import default_fleet
+from zscout.config.fleet import Fleet, default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
@@ -24,7 +24,8 @@ FLEET = default_fleet()
 class SmallFleet:
     """Candidates, RC and OTHER on a host of their own, and clients, each with its place on one network."""
 
-    def __init__(self) -> None:
+    def __init__(self, fleet: Fleet = FLEET) -> None:
+        self.fleet = fleet
         self.network = MemoryNetwork(lease=FLEET.mesh.lease)
         self.candidates: dict[str, Candidate] = {}
         self.clients: list[Client] = []
@@ -41,12 +42,12 @@ class SmallFleet:
         return self.network.open(FLEET.name, Sender(host, name))
 
     def candidate(self, host: str) -> Candidate:
-        candidate = self.candidates[host] = Candidate(self.mesh(host, "node"), FLEET)
+        candidate = self.candidates[host] = Candidate(self.mesh(host, "node"), self.fleet)
         candidate.start()
         return candidate
 
     def client(self, name: str) -> Client:
-        client = Client(self.mesh("h", name), FLEET).start()
+        client = Client(self.mesh("h", name), self.fleet).start()
         self.clients.append(client)
         return client
 
@@ -62,8 +63,8 @@ class SmallFleet:
 
 
 @asynccontextmanager
-async def small_fleet(*clients: str) -> AsyncIterator[tuple[SmallFleet, list[Client]]]:
-    fleet = SmallFleet()
+async def small_fleet(*clients: str, config: Fleet = FLEET) -> AsyncIterator[tuple[SmallFleet, list[Client]]]:
+    fleet = SmallFleet(config)
     for rc in fleet.rcs:
         await rc.start()
     fleet.candidate("h0")

@@ -41,7 +41,7 @@ def test_a_hold_ends_after_its_minimum_runtime_without_an_error() -> None:
     async def test() -> None:
         async with small_fleet("one") as (fleet, (one,)):
             began = one.mesh.now()
-            async with hold(one, "first", {RC: {}}, min_runtime=5):
+            async with hold(one, "first", {RC: {}}, min_runtime=5, keep=False):
                 await asyncio.sleep(3600)
             assert 5 <= (one.mesh.now() - began) / SECOND < 5.1
             assert await fleet.holders() == []
@@ -57,7 +57,7 @@ def test_a_timer_that_goes_off_early_ends_a_hold_without_an_error() -> None:
             mesh.now = lambda: round((START + (loop.time() - START) * 0.999) * SECOND)
             slow = Client(mesh, FLEET).start()
             fleet.clients.append(slow)
-            async with hold(slow, "first", {RC: {}}, min_runtime=2) as held:
+            async with hold(slow, "first", {RC: {}}, min_runtime=2, keep=False) as held:
                 fleet.network.link(fleet.leader(), mesh).loss = 1.0  # it does not hear that its hold is over
                 await asyncio.sleep(3600)
             assert held.completed

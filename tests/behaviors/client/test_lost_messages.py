@@ -71,7 +71,7 @@ def test_what_had_its_time_before_its_client_heard_of_it_is_asked_for_anew_at_it
     async def test() -> None:
         async with small_fleet("one", "two") as (fleet, (one, two)):
             first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
-            waits = await two.request("second", {RC: {}}, min_runtime=0.5)
+            waits = await two.request("second", {RC: {}}, min_runtime=0.5, keep=False)
             known_as, place = waits.id, waits.place
             fleet.network.disturb({"notice": Disturbance(lost=1.0)})
             await one.end(first)

@@ -122,8 +122,10 @@ def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
     here = start(fleet, "stayer")
     assert fleet.zscout("migrate", "stayer", "--to", here).stdout == f"stayer is on {here} already\n"
     nowhere = fleet.zscout("migrate", "stayer", "--to", "nowhere")
-    assert (nowhere.returncode, nowhere.stdout) == (1, "")
-    assert nowhere.stderr.startswith("zscout: stayer was not moved: ")
+    assert (nowhere.returncode, nowhere.stdout) == (2, "")
+    assert nowhere.stderr.startswith('zscout: --to: there is no host "nowhere"; there are anvil, bellows')
+    near = fleet.zscout("migrate", "stayer", "--to", "bellow")
+    assert (near.returncode, near.stderr) == (2, 'zscout: --to: there is no host "bellow"; did you mean bellows?\n')
     nobody = fleet.zscout("migrate", "stayr")
     assert (nobody.returncode, nobody.stdout) == (1, "")
     assert nobody.stderr == 'zscout: no component "stayr" is known; did you mean stayer?\n'

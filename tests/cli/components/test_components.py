@@ -14,6 +14,7 @@ from tests.behaviors.components.kit import ROOT, register_odd_kinds
 from tests.cli.cli_fleet import CliFleet
 from tests.cli.tools import read_until, zscout
 from tests.hang import HANG
+from zscout.behaviors.client.blocking import connect
 
 pytestmark = pytest.mark.live
 
@@ -55,7 +56,7 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
     plain = fleet.zscout("components")
     assert re.search(r"^Fleet test-\w+: 1 of 1 run on 1 host$", plain.stdout, re.MULTILINE)
     assert re.search(
-        r"^counter  counter  running  anvil +[0-9.]+ s +0 +0 +[0-9.]+ +\d+ MiB", plain.stdout, re.MULTILINE
+        r"^counter  counter  running  anvil +[0-9:]+ \([0-9.]+ s\) +0 +0 +[0-9.]+ +\d+ MiB", plain.stdout, re.MULTILINE
     )
 
     again = fleet.zscout("start", "counter", "--set", "period=0.1", "--set", "rc=robot/a")
@@ -100,14 +101,17 @@ def test_json_and_no_wait(fleet: CliFleet) -> None:
 
 
 def test_what_fails_is_given_up_with_its_reason(fleet: CliFleet) -> None:
-    failed = fleet.zscout("start", "counter", "--name", "bad", "--set", "period=fast", "--restart", "never")
+    # At once, though it is to be started again whenever it fails.
+    failed = fleet.zscout("start", "counter", "--name", "bad", "--set", "period=fast", "--restart", "always")
     assert failed.returncode == 1
     assert "bad is given up: " in failed.stderr
     assert 'period: is the text "fast"' in failed.stderr
-    assert listed(fleet, "bad")[0]["state"] == "given_up"
+    (bad,) = listed(fleet, "bad")
+    assert (bad["state"], bad["restarts"]) == ("given_up", 1)
+    assert 'period: is the text "fast"' in fleet.zscout("components").stdout
     unknown = fleet.zscout("start", "cuonter")
     assert unknown.returncode == 1
-    assert "no kind 'cuonter' is installed here; there are brief, counter" in unknown.stderr
+    assert "no host has kind cuonter; did you mean counter?" in unknown.stderr
     assert unknown.stderr.count("\n") == 1
 
 
@@ -208,4 +212,10 @@ def test_tab_offers_components_hosts_and_kinds(fleet: CliFleet) -> None:
     assert offered("zscout", "logs", "off") == ["plain,offered"]
     assert offered("zscout", "drain", "an") == ["plain,anvil"]
     assert offered("zscout", "start", "coun") == ["plain,counter"]
+    assert offered("zscout", "request", "ro") == ["plain,robot/a"]
+    assert offered("zscout", "status", "an") == ["plain,anvil"]
+    assert offered("zscout", "status", "anvil", "an") == []
+    with connect("desk", fleet=fleet.lab.fleet, host="test") as lab, lab.hold("surveying", {"robot/a": {}}):
+        assert offered("zscout", "why", "surv") == ["plain,surveying"]
+        assert offered("zscout", "status", "surv") == ["plain,surveying"]
     assert fleet.zscout("stop", "offered").returncode == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import signal
 import subprocess
 import termios
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.cli.tools import COMMAND, Terminal, zscout_soon
+from tests.cli.tools import CLOCK, COMMAND, Terminal, ours, zscout_soon
 from tests.hang import HANG
 from tests.live.lab import Lab
 
@@ -37,28 +38,34 @@ def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
             take = await other.request("take", {"robot/b": {}}, priority=10, min_runtime=600, keep=True)
             await other.request("second", {"robot/b": {}}, priority=1, min_runtime=60)
             await client.request("first", {"robot/b": {}}, priority=2, min_runtime=60)
-            await client.request("ghost", {"robot/nowhere": {}}, priority=0, min_runtime=60)
+            await client.request("ghost", {"robot/nowhere": {}}, priority=0, min_runtime=60, wait_for_device=True)
             state = await lab.state(client, lambda state: len(state.queue) == 3 and len(state.holds) == 2)
 
             plain = await zscout_soon("status", env=lab.env)
             assert (plain.returncode, plain.stderr) == (0, "")
             assert f"Fleet {lab.fleet.name}: {state.host} leads, term {state.term.counter}" in plain.stdout
             assert section(plain.stdout, "RCs") == [
-                ["radio/rf0", "shared", "held", "anvil", "survey (rate=4)"],
-                ["robot/a", "exclusive", "held", "anvil", "survey"],
-                ["robot/b", "exclusive", "held", "bellows", "take"],
-                ["robot/nowhere", "exclusive", "absent", "-"],
+                ["radio/rf0", "shared", "held", "anvil", f"{ours()} (rate=4)"],
+                ["robot/a", "exclusive", "held", "anvil", ours()],
+                ["robot/b", "exclusive", "held", "bellows", ours()],
             ]
             running = section(plain.stdout, "Running")
-            assert [(row[0], row[1], *row[-2:]) for row in running] == [
-                ("take", "10", "test/other", "robot/b"),
-                ("survey", "1", "test/program", "radio/rf0 robot/a"),
+            assert [(*row[:3], *row[-2:]) for row in running] == [
+                ("take", ours(), "10", "robot/b", "test/other"),
+                ("survey", ours(), "1", "radio/rf0 robot/a", "test/program"),
             ]
-            assert running[0][3].endswith(", keeps")
+            assert re.fullmatch(rf"{CLOCK} \(\d+\.\d s\)", running[0][3])
+            assert re.fullmatch(rf"{CLOCK} \(.*\), keeps", running[0][4])
             waiting = section(plain.stdout, "Waiting")
-            assert [row[:3] for row in waiting] == [["1", "first", "2"], ["2", "second", "1"], ["3", "ghost", "0"]]
-            assert "held by take, priority 10" in waiting[0][-1]
-            assert waiting[2][-1] == "robot/nowhere not on the mesh"
+            assert [(*row[:2], row[3]) for row in waiting] == [
+                ("1", "first", "2"),
+                ("2", "second", "1"),
+                ("3", "ghost", "0"),
+            ]
+            assert waiting[0][2] == ours()
+            # It is kept by a higher rank: nobody knows for how long.
+            assert waiting[0][-2:] == [f"waits for {ours()}: robot/b", "test/program"]
+            assert waiting[2][-2] == "robot/nowhere not on the mesh"
             hosts = {row[0]: row for row in section(plain.stdout, "Hosts")}
             assert set(hosts) == {"anvil", "bellows", "test"}
             assert hosts[state.host][1] == "leads"
@@ -73,9 +80,11 @@ def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
                 ("radio/rf0", True, True, "anvil"),
                 ("robot/a", True, False, "anvil"),
                 ("robot/b", True, False, "bellows"),
-                ("robot/nowhere", False, False, None),
             ]
-            assert shown["rcs"][0]["holders"] == [{"arc": "survey", "id": survey.id, "client": "test/program"}]
+            assert shown["rcs"][0]["holders"] == [
+                {"arc": "survey", "id": survey.id, "client": "test/program", "who": shown["holds"][1]["who"]}
+            ]
+            assert "{user}@{host} ({command})".format(**shown["holds"][1]["who"]) == ours()
             kept = next(hold for hold in shown["holds"] if hold["id"] == take.id)
             assert (kept["keep"], kept["priority"], kept["needs"]) == (True, 10, {"robot/b": {}})
             assert 590 < kept["remaining"] < 600
@@ -144,11 +153,11 @@ def test_watching_in_a_pipe_prints_a_block_when_something_happens(tmp_path: Path
 
             await block_with("robot/a  exclusive  free", "bellows")
             arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
-            await block_with("robot/a  exclusive  held   anvil    survey")
+            await block_with(f"robot/a  exclusive  held   anvil    {ours()}")
             await client.end(arc)
             await block_with("robot/a  exclusive  free")
             bellows.kill()
-            await block_with("robot/b  exclusive  absent", "gone for")
+            await block_with("robot/b  exclusive  absent", "gone since ")
             watcher.send_signal(signal.SIGINT)
             assert await watcher.wait() == 130
             # Loads and spans of time make no block.

@@ -25,6 +25,10 @@ from tests.cli.tools import COMMAND, zscout_here
 from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.services.recorder.paper_run import RCS, RERUN, TABLE2, lanes, play_table1, second_by_second
+from zscout.cli.fleet import view as module
+from zscout.keyexpr import Role
+from zscout.messages import Recorded
+from zscout.services.recorder.process import Recording
 from zscout.services.recorder.timeline import Timeline
 
 OPEN = re.compile(rb"^Open (http://\S+)", re.MULTILINE)
@@ -85,6 +89,7 @@ def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Pa
     with viewing(tmp_path, recording, "--web") as process:
         url, stream = page(tmp_path, process)
         assert urlsplit(url).hostname == "127.0.0.1"
+        assert parse_qs(urlsplit(url).query)["theme"] == ["dark"]
         with urllib.request.urlopen(url, timeout=HANG) as answer:  # noqa: S310 - our own page
             assert b"Rerun" in answer.read()
         # Another viewer gets the whole recording from where the page would.
@@ -169,6 +174,50 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
             assert [states for _, states in lane][-2:] == [["survey"], [""]]
 
     asyncio.run(story())
+
+
+@pytest.mark.live
+def test_where_a_node_of_this_host_records_its_recording_is_shown(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            with socket.create_server(("127.0.0.1", 0)) as free:
+                port = free.getsockname()[1]
+            lab.node("anvil", "robot/a", extra=f'[recorder]\npath = "runs"\nport = {port}')
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a")
+            await lab.living(client, Role.RECORDER, lambda hosts: hosts == ["anvil"])
+            with viewing(tmp_path, "--web", "--json", "--out", tmp_path / "out", env=lab.env) as process:
+                said = await asyncio.to_thread(said_as_json, tmp_path, process)
+                assert said["live"] == f"rerun+http://127.0.0.1:{port}/proxy"
+                assert [Path(said["file"])] == list((tmp_path / "runs").glob("*.rrd"))
+                # No second recorder was started.
+                assert [child.name() for child in descendants(process)] == ["rerun"]
+                assert not (tmp_path / "out").exists()
+                process.send_signal(signal.SIGINT)
+                assert await asyncio.to_thread(process.wait, HANG) == 130
+            assert listens(said["live"])
+
+    asyncio.run(story())
+
+
+def test_a_recording_of_another_host_is_not_taken_for_one_of_this_host(tmp_path: Path) -> None:
+    file = tmp_path / "run.rrd"
+    file.touch()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port, inode = server.getsockname()[1], file.stat().st_ino
+
+        def reached(page: str = "127.0.0.1", **more: Any) -> Recording | None:
+            told = {"file": str(file), "inode": inode, "bind": "127.0.0.1", "port": port} | more
+            return asyncio.run(module._reached(Recorded(**told), page))
+
+        url = f"rerun+http://127.0.0.1:{port}/proxy"
+        assert reached() == Recording(str(file), url)
+        for other in ({"inode": inode + 1}, {"file": str(tmp_path / "none.rrd")}, {"bind": "evil"}, {"file": "a\0b"}):
+            assert reached(**other) is None
+        # A page that other hosts open needs a live view that they reach.
+        assert reached("0.0.0.0") is None  # noqa: S104
+        assert reached(bind="0.0.0.0") == Recording(str(file), url)  # noqa: S104
+    assert reached() is None
 
 
 @pytest.mark.live

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import COMMAND, Terminal, end, events, out_of, read_until
+from tests.cli.tools import COMMAND, Terminal, by, end, events, named, out_of, read_until
 from tests.hang import HANG
 
 pytestmark = pytest.mark.live
@@ -23,18 +23,20 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
 
 def test_a_yes_at_the_terminal_takes_and_ctrl_c_gives_back(fleet: CliFleet) -> None:
     survey = fleet.holder("survey", "robot/a", "robot/b", "--priority", "3")
-    with fleet.terminal("take", "robot/a") as terminal:
+    with fleet.terminal("take", "robot/a", "--reason", "the gripper\x1b is stuck") as terminal:
         shown = terminal.until("Take robot/a? [y/N] ")
-        assert "operator preempts survey (priority 3, " in shown
+        assert f"operator preempts {named('survey')}, priority 3, since " in shown
         assert ": robot/a, robot/b" in shown
         terminal.press("y\n")
-        terminal.until("operator holds robot/a until it is needed elsewhere")
+        terminal.until("operator holds robot/a: yours for ")
         state = fleet.state(lambda state: bool(state.holds))
         assert [(hold.arc, hold.priority, hold.keep) for hold in state.holds] == [("operator", 10, True)]
+        assert f"{by('zscout take')}: the gripper is stuck" in fleet.zscout("status").stdout
         terminal.press("\x03")
         assert terminal.code() == 130
     assert survey.wait(HANG) == 1
-    assert "survey lost its grant: preempted by operator, priority 10" in out_of(survey).read()
+    told = f"survey lost its grant: preempted by {by('zscout take')}, priority 10: the gripper is stuck"
+    assert told in out_of(survey).read()
     assert fleet.idle("robot/a")
 
 
@@ -71,7 +73,7 @@ def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(fleet
     script = f'exec {shlex.join(COMMAND)} take robot/a --json > "{out}"'
     with Terminal(command=("sh", "-c", script), env=fleet.lab.env) as terminal:
         shown = terminal.until("Take robot/a? [y/N] ")
-        assert "operator preempts survey (priority 0, " in shown
+        assert f"operator preempts {named('survey')}, priority 0, since " in shown
         assert "{" not in shown
         assert [event["event"] for event in events(out.read_text())] == ["preview"]
         terminal.press("y\n")
@@ -106,8 +108,8 @@ def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
 def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
     taker = fleet.start("take", "robot/b", "--name", "operator", "--", "true")
-    lines = read_until(taker, "operator waits: needs robot/b (held by peer, priority 10)")
-    assert any("operator waits for peer (priority 10, " in line for line in lines)
+    lines = read_until(taker, f"operator waits for {named('peer')}: robot/b, until ")
+    assert any(f"operator waits for {named('peer')}, priority 10, " in line for line in lines)
     end(peer)
     read_until(taker, "operator holds robot/b")
     assert taker.wait(HANG) == 0

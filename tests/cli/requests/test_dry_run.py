@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end
+from tests.cli.tools import end, named
 
 pytestmark = pytest.mark.live
 
@@ -23,12 +23,12 @@ def test_it_says_when_it_would_start_and_whom_it_would_preempt(fleet: CliFleet) 
     mine = fleet.holder("mine", "robot/a")
     try:
         take = fleet.zscout("request", "robot/a", "--priority", "5", "--dry-run")
-        assert take.stdout == "request would start at once\nit would preempt mine\n"
+        assert take.stdout == f"request would start at once\nit would preempt mine of {named('mine')}\n"
         wait = fleet.zscout("request", "robot/a", "robot/b", "--dry-run", "--json", "--name", "wide")
         told = json.loads(wait.stdout)
         assert (wait.returncode, told["arc"], told["preempts"]) == (0, "wide", [])
         assert told["starts_in"] > 0
-        assert "robot/a (held by mine" in told["reason"]
+        assert told["reason"] == f"waits for {named('mine')}: robot/a"
         state = fleet.state(lambda state: True)
         assert [hold.arc for hold in state.holds] == ["mine"]
         assert not state.queue
@@ -37,7 +37,7 @@ def test_it_says_when_it_would_start_and_whom_it_would_preempt(fleet: CliFleet) 
 
 
 def test_what_would_never_start_is_said_with_code_1(fleet: CliFleet) -> None:
-    done = fleet.zscout("request", "robot/zz", "--dry-run")
+    done = fleet.zscout("request", "robot/zz", "--dry-run", "--wait-for-device")
     assert done.returncode == 1
     assert done.stdout == ("request would wait, and no start can be foretold: robot/zz not on the mesh\n")
 
@@ -50,8 +50,8 @@ def test_status_and_why_tell_when_a_waiting_one_may_start(fleet: CliFleet) -> No
         status = json.loads(fleet.zscout("status", "--json").stdout)
         [queued] = status["queue"]
         assert queued["starts_in"] > 0
-        assert " in " in fleet.zscout("status").stdout
-        assert "it may start in" in fleet.zscout("why", "next").stdout
+        assert " (in " in fleet.zscout("status").stdout
+        assert "it may start at " in fleet.zscout("why", "next").stdout
     finally:
         end(waiting)
         end(mine)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, events, out_of, read_until, zscout_here
+from tests.cli.tools import CLOCK, end, events, named, out_of, read_until, zscout_here
 from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
 from zscout.cli.requests.options import HoldOptions
@@ -44,7 +44,7 @@ def test_a_command_is_told_which_device_meets_which_pattern(fleet: CliFleet) -> 
     assert told.keys() == {ANY, MORE}
     assert sorted(told.values()) == [F1, F2]
     met = {rc: need for need, rc in told.items()}
-    assert f"stereo holds {F1} for {met[F1]}, {F2} for {met[F2]}, robot/a for 1 min" in done.stderr
+    assert f"stereo holds {F1} for {met[F1]}, {F2} for {met[F2]}, robot/a: yours for " in done.stderr
     plain = fleet.zscout("request", "robot/a", "--", "sh", "-c", script)
     assert plain.stdout == "robot/a|{}\n"
 
@@ -68,8 +68,10 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     }
     assert {rc["rc"]: rc["holders"][0]["arc"] for rc in queued["rcs"] if rc["holders"]} == held
     shown = fleet.zscout("status").stdout
-    assert re.search(rf"^{F2} +exclusive +held +anvil +second$", shown, re.MULTILINE)
-    assert re.search(r"^1 +next +0 .* no framegrabber/\* is to be had: needs framegrabber/", shown, re.MULTILINE)
+    assert re.search(rf"^{F2} +exclusive +held +anvil +{re.escape(named('second'))}$", shown, re.MULTILINE)
+    choices = [rf"{rc} \(held by {re.escape(named(arc))}, until {CLOCK} at the latest\)" for rc, arc in held.items()]
+    text = ", ".join(choices).replace(f", {F2}", f", {F2.removeprefix('framegrabber/')}")
+    assert re.search(rf"^1 +next .* waits for one of {text}  ", shown, re.MULTILINE)
 
     end(second)
     granted, ended = events(out_of(waiting).read())
@@ -85,17 +87,18 @@ def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliF
     first, robot = fleet.holder("first", F1), fleet.holder("robot", "robot/a")
     late = fleet.zscout("request", ANY, ANY, "--name", "both", "--timeout", "0.3")
     (line,) = late.stdout.splitlines()
-    assert re.search(rf"starts in .*; {F1}: first \(priority 0, [^;]* left$", line)
+    blocker = rf"{F1}: {re.escape(named('first'))}, priority 0, since {CLOCK} [^;]*, until {CLOCK} [^;]* at the latest"
+    assert re.search(rf"starts at {CLOCK} .*; {blocker}$", line)
     # One framegrabber is free: who has the other is in nobody's way.
     easy = fleet.zscout("request", ANY, "robot/a", "--name", "easy", "--timeout", "0.3")
     (line,) = easy.stdout.splitlines()
-    assert "; robot/a: robot (priority 0, " in line
+    assert f"; robot/a: {named('robot')}, priority 0, " in line
     assert "framegrabber" not in line
     end(robot)
     with fleet.terminal("request", ANY, ANY, "--name", "both") as terminal:
-        terminal.until(f"  {F1}: first (priority 0, ")
+        terminal.until(f"  {F1}: {named('first')}, priority 0, ")
         end(first)
-        shown = terminal.until(" left; Ctrl-C gives back")
+        shown = terminal.until("  Ctrl-C gives back")
         assert re.search(r"both holds framegrabber/f1 for framegrabber/\*(#2)?, framegrabber/f2 for ", shown)
         terminal.press("\x03")
         assert terminal.code() == 130
@@ -107,17 +110,18 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     first, second = fleet.holder("first", F1), fleet.holder("second", ANY)
     radio = fleet.holder("loud", "radio/*:rate=8")
     waiting = [
-        fleet.start("request", ANY, "robot/a", "video/*", "--name", "next"),
+        fleet.start("request", ANY, "robot/a", "video/*", "--name", "next", "--wait-for-device"),
         fleet.start("request", "radio/*:rate=5", "robot/*", "--name", "quiet"),
     ]
     for process, name in zip(waiting, ("next", "quiet"), strict=True):
         read_until(process, f"{name} waits")
     text = fleet.zscout("why", "next").stdout
-    assert re.search(rf"^  framegrabber/\*: {F1} held by first of .*, priority 0, for .* left$", text, re.MULTILINE)
-    assert re.search(rf"^  framegrabber/\*: {F2} held by second of ", text, re.MULTILINE)
+    one = rf"{F1} held by {re.escape(named('first'))}, priority 0, since {CLOCK} .* at the latest"
+    assert re.search(rf"^  framegrabber/\*: {one}$", text, re.MULTILINE)
+    assert f"\n  framegrabber/*: {F2} held by {named('second')}, " in text
     assert "\n  robot/a: no other ARC holds it\n" in text
     assert "\n  video/*: not on the mesh\n" in text
-    assert " ago  asked for framegrabber/*, robot/a, video/* at priority 0\n" in text
+    assert " ago)  asked for framegrabber/*, robot/a, video/* at priority 0\n" in text
     assert re.search(r"no RC on the mesh is left for .*video/\*", text)
     (told,) = json.loads(fleet.zscout("why", "next", "--json").stdout)["arcs"]
     assert [(need["need"], need["rc"], need["present"]) for need in told["needs"]] == [
@@ -128,7 +132,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     assert [holder["rc"] for holder in told["needs"][0]["holders"]] == [F1, F2]
 
     shared = fleet.zscout("why", "quiet").stdout
-    assert re.search(r"^  radio/\* \(rate=5\): radio/rf0 shared with loud \(rate=8\) of ", shared, re.MULTILINE)
+    assert f"\n  radio/* (rate=5): radio/rf0 shared with {named('loud')} (rate=8), priority 0, since " in shared
     assert "\n  robot/*: no ARC holds robot/a\n" in shared
     holds = fleet.zscout("why", "second").stdout
     assert f"\nHolds\n  {F2} for {ANY}: no other ARC holds it\n" in holds
@@ -149,7 +153,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
 
     low, high = fleet.holder("low", F1), fleet.holder("high", ANY, "--priority", "1")
     would = fleet.zscout("request", ANY, "--priority", "5", "--dry-run")
-    assert would.stdout == "request would start at once\nit would preempt low\n"
+    assert would.stdout == f"request would start at once\nit would preempt low of {named('low')}\n"
     assert fleet.zscout("take", ANY).returncode == 1
     taken = fleet.zscout("take", ANY, "--yes", "--no-keep", "--min-runtime", "2", "--json")
     preview, granted, _ = events(taken.stdout)
@@ -189,7 +193,7 @@ def test_bad_patterns_are_one_line_with_the_remedy(
 def test_the_help_says_how_to_quote(capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here("request", "--help") == 0
     said = capsys.readouterr().out
-    assert "zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- ./stereo.py" in said
+    assert "zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- python3 -i" in said
     assert "ZSCOUT_BOUND" in said
 
 
@@ -271,5 +275,5 @@ def test_what_taking_by_pattern_costs(needs: list[str], costs: dict[str, Any]) -
     said |= {"waits_for_one_of": either, "absent": absent}
     assert {what: found for what, found in said.items() if found} == costs
     for need, holds in either.items():
-        (line,) = [line for line in cost.lines() if line.startswith(f"waits for {need}: ")]
-        assert re.findall(r"(\w+) \(priority", line) == holds
+        (line,) = [line for line in cost.lines() if line.startswith("waits for one of ")]
+        assert re.findall(r"\((\w+)\), priority", line) == holds, need

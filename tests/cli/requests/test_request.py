@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, events, gone, out_of, read_until
+from tests.cli.tools import CLOCK, by, end, events, gone, named, out_of, read_until
 from tests.hang import HANG
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
 from zscout.cli.requests.request import REFRESH, Report
@@ -41,7 +41,8 @@ def test_a_command_gets_its_grant_and_gives_its_exit_code(fleet: CliFleet) -> No
     assert grant.startswith("[[")
     assert "/request-" in client
     assert 50 < float(remaining) <= 60
-    assert "survey holds radio/rf0, robot/a for 1 min" in done.stderr
+    yours = rf"yours for (1 min|\d\d s) \(until {CLOCK}\), then until somebody waits for it"
+    assert re.search(rf"survey holds radio/rf0, robot/a: {yours}", done.stderr)
     assert fleet.idle("robot/a", "radio/rf0")
 
 
@@ -50,7 +51,7 @@ def test_a_command_ended_by_a_signal_gives_128_and_its_number(fleet: CliFleet) -
 
 
 def test_without_a_command_it_holds_for_its_time(fleet: CliFleet) -> None:
-    done = fleet.zscout("request", "robot/a", "--min-runtime", "2s", "--json")
+    done = fleet.zscout("request", "robot/a", "--release-after", "2s", "--json")
     assert done.returncode == 0
     granted, ended = events(done.stdout)
     assert (granted["event"], granted["rcs"], granted["keep"]) == ("granted", ["robot/a"], False)
@@ -62,17 +63,19 @@ def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> 
     blocker = fleet.holder("blocker", "robot/a")
     waiting = fleet.start("request", "robot/a", "--name", "next", "--", "true")
     (line,) = read_until(waiting, "next waits")
-    assert re.search(
-        r"\(held by blocker, priority 0\); starts in (\d\d s|1 min); robot/a: blocker \(priority 0, ", line
+    who = re.escape(named("blocker"))
+    assert re.fullmatch(
+        rf"next waits for {who}: robot/a, until {CLOCK} at the latest; starts at {CLOCK} \(in (\d\d s|1 min)\); "
+        rf"robot/a: {who}, priority 0, since {CLOCK} \(.* s\), until {CLOCK} \((\d\d s|1 min)\) at the latest",
+        line.strip(),
     )
-    assert line.endswith(" left")
     end(blocker)
     read_until(waiting, "next holds robot/a")
     assert waiting.wait(HANG) == 0
 
 
 def test_a_start_that_nobody_can_foretell_is_said_to_be_so(fleet: CliFleet) -> None:
-    never = ("request", "robot/nowhere", "--name", "never", "--timeout", "1")
+    never = ("request", "robot/nowhere", "--wait-for-device", "--name", "never", "--timeout", "1")
     line, _ = out_of(fleet.start(*never)).read().splitlines()
     assert line == "never waits: robot/nowhere not on the mesh; no start can be foretold"
     waits, _ = events(fleet.zscout(*never, "--json").stdout)
@@ -111,7 +114,7 @@ def test_an_estimate_that_ticks_down_prints_nothing_and_asks_for_nothing(fleet: 
 
     assert asyncio.run(wait_in_a_crowd_of_news()) == [False]
     (line,) = out.getvalue().splitlines()
-    assert "; starts in " in line
+    assert "; starts at " in line
     end(blocker)
 
 
@@ -124,15 +127,67 @@ def test_a_command_is_ended_when_its_grant_is_taken(fleet: CliFleet) -> None:
     lines = out_of(victim).read()
     assert victim.wait(HANG) == 75
     assert "told" in lines
-    assert "victim lost its grant: preempted by boss, priority 5" in lines
+    assert f"victim lost its grant: preempted by {by('true')}, priority 5" in lines
     assert fleet.idle("robot/a")
 
 
 def test_a_command_whose_time_is_over_is_ended(fleet: CliFleet) -> None:
-    done = fleet.zscout("request", "robot/a", "--min-runtime", "300ms", "--json", "--", "sleep", "1000")
+    done = fleet.zscout("request", "robot/a", "--release-after", "300ms", "--json", "--", "sleep", "1000")
     assert (done.returncode, done.stdout) == (124, "")
     assert [event["event"] for event in events(done.stderr)] == ["granted", "stopping", "ended"]
     assert fleet.idle("robot/a")
+
+
+def test_a_command_goes_on_past_its_minimum_runtime_until_an_equal_waits(fleet: CliFleet) -> None:
+    script = "trap 'echo told; exit 3' TERM; echo pid $$; while :; do sleep 0.05; done"
+    kept = fleet.start("request", "robot/a", "--name", "kept", "--min-runtime", "300ms", "--", "sh", "-c", script)
+    first = read_until(kept, "pid")
+    assert re.fullmatch(
+        rf"kept holds robot/a: yours for 0\.\d s \(until {CLOCK}\), then until somebody waits for it", first[0]
+    )
+    fleet.state(lambda state: [hold.remaining < -0.5 for hold in state.holds] == [True])
+    assert kept.poll() is None
+    # Lower priority does not end it.
+    assert fleet.zscout("request", "robot/a", "--priority", "-1", "--timeout", "300ms").returncode == 1
+    assert kept.poll() is None
+    assert fleet.zscout("request", "robot/a", "--name", "next", "--", "true").returncode == 0
+    lines = out_of(kept).read()
+    assert kept.wait(HANG) == 124
+    assert "told" in lines
+    why = f"its minimum runtime is over and {by('true')}, priority 0, needs its RCs"
+    assert f"the time of kept is over: {why}\n" in lines
+    assert fleet.idle("robot/a")
+
+
+def test_again_asks_anew_for_what_was_kept_and_ended_for_another(fleet: CliFleet, tmp_path: Path) -> None:
+    script = f"echo run $$; if mkdir {tmp_path}/first; then sleep 1000; fi; exit 4"
+    options = ["--again", "--name", "kept", "--min-runtime", "300ms"]
+    kept = fleet.start("request", "robot/b", *options, "--", "sh", "-c", script)
+    first = read_until(kept, "run ")[-1]
+    assert fleet.zscout("request", "robot/b", "--", "true").returncode == 0
+    lines = read_until(kept, "run ")
+    assert any(line.endswith("; asking anew") for line in lines)
+    assert lines[-1] != first
+    assert kept.wait(HANG) == 4
+
+
+def test_what_an_operator_releases_is_not_asked_for_again(fleet: CliFleet) -> None:
+    options = ["--again", "--name", "kept", "--min-runtime", "100ms"]
+    kept = fleet.start("request", "robot/b", *options, "--", "sh", "-c", "echo run; sleep 1000")
+    read_until(kept, "run")
+    fleet.state(lambda state: [hold.remaining < 0 for hold in state.holds] == [True])
+    assert fleet.zscout("release", "kept").returncode == 0
+    assert kept.wait(HANG) == 124
+    assert "run\n" not in out_of(kept).read()
+
+
+def test_without_a_command_what_is_kept_ends_in_order(fleet: CliFleet) -> None:
+    kept = fleet.start("request", "robot/b", "--name", "kept", "--min-runtime", "100ms", "--json")
+    read_until(kept, '"granted"')
+    assert fleet.zscout("request", "robot/b", "--", "true").returncode == 0
+    (ended,) = events(out_of(kept).read())
+    assert (ended["event"], ended["outcome"], ended["again"]) == ("ended", "completed", False)
+    assert kept.wait(HANG) == 0
 
 
 def test_what_ignores_sigterm_is_killed_after_the_grace_with_its_children(fleet: CliFleet) -> None:
@@ -228,6 +283,20 @@ def test_what_can_not_run_is_said_before_anybody_waits(fleet: CliFleet, tmp_path
     assert fleet.zscout("request", "robot/a", "--", str(plain)).returncode == 126
 
 
+def test_what_can_never_start_is_refused_at_once_with_code_2(fleet: CliFleet) -> None:
+    for command in (("request",), ("request", "--dry-run"), ("take", "--yes")):
+        much = fleet.zscout(*command, "radio/rf0:rate=50")
+        assert (much.returncode, much.stdout) == (2, "")
+        assert much.stderr == "zscout: can never start: rate 50 of 10 at radio/rf0; ask for less\n"
+        typo = fleet.zscout(*command, "radio/rf0:rat=5")
+        assert typo.returncode == 2
+        assert typo.stderr == "zscout: radio/rf0 knows no parameter rat; did you mean rate?\n"
+    none = fleet.zscout("request", "robot/a:speed=1", "--", "true")
+    assert none.returncode == 2
+    assert none.stderr == "zscout: robot/a knows no parameter speed; it takes none\n"
+    fleet.state(lambda state: not state.queue and not state.holds)
+
+
 def test_refusals_by_the_rcm_are_one_line(fleet: CliFleet) -> None:
     blank = fleet.zscout("request", "robot/a", "--name", "not valid")
     assert blank.returncode == 2
@@ -240,8 +309,10 @@ def test_refusals_by_the_rcm_are_one_line(fleet: CliFleet) -> None:
 def test_the_live_line_shows_and_ctrl_c_ends_the_wait(fleet: CliFleet) -> None:
     blocker = fleet.holder("blocker", "robot/a")
     with fleet.terminal("request", "robot/a", "--name", "seen") as terminal:
-        assert re.search(r"seen waits \d\.\d s, starts in (\d\d s|1 min): needs ", terminal.until(": needs "))
-        terminal.until("robot/a: blocker (priority 0, ")
+        terminal.until(f"seen waits for {named('blocker')}: robot/a, until ")
+        since = terminal.until("(in ")
+        assert re.search(rf"waits since {CLOCK} \(\d\.\d s\), starts at {CLOCK} ", since)
+        terminal.until(f"robot/a: {named('blocker')}, priority 0, ")
         terminal.until("seen waits ")  # drawn anew
         terminal.press("\x03")
         terminal.until("seen is cancelled")

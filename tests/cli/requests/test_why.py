@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.tools import zscout_here, zscout_soon
+from tests.cli.tools import CLOCK, ours, zscout_here, zscout_soon
 from tests.live.lab import Lab
 
 pytestmark = pytest.mark.live
+US = re.escape(ours())
 
 
 def test_the_story_of_an_arc(tmp_path: Path) -> None:
@@ -23,26 +24,31 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             await lab.ready(client, "robot/a", "robot/b", "radio/rf0")
             survey = await client.request("survey", {"robot/a": {}, "radio/rf0": {"rate": 4}}, min_runtime=600)
             await other.request("mapping", {"radio/rf0": {"rate": 5}}, min_runtime=600, keep=True)
-            await other.request("take", {"robot/a": {}}, priority=10, min_runtime=600)
-            await other.request("late", {"robot/b": {}, "robot/nowhere": {}}, min_runtime=30)
+            await other.request("take", {"robot/a": {}}, priority=10, min_runtime=600, keep=False)
+            await other.request("late", {"robot/b": {}, "robot/nowhere": {}}, min_runtime=30, wait_for_device=True)
             await lab.state(client, lambda state: len(state.holds) == 2 and len(state.queue) == 2)
 
             plain = await zscout_soon("why", "survey", env=lab.env)
             assert (plain.returncode, plain.stderr) == (0, "")
             lines = plain.stdout.splitlines()
-            assert lines[0].startswith(f"survey (id {survey.id}, of test/program, priority 0) has waited for ")
-            assert "held by take, priority 10" in lines[1]
-            assert lines[2].endswith("in the queue of 2; it wants 10 min")
-            assert re.fullmatch(r"  it may start in (10 min|9 min 5\d s), if nothing else comes", lines[3])
-            assert lines[4:6] == ["  it was preempted once", "Needs"]
-            assert lines[6].startswith("  radio/rf0 (rate=4): shared with mapping (rate=5) of test/other, priority 0,")
-            assert lines[6].endswith(" left at least")
-            assert lines[7].startswith("  robot/a: held by take of test/other, priority 10, for ")
-            assert lines[8] == "Story"
-            told = [line.split(" ago  ", 1)[1] for line in lines[9:]]
+            assert re.fullmatch(rf"survey of {US}, priority 0, has waited since {CLOCK} \(\d\.\d s\)", lines[0])
+            assert lines[1] == f"  id {survey.id}, client test/program"
+            assert re.fullmatch(rf"  waits for {US}: robot/a, until {CLOCK} at the latest", lines[2])
+            assert lines[3].endswith("in the queue of 2; it wants 10 min")
+            spans = r"\(in (10 min|9 min 5\d s)\)"
+            assert re.fullmatch(rf"  it may start at {CLOCK} {spans}, if nothing else comes", lines[4])
+            assert lines[5:7] == ["  it was preempted once", "Needs"]
+            since, until = rf"since {CLOCK} \(\d\.\d s\)", rf"until {CLOCK} \((10 min|9 min \d+ s)\) at the latest"
+            assert re.fullmatch(
+                rf"  radio/rf0 \(rate=4\): shared with {US} \(rate=5\), priority 0, {since}, {until}", lines[7]
+            )
+            assert re.fullmatch(rf"  robot/a: held by {US}, priority 10, {since}, {until}", lines[8])
+            assert lines[9] == "Story"
+            told = [line.split(" ago)  ", 1)[1] for line in lines[10:]]
+            assert re.match(rf" +{CLOCK} \(", lines[10])
             assert told[:2] == ["asked for radio/rf0, robot/a at priority 0", "granted radio/rf0, robot/a"]
-            assert told[2].startswith("preempted: preempted by take")
-            assert told[3].startswith("waits: ")
+            assert re.fullmatch(rf"preempted by {US}, priority 10; queued again", told[2])
+            assert re.fullmatch(rf"waits for {US}: robot/a", told[3])
 
             by_id = json.loads((await zscout_soon("why", survey.id, "--json", env=lab.env)).stdout)
             (arc,) = by_id["arcs"]
@@ -58,13 +64,12 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             assert "  robot/b: no other ARC holds it\n" in missing
 
             # Two of one name are told of one by one; ended ones from memory; unknown ones with what is near.
-            twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1)
+            twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1, wait_for_device=True)
             runs, waits = (await zscout_soon("why", "take", env=lab.env)).stdout.split("\n\n")
-            assert runs.startswith("take (id ")
-            assert " has run for " in runs
-            assert " of its minimum runtime of 10 min\nHolds\n" in runs
+            assert re.match(rf"take of {US}, priority 10, has run since ", runs)
+            assert re.search(rf"\n  until {CLOCK} \(.*\), its minimum runtime of 10 min\nHolds\n", runs)
             assert " asked for robot/a at priority 10\n" in runs
-            assert waits.startswith(f"take (id {twin.id}, ")
+            assert f"  id {twin.id}, client test/program\n" in waits
             assert " asked for robot/nowhere at priority 0\n" in waits
             assert "robot/a" not in waits
             await client.end(survey)

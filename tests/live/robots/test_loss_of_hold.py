@@ -94,7 +94,7 @@ class Losses:
         await asyncio.gather(turning.end(), self.client.end(rivals[0]))
 
     async def time_over(self) -> None:
-        turning = await self.driving(min_runtime=1.0)
+        turning = await self.driving(min_runtime=1.0, keep=False)
 
         async def over() -> None:
             assert turning.arc is not None

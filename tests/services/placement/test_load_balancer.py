@@ -42,6 +42,27 @@ def test_hosts_are_ranked_by_their_reports() -> None:
     run(story())
 
 
+def test_the_reports_are_told_with_their_age_where_they_are_asked_for() -> None:
+    async def story() -> None:
+        fleet, balancer = await balancing("a", "b")
+        fleet.nodes["a"].report(3.0)
+        await asyncio.sleep(2 * READ_EVERY)
+        assert (await fleet.ask(RankAsk(), HostRanking)).reports is None
+        told = (await fleet.ask(RankAsk(labels=["gpu"], reports=True), HostRanking)).reports
+        assert told is not None
+        loads = {known.report.host: known.report.load_average[0] for known in told}
+        assert loads == {"a": 3.0, "b": 0.0}, "of hosts that are left out as well"
+        await asyncio.sleep(1.0)
+        some = (await fleet.ask(RankAsk(hosts=["a", "z"], reports=True), HostRanking)).reports
+        assert some is not None
+        (known,) = some
+        assert known.report.host == "a"
+        assert 1.0 <= known.age <= 1.0 + 3 * READ_EVERY
+        balancer.stop()
+
+    run(story())
+
+
 def test_a_report_is_believed_of_the_host_in_whose_key_it_stands() -> None:
     async def story() -> None:
         fleet, balancer = await balancing("a", "b")

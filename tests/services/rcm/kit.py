@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 from decimal import Decimal
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -22,6 +23,7 @@ from zscout.messages import (
     Notice,
     OpenRequest,
     Operation,
+    Parameter,
     Problem,
     Proposal,
     RcAsk,
@@ -55,6 +57,8 @@ class FakeRc:
     proposals: list[Proposal] = field(default_factory=list)
     asked: list[RcAsk] = field(default_factory=list)
     rules: int = 0
+    health: str = "ok"
+    parameters: list[Parameter] | None = None
     deaf: bool = False
     """Whether it answers no question of its state."""
     ignored: list[IncomingQuery[RcAsk]] = field(default_factory=list)
@@ -79,7 +83,8 @@ class FakeRc:
             holders=self.holders,
             leader=self.leader,
             rules=self.rules,
-            **more,
+            parameters=self.parameters,
+            **({"health": self.health} | more),
         )
 
     def publish(self, **more: Any) -> None:
@@ -206,8 +211,8 @@ class FakeFleet:
         rcm.start(recovered or RecoveredState())
         return rcm
 
-    def candidate(self, host: str) -> Candidate:
-        candidate = Candidate(self.mesh(host), self.fleet)
+    def candidate(self, host: str, folder: Path | None = None) -> Candidate:
+        candidate = Candidate(self.mesh(host), self.fleet, folder)
         candidate.start()
         return candidate
 

@@ -33,7 +33,7 @@ def test_a_grant_is_published_then_the_loser_is_told_then_the_asker_is_answered(
         assert (preempted.outcome, preempted.by, preempted.grant) == ("preempted", "desk/operator/drive", first.grant)
         # Why it waits now is told a little later.
         await until(lambda: len(survey.notices) == 2)
-        assert survey.notices[1].reason == "needs robot/a (held by drive, priority 10)"
+        assert survey.notices[1].reason == "waits for desk/operator (drive): robot/a"
         # The end of a hold that its own client released is told by the answer alone.
         await operator.do(Release("drive"))
         await until(lambda: survey.notices[-1].state == "running")
@@ -43,8 +43,8 @@ def test_a_grant_is_published_then_the_loser_is_told_then_the_asker_is_answered(
         assert story == [
             "asked for robot/a at priority 0",
             "granted robot/a",
-            "preempted: preempted by drive, priority 10; queued again",
-            "waits: needs robot/a (held by drive, priority 10)",
+            "preempted by desk/operator (drive), priority 10; queued again",
+            "waits for desk/operator (drive): robot/a",
             "granted robot/a",
         ]
 
@@ -133,7 +133,9 @@ def test_a_vote_that_is_late_grants_later_and_a_veto_is_a_reason() -> None:
         await until(lambda: client.notices and client.notices[-1].state == "running")
         # A veto is a reason. It stands until the rules of the RC change.
         radio.accept = False
-        assert (await client.ask("more", "radio/f:9")).reason == "radio/f refuses: too much"
+        assert (
+            await client.ask("more", "radio/f:9")
+        ).reason == "waits for desk/one (talk): radio/f refuses more: too much"
         await client.ask("more", "radio/f:9")
         assert [len(proposal.holders) for proposal in radio.proposals] == [1, 2]
         radio.accept, radio.rules = True, 1
@@ -162,7 +164,7 @@ def test_an_rc_that_comes_is_granted_and_one_that_goes_ends_the_whole_gang() -> 
         await until(lambda: client.notices[-1].state == "running")
         # Its token goes; another instance comes.
         robots[1].token.close()
-        await until(lambda: client.notices[-1].reason == "robot/b was lost: it left the mesh")
+        await until(lambda: client.notices[-1].reason == "robot/b was lost: it is gone from devices")
         fleet.rc("robot/b", instance="i2")
         await until(lambda: client.notices[-1].state == "running")
         assert client.notices[-1].place == place

@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 from zscout.lab.replay import Replay, replay
 from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.model import ArcRequest, Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.services.recorder.blueprint import TIME
+from zscout.services.recorder.blueprint import TIME, WALL_TIME
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import OPERATOR_MARK, Timeline
 from zscout.types import SECOND, Ns
@@ -96,15 +96,32 @@ def play_table1(timeline: Timeline) -> Replay:
 
 
 def rows(path: Path, content: str, column: str, *, static: bool = False) -> Iterator[tuple[str, float, Any]]:
-    """(entity, seconds, value) of every logged row, as stored."""
+    """(entity, seconds since the recording's zero, value) of every logged row, as stored."""
+    begin = 0
     for chunk in RrdReader(path).stream().filter(content=content, is_static=static):
         batch = chunk.to_record_batch()
         if column not in batch.schema.names:
             continue
         values = batch.column(column).to_pylist()
-        times = [0] * len(values) if static else batch.column(TIME).cast("int64").to_pylist()
+        times = [0] * len(values)
+        if WALL_TIME in batch.schema.names:
+            begin = begin or _begin(path)
+            times = [at - begin for at in batch.column(WALL_TIME).cast("int64").to_pylist()]
+        elif not static:
+            times = batch.column(TIME).cast("int64").to_pylist()
         for nanoseconds, value in zip(times, values, strict=True):
-            yield str(chunk.entity_path), nanoseconds / 1e9, value
+            if value is not None:  # rows of one entity may tell of several things
+                yield str(chunk.entity_path), nanoseconds / 1e9, value
+
+
+def _begin(path: Path) -> int:
+    """When the recording began, in nanoseconds of the epoch: what was told last."""
+    begin = 0
+    for chunk in RrdReader(path).stream().filter(content="/__properties/**", is_static=True):
+        batch = chunk.to_record_batch()
+        if "RecordingInfo:start_time" in batch.schema.names:
+            begin = [value[0] for value in batch.column("RecordingInfo:start_time").to_pylist() if value][-1]
+    return begin
 
 
 def lanes(path: Path, content: str) -> dict[str, list[tuple[float, list[str]]]]:

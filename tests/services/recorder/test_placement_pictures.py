@@ -34,7 +34,7 @@ def test_an_hour_of_placements_at_a_glance(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         play(timeline)
-    with viewer(path, tmp_path, panes=7, height=HEIGHT) as client:
+    with viewer(path, tmp_path, panes=8, height=HEIGHT) as client:
         picture = settled_picture(client, tmp_path / "picture.png")
         views = client.get_state().views
     assert [report for view in views for report in view.reports] == []

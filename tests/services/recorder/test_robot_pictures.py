@@ -31,7 +31,7 @@ def pixels(picture: Image.Image, colour: Rgb, off: int = 3) -> list[tuple[int, i
 def test_a_minute_of_robots_at_a_glance(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     record(path, until=37)
-    with viewer(path, tmp_path, panes=9, height=HEIGHT) as client:
+    with viewer(path, tmp_path, panes=10, height=HEIGHT) as client:
         picture = settled_picture(client, tmp_path / "picture.png")
         views = client.get_state().views
     assert [report for view in views for report in view.reports] == []
@@ -44,6 +44,7 @@ def test_a_minute_of_robots_at_a_glance(tmp_path: Path) -> None:
         "fgrab1",
         "fgrab2",
         "Events",
+        "Who comes and goes",
         "Devices (point at a curve)",
     }
     left = round(WIDTH * PANES)
@@ -95,9 +96,9 @@ def test_garbled_pictures_and_words_do_not_end_the_viewer(tmp_path: Path) -> Non
         for number in range(4):
             robots.frame(1, f"framegrabber/fgrab{number}", head(1), good)
         assert robots.floor.size is not None
-        timeline.recording.flush(timeout_sec=10)
+        timeline.flush(10)
         live.write_bytes(path.read_bytes())
     # Seven cameras on two pages, and each of the other panes.
-    with viewer(live, tmp_path, panes=7 + 7, height=HEIGHT) as client:
+    with viewer(live, tmp_path, panes=7 + 8, height=HEIGHT) as client:
         settled_picture(client, tmp_path / "picture.png")
         assert [report for view in client.get_state().views for report in view.reports] == []

@@ -11,16 +11,17 @@ from pathlib import Path
 import pytest
 
 from tests.mesh.kit import run, until
-from tests.services.recorder.paper_run import SCOUT33, events, lanes
+from tests.services.recorder.paper_run import SCOUT33, events, lanes, rows
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
-from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, StateAsk
+from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, ReasonParty, StateAsk
 from zscout.services.recorder.recorder import Recorder, RecorderFailed
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import Grant, Place, Term
 
 TERM = Term(1, "anvil")
+REASON = f"waits for drive: {SCOUT33}"
 GRANT = Grant(TERM, 1)
 PLACE = Place(TERM, 1)
 
@@ -69,6 +70,49 @@ def test_it_reads_the_state_and_follows_what_is_published(tmp_path: Path) -> Non
     doing = [state[0] for _, state in lanes(path, "/arc/**")["/arc/hide"]]
     assert doing == ["waiting · robot/scout33 is held by drive", "running · priority 1 · min 5 s"]
     assert "hide runs on robot/scout33" in events(path)
+
+
+def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goings(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    async def play() -> None:
+        network, stop = MemoryNetwork(), asyncio.Event()
+        rcm, here = leader(network), network.open("lab", Sender("basil", "recorder"))
+        with Timeline("lab", path=path) as timeline:
+            recording = asyncio.create_task(Recorder(here, default_fleet(), timeline).run(stop))
+            await rcm_sees(rcm, Role.RECORDER)
+            node = network.open("lab", Sender("cart", "node"))
+            tokens = [
+                node.alive(Token("cart", Role.NODE, "node", "i2")),
+                node.alive(Token("cart", Role.RC, SCOUT33, "i3")),
+            ]
+            await asyncio.sleep(1)
+            why = ReasonInfo("held", [SCOUT33], [ReasonParty("a0", "drive", "cart/teleop", priority=10)])
+            me = Sender("cart", "net")
+            rcm.put(rcm.keys.notice(me), Notice("a1", "hide", str(me), "queued", TERM, 1, reason=REASON, why=why))
+            await asyncio.sleep(1)
+            assert list(timeline.layout(live=False).contended) == [f"/rc/{SCOUT33}"]
+            for token in tokens:
+                token.close()
+            await asyncio.sleep(1)
+            assert list(timeline.layout(live=False).absent) == [f"/rc/{SCOUT33}"]
+            stop.set()
+            await recording
+
+    run(play())
+    # At its end it reads the state, in which this leader has nothing.
+    assert lanes(path, "/arc/hide")["/arc/hide"][0][1] == [f"waiting · for drive: {SCOUT33}"]
+    assert [state for _, (state,) in lanes(path, f"/rc/{SCOUT33}")[f"/rc/{SCOUT33}"]] == ["", "not there"]
+    assert [text for text in events(path) if "lead" not in text] == [
+        f"hide {REASON}",
+        "hide ended: while nobody listened",
+    ]
+    assert [text for _, _, (text,) in rows(path, "/presence", "TextLog:text")] == [
+        "node cart is there",
+        f"{SCOUT33} is offered by cart",
+        "node cart is gone",
+        f"{SCOUT33} is gone from cart",
+    ]
 
 
 def test_at_its_end_it_reads_what_was_published_and_missed(tmp_path: Path) -> None:

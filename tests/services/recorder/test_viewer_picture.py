@@ -62,7 +62,7 @@ def record(path: Path) -> None:
 
 
 @contextmanager
-def viewer(recording: Path, home: Path, *, panes: int = 4, height: int = HEIGHT) -> Iterator[ViewerClient]:
+def viewer(recording: Path, home: Path, *, panes: int = 5, height: int = HEIGHT) -> Iterator[ViewerClient]:
     """A viewer without a window that has the recording open; skips where it finds no graphics driver.
 
     `panes` are those that the recording's layout has, hidden ones among them."""
@@ -172,6 +172,7 @@ def test_the_paper_s_example_in_the_viewer(tmp_path: Path) -> None:
         "What each ARC is doing",
         "Load average (1 min) per host",
         "Events",
+        "Who comes and goes",
     }
     (shown,) = state.recordings
     assert [(timeline.name, timeline.time_type) for timeline in shown.timelines] == [(TIME, "duration")]

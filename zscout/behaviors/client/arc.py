@@ -1,40 +1,49 @@
 """An ARC in a few lines: a context manager that waits for the grant and ends its body when it is over.
 
     async with Client.connect() as client:
-        async with hold(client, "survey", {"robot/scout33": {}}, min_runtime=5) as held:
+        async with hold(client, "survey", {"robot/scout33": {}}) as held:
             await held.command("robot/scout33", {"name": "echo", "value": 1})
 
-The body is cancelled when the hold is taken away (`Revoked` comes out of the `async with`), and when its
-minimum runtime is over (nothing comes out: it had its time). `holds` goes again when it is granted again:
+A hold is protected for its minimum runtime (the fleet's, 60 s), and goes on until somebody of equal or higher
+priority waits for what it holds; with `keep=False` it ends when its minimum runtime is over. The body is cancelled when
+the hold is taken away before that (`Revoked` comes out of the `async with`), and when its time is over (nothing comes
+out, and `held.completed` is true). `holds` asks again, and goes again when it is granted again:
 
-    async for attempt in holds(client, "survey", {"robot/scout33": {}}, min_runtime=5):
+    async for attempt in holds(client, "survey", {"robot/scout33": {}}):
         async with attempt as held:
             ...
 
 A need may be a pattern, which any one RC meets: with `{"framegrabber/*": {}}` as needs,
 `held.rc("framegrabber/*")` is the one that was given, and `held.command("framegrabber/*", ...)` goes to it.
+
+A body that touches devices past their RCs says `direct=True`. When its hold ends it is cancelled, and its `finally` and
+`except CancelledError` run to their end, in at most nine tenths of what its RCs settle; the next holder waits for that.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import suppress
 from decimal import Decimal
 from typing import Any
 
 from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.request import HoldEnd, Needs, OpenArc
 from zscout.keyexpr import is_pattern
 from zscout.messages import Done
 from zscout.types import SECOND, Grant, Ns
 
+log = logging.getLogger(__name__)
+
 
 class Revoked(Exception):
     """The hold was taken away; `outcome` is the protocol's word, the message the reason."""
 
-    def __init__(self, arc: OpenArc) -> None:
-        ending = arc.ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
+    def __init__(self, arc: OpenArc, ending: HoldEnd | None = None) -> None:
+        ending = ending or arc.ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
         super().__init__(ending.reason or ending.outcome)
         self.outcome = ending.outcome
         self.by = ending.by
@@ -78,7 +87,7 @@ class Held:
 
     @property
     def completed(self) -> bool:
-        """Whether the hold is over because it had its minimum runtime."""
+        """Whether the hold is over because it had its time: its minimum runtime, and with `keep` somebody waited."""
         if self.active:
             return not self.arc.keep and self.remaining <= 0
         return self.arc.outcome == "completed"
@@ -105,23 +114,41 @@ class Held:
 
 class Attempt:
     """One entry into an ARC's body, or one after the other: `again` lets a hold that was taken away be waited for
-    once more."""
+    once more, and one that was kept and had its time be asked for anew. `timeout` in seconds, for each wait."""
 
-    def __init__(self, client: Client, ask: dict[str, Any], *, again: bool) -> None:
-        self._client, self._ask, self._again = client, ask, again
+    def __init__(
+        self, client: Client, ask: dict[str, Any], *, again: bool = False, timeout: float | None = None
+    ) -> None:
+        self._client, self._ask, self._again, self._timeout = client, ask, again, timeout
         self.arc: OpenArc | None = None
-        self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None]] | None = None
-        """The hold, its body, and what cancels the body when the hold is over."""
+        self._anew = False
+        """Whether what was kept is to be asked for anew."""
+        self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None], DirectHold | None] | None = None
+        """The hold, its body, what cancels the body when the hold is over, and what a direct one owes its RCs."""
+        self._cancelled = 0
+        """How often the body was, for that."""
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether its ARC is to be waited for once more."""
+        return self._anew or (self.arc is not None and self.arc.open)
 
     async def granted(self) -> Held:
-        """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused."""
-        if self.arc is None:
-            self.arc = await self._client.request(**self._ask)
+        """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused, TimeoutError."""
+        if self._anew:
+            self.arc, self._anew = None, False
         try:
-            grant = await self._client.granted(self.arc)
-        except asyncio.CancelledError:
-            await self._client.end(self.arc)
-            raise
+            async with asyncio.timeout(self._timeout):
+                if self.arc is None:
+                    self.arc = await self._client.request(**self._ask)
+                grant = await self._client.granted(self.arc)
+        except (asyncio.CancelledError, TimeoutError) as error:
+            why = self.arc.reason if self.arc is not None else "no RCM has answered"
+            if self.arc is not None:
+                await self._client.end(self.arc)
+            if isinstance(error, asyncio.CancelledError):
+                raise
+            raise TimeoutError(f"{self._ask['name']} was not granted within {self._timeout:g} s: {why}") from None
         if grant is None:
             raise Revoked(self.arc)
         return Held(self._client, self.arc, grant)
@@ -129,26 +156,44 @@ class Attempt:
     async def __aenter__(self) -> Held:
         held, body = await self.granted(), asyncio.current_task()
         assert body is not None  # noqa: S101 - this is a coroutine
-        self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body))
+        direct, self._cancelled = self._client.direct_hold(held.grant), 0
+        self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body, direct)), direct
         return held
 
-    async def _interrupt_when_over(self, held: Held, body: asyncio.Task[Any]) -> None:
+    async def _interrupt_when_over(self, held: Held, body: asyncio.Task[Any], direct: DirectHold | None) -> None:
         await held.over()
         await held.resumed()
+        self._cancel(body)
+        if direct is not None:
+            direct.end()
+            await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
+            log.warning(
+                "%s clears up for too long after its hold, and is interrupted: the next holder begins", held.arc.name
+            )
+            self._cancel(body)
+
+    def _cancel(self, body: asyncio.Task[Any]) -> None:
+        self._cancelled += 1
         body.cancel()
 
     async def __aexit__(self, kind: type[BaseException] | None, *_error: object) -> bool:
         assert self._entered is not None  # noqa: S101 - entered before left
-        held, body, watch = self._entered
+        held, body, watch, direct = self._entered
         arc = held.arc
-        interrupted = watch.done() and not watch.cancelled()
         watch.cancel()
+        if direct is not None:
+            direct.returned()
         # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
-        interrupted = interrupted and body.uncancel() == 0 and kind is asyncio.CancelledError
+        left = [body.uncancel() for _ in range(self._cancelled)]
+        interrupted = left[-1:] == [0] and kind is asyncio.CancelledError
         if held.completed:
+            # What somebody released is not to be had again.
+            by_hand = arc.why is not None and arc.why.code == "released"
+            self._anew = self._again and interrupted and arc.keep and not by_hand
             self._client.complete(arc)
             return interrupted
-        if held.active or (kind is not None and not interrupted):
+        # Whose body was interrupted is over for it, though a new RCM may have found that it stands all the same.
+        if not interrupted and (held.active or kind is not None):
             if arc.open:
                 await self._client.end(arc)
             return False
@@ -166,12 +211,26 @@ def hold(
     needs: Needs,
     *,
     priority: int = 0,
-    min_runtime: float | Decimal = 1.0,
-    keep: bool = False,
+    min_runtime: float | Decimal | None = None,
+    keep: bool = True,
+    direct: bool = False,
+    timeout: float | None = None,
+    comment: str = "",
+    wait_for_device: bool | None = None,
 ) -> Attempt:
-    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds."""
-    ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
-    return Attempt(client, ask, again=False)
+    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's; the
+    `comment` is shown to others; `wait_for_device` as `Client.request` has it.
+
+    Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
+    how: dict[str, Any] = {
+        "priority": priority,
+        "min_runtime": min_runtime,
+        "keep": keep,
+        "direct": direct,
+        "comment": comment,
+    }
+    how["wait_for_device"] = wait_for_device
+    return Attempt(client, {"name": name, "needs": needs} | how, timeout=timeout)
 
 
 async def holds(
@@ -180,13 +239,23 @@ async def holds(
     needs: Needs,
     *,
     priority: int = 0,
-    min_runtime: float | Decimal = 1.0,
-    keep: bool = False,
+    min_runtime: float | Decimal | None = None,
+    keep: bool = True,
+    direct: bool = False,
+    comment: str = "",
+    wait_for_device: bool | None = None,
 ) -> AsyncIterator[Attempt]:
-    """The same, entered again whenever it was taken away and is granted again, until a body ends by itself
-    or has had its time."""
-    ask = {"name": name, "needs": needs, "priority": priority, "min_runtime": min_runtime, "keep": keep}
-    attempt = Attempt(client, ask, again=True)
+    """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
+    without `keep` has had its time."""
+    how: dict[str, Any] = {
+        "priority": priority,
+        "min_runtime": min_runtime,
+        "keep": keep,
+        "direct": direct,
+        "comment": comment,
+    }
+    how["wait_for_device"] = wait_for_device
+    attempt = Attempt(client, {"name": name, "needs": needs} | how, again=True)
     yield attempt
-    while attempt.arc is not None and attempt.arc.open:
+    while attempt.goes_on:
         yield attempt

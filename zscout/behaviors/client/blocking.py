@@ -1,29 +1,37 @@
 """The synchronous form, for scripts and notebooks.
 
-    with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}, min_runtime=60) as held:
+    with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}) as held:
         held.command("robot/scout33", {"name": "echo", "value": 1})
 
-A body that is plain Python can't be stopped from outside: look at `held.active`, wait with `held.wait(...)`,
-or let `held.check()` raise. An RC obeys nothing under a hold that is over, whatever the body does.
+When the hold is taken away, or its time is over, `Revoked` is raised in the body, whatever that is doing: in a
+`time.sleep`, a read or a wait for another hold as well. That is done by a signal (`interruption.py`), so only where the
+body runs in the main thread, and not before a call of a C library returns that does not mind signals. In other threads,
+and with `interrupt=False`, a body looks at `held.active`, waits with `held.wait(...)` or lets `held.check()` raise. An
+RC obeys nothing under a hold that is over, whatever the body does.
 """
 
 from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Coroutine, Iterator, Mapping
-from contextlib import contextmanager
-from typing import Any, Self, TypeVar
+from collections.abc import Coroutine, Mapping
+from contextlib import AbstractContextManager
+from types import TracebackType
+from typing import Any, Final, Self, TypeVar
 
 import uvloop
 
-from zscout.behaviors.client.arc import Held, Revoked, hold
+from zscout.behaviors.client.arc import Attempt, Held, Revoked, hold
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.client.request import Needs
+from zscout.behaviors.client.interruption import InterruptibleBody, interruptible, uninterrupted
+from zscout.behaviors.client.request import HoldEnd, Needs
 from zscout.config.fleet import Fleet
 from zscout.mesh.supervision import done_within
 
 T = TypeVar("T")
+
+LOOK_FOR_RCM: Final = 3.0
+"""Seconds in which a mesh that has an RCM shows it."""
 
 
 class BlockingHeld:
@@ -31,24 +39,38 @@ class BlockingHeld:
 
     def __init__(self, lab: Lab, held: Held) -> None:
         self._lab, self._held = lab, held
+        self._body = InterruptibleBody(self._revoked)
 
     @property
     def active(self) -> bool:
+        """Whether the hold is still in force, as far as this client knows."""
         return self._held.active and (self._held.arc.keep or self._held.remaining > 0)
 
     @property
+    def completed(self) -> bool:
+        """Whether the hold is over because it had its time: its minimum runtime, and with `keep` somebody waited."""
+        return self._held.completed
+
+    @property
     def remaining(self) -> float:
-        """Seconds of the minimum runtime that are left."""
+        """Seconds of the minimum runtime that are left: in these only a higher priority takes it."""
         return self._held.remaining
 
     def check(self) -> None:
         """Raises Revoked once the hold is over."""
         if not self.active:
-            raise Revoked(self._held.arc)
+            self._body.told = True
+            raise self._revoked()
 
-    def wait(self, timeout: float) -> bool:
-        """Waits until the hold is over, at most `timeout` seconds. True: it is over."""
-        return self._lab.run(done_within(timeout, self._held.over()))
+    def wait(self, timeout: float | None = None) -> bool:
+        """Waits until the hold is over, at most `timeout` seconds. True: it is over, and nothing is raised for it."""
+        self._body.waits = True
+        try:
+            over = self._lab.run(done_within(timeout, self._held.over()))
+            self._body.told |= over
+        finally:
+            self._body.waits = False
+        return over
 
     @property
     def rcs(self) -> list[str]:
@@ -63,6 +85,77 @@ class BlockingHeld:
         """Has one of the held RCs do something and returns its result: the one of this name, or that meets
         this pattern. Raises CommandRefused, and KeyError for a pattern that was not asked for."""
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
+
+    def _revoked(self) -> Revoked:
+        arc = self._held.arc
+        over = HoldEnd("completed", "its minimum runtime is over") if self._held.active else None
+        return Revoked(arc, over)
+
+
+class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
+    """What `Lab.hold` gives: waits for the grant when it is entered, and gives back when it is left."""
+
+    def __init__(self, lab: Lab, attempt: Attempt, *, interrupt: bool) -> None:
+        self._lab, self._attempt, self._interrupt = lab, attempt, interrupt
+        self._held: BlockingHeld | None = None
+        self._entering: asyncio.Task[Any] | None = None
+        self._watch: asyncio.Task[None] | None = None
+
+    def __enter__(self) -> BlockingHeld:
+        try:
+            self._held = BlockingHeld(self._lab, self._lab.run(self._granted()))
+            if self._interrupt and interruptible():
+                self._held._body.enter()
+                self._lab.run(self._watch_over(self._held))
+        except BaseException:
+            self._leave()
+            raise
+        return self._held
+
+    @uninterrupted
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        held = self._held
+        assert held is not None  # noqa: S101 - entered before left
+        unknown = kind is None and not held.active and not held.completed and not held._body.told
+        revoked = held._revoked() if unknown else None
+        self._leave()
+        if revoked is not None:
+            raise revoked
+
+    @uninterrupted
+    def _leave(self) -> None:
+        try:
+            if not self._lab.closed:
+                self._lab.run(self._end())
+        finally:
+            if self._held is not None:
+                self._held._body.leave()
+
+    # In the loop's thread
+
+    async def _granted(self) -> Held:
+        self._entering = asyncio.current_task()
+        await self._lab.client.see_rcm(LOOK_FOR_RCM)
+        return await self._attempt.granted()
+
+    async def _watch_over(self, held: BlockingHeld) -> None:
+        self._watch = asyncio.create_task(self._interrupt_when_over(held))
+
+    async def _interrupt_when_over(self, held: BlockingHeld) -> None:
+        await held._held.over()
+        await held._body.interrupt()
+
+    async def _end(self) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+        if self._entering is not None and not self._entering.done():
+            # It was interrupted, and withdraws what it asked for.
+            await asyncio.wait([self._entering])
+        arc = self._attempt.arc
+        if arc is not None and arc.open:
+            await self._lab.client.end(arc)
 
 
 class Lab:
@@ -84,7 +177,12 @@ class Lab:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
+    @property
+    def closed(self) -> bool:
+        return not self._thread.is_alive()
+
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """What the coroutine returns, which runs in the loop of the client."""
         future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
         try:
             return future.result()
@@ -92,23 +190,42 @@ class Lab:
             future.cancel()
             raise
 
+    @uninterrupted
     def close(self) -> None:
-        if self._thread.is_alive():
+        """Gives back everything and leaves the mesh."""
+        if not self.closed:
             self.run(self.client.close())
             self._stop()
 
-    @contextmanager
     def hold(
-        self, name: str, needs: Needs, *, priority: int = 0, min_runtime: float = 1.0, keep: bool = False
-    ) -> Iterator[BlockingHeld]:
-        """Waits for all of `needs`; gives them back at the end of the body."""
-        attempt = hold(self.client, name, needs, priority=priority, min_runtime=min_runtime, keep=keep)
-        held = self.run(attempt.granted())
-        try:
-            yield BlockingHeld(self, held)
-        finally:
-            if held.arc.open:
-                self.run(self.client.end(held.arc))
+        self,
+        name: str,
+        needs: Needs,
+        *,
+        priority: int = 0,
+        min_runtime: float | None = None,
+        keep: bool = True,
+        timeout: float | None = None,
+        interrupt: bool = True,
+        comment: str = "",
+        wait_for_device: bool | None = None,
+    ) -> AbstractContextManager[BlockingHeld, None]:
+        """When entered it waits for all of `needs`, at most `timeout` seconds; when left it gives them back. Others
+        are shown the `comment`.
+
+        The hold is protected for `min_runtime` seconds (default: the fleet's, 60), and goes on until somebody of equal
+        or higher priority waits for what it holds; with `keep=False` it ends when they are over. Then, or when it is
+        taken away before, `Revoked` is raised in a body in the main thread, unless `interrupt` is false: its `outcome`
+        is `completed` where it had its time.
+
+        What can never start is refused; with `wait_for_device`, not for a need that nobody knows.
+
+        Entering raises TimeoutError, RequestRefused, Revoked where others ended the request, and NoRcm where none is
+        seen within 3 s. Leaving raises Revoked where the hold was taken away and the body has not been told."""
+        how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
+        how["comment"] = comment
+        how["wait_for_device"] = wait_for_device
+        return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
     def _stop(self) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)

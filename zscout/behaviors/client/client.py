@@ -11,26 +11,41 @@ from contextlib import ExitStack, closing
 from decimal import Decimal
 from typing import Any, Final, Generic, Self, TypeVar
 
+from msgspec.structs import replace
+
 from zscout import messages
+from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
+from zscout.behaviors.client.identity import checked_comment, this_program
 from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN
-from zscout.behaviors.client.request import CommandRefused, Needs, OpenArc, RequestRefused, amounts
-from zscout.config.fleet import Fleet, fleet_from_env
+from zscout.behaviors.client.request import CommandRefused, Needs, NoRcm, OpenArc, RequestRefused, amounts
+from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
 from zscout.mesh.renewal import PATIENCE
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import Done, Foresight, Notice, Problem, RcmState
+from zscout.messages import Done, Foresight, Notice, Problem, RcmState, Who
 from zscout.types import SECOND, Grant, Ns, Term
 
-__all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "RequestRefused"]
+__all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "NoRcm", "RequestRefused"]
 
 log = logging.getLogger(__name__)
 
+LOOK_FOR_RCM: Final = 3.0
+"""Seconds in which a mesh that has an RCM shows it."""
+LOOK_FOR_TAKEOVER: Final = 5.0
+"""The same where a candidate is seen."""
+MAX_NAMED: Final = 5
 UNREACHED = 10.0
 """Seconds for which an RC may be granted that this client neither sees nor reaches."""
 CONFIRM_TIMEOUT = 1.0
 """Seconds within which all RCs of a grant must have confirmed it."""
+SETTLING: Final = "settling"
+"""What an RC answers while the program of its last holder may still touch its device."""
+LAST_WORD: Final = 0.5
+"""Seconds at most for which a client that closes tells RCs that its programs are gone."""
+LOOK_AGAIN: Final = 0.1
+"""Seconds between two questions whether it has settled."""
 CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
 """Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
 NOT_HELD = frozenset({"ended", "free", "not_holder"})
@@ -51,6 +66,8 @@ class Client(MovableClient):
 
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
         super().__init__(mesh, fleet, Supervisor(f"client {mesh.me}", self._failed))
+        self.who: Who | None = None
+        """Who asks, as others are told; `connect` fills it in."""
         self._leaving: asyncio.Task[None] | None = None
         self._declared: list[Declaration] = []
         self._token: Declaration | None = None
@@ -58,6 +75,11 @@ class Client(MovableClient):
         """When the present token was declared."""
         self._denied: set[Grant] = set()
         """Grants that an RC says are over, and no notice yet."""
+        self._direct: dict[Grant, DirectHold] = {}
+        """Holds of direct requests, until their programs are gone."""
+        self._store.watchers.append(self._look_at_direct)
+        self.waits_for_devices = False
+        """Whether its requests wait for what nobody knows, instead of being refused, if they do not say."""
 
     @classmethod
     def connect(
@@ -73,7 +95,9 @@ class Client(MovableClient):
         fleet = fleet or fleet_from_env()
         host = host or os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
         me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
-        return cls(await ZenohMesh.open(fleet.name, me, fleet.mesh), fleet).start()
+        client = cls(await ZenohMesh.open(fleet.name, me, fleet.mesh), fleet)
+        client.who = this_program(host)
+        return client.start()
 
     async def __aenter__(self) -> Self:
         return self
@@ -114,6 +138,8 @@ class Client(MovableClient):
                 self._may_end.set()
                 await self._supervisor.close()
                 await asyncio.gather(*(self.end(arc) for arc in self._store.open))
+                if telling := [task for direct in self._direct.values() for task in direct.telling]:
+                    await asyncio.wait(telling, timeout=LAST_WORD)
         finally:
             await self.leave()
 
@@ -129,6 +155,8 @@ class Client(MovableClient):
         try:
             await self._supervisor.close()
         finally:
+            for telling in [task for direct in self._direct.values() for task in direct.telling]:
+                telling.cancel()
             for declared in (*filter(None, [self._token]), *reversed(self._declared)):
                 declared.close()
             await self.mesh.close()
@@ -150,6 +178,37 @@ class Client(MovableClient):
         """The host whose node leads, or None where no RCM is seen."""
         return self._rcm.leader
 
+    async def see_rcm(self, seconds: float = LOOK_FOR_RCM, takeover: float = LOOK_FOR_TAKEOVER) -> None:
+        """Returns as soon as an RCM is seen. Raises NoRcm where none is within `seconds`, or within `takeover` where a
+        candidate is seen, which may be about to take the lead."""
+        if self.leader is not None:
+            return
+        seen, candidates = asyncio.Event(), set[Token]()
+
+        def on_token(token: Token, alive: bool) -> None:
+            if token.role == Role.CANDIDATE:
+                (candidates.add if alive else candidates.discard)(token)
+            elif alive:
+                seen.set()
+
+        with ExitStack() as stack:
+            for role in (Role.RCM, Role.CANDIDATE):
+                stack.enter_context(closing(self.mesh.watch(self.mesh.keys.alive_any(role), on_token)))
+            if await done_within(seconds, seen.wait()):
+                return
+            if candidates and await done_within(max(0.0, takeover - seconds), seen.wait()):
+                return
+        nobody = f"no RCM is on the mesh of fleet {self.fleet.name}"
+        if candidates:
+            names = ", ".join(sorted(token.host for token in candidates)[:MAX_NAMED])
+            raise NoRcm(f"{nobody}, though {names} could lead; see the log of zscout-node there")
+        links = self.mesh.links()
+        who = f"{links} links to other programs" if links else "no other program either"
+        raise NoRcm(
+            f"{nobody} ({who}); start zscout-node on a host, or check the fleet's name, `interface` and `connect` in "
+            f"its file (--fleet, ${FLEET_VARIABLE})"
+        )
+
     # Requests
 
     async def request(
@@ -158,22 +217,34 @@ class Client(MovableClient):
         needs: Needs,
         *,
         priority: int = 0,
-        min_runtime: float | Decimal = 1.0,
-        keep: bool = False,
+        min_runtime: float | Decimal | None = None,
+        keep: bool = True,
         estimate: bool = False,
+        direct: bool = False,
+        comment: str = "",
+        wait_for_device: bool | None = None,
     ) -> OpenArc:
         """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
 
+        Once granted it is protected for `min_runtime` seconds (default: the fleet's, 60), and held until somebody of
+        equal or higher priority waits for what it holds; without `keep`, it ends when they are over.
+
         A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
-        more. With `estimate` its notices say when it will start. Raises RequestRefused where the request
-        can't be taken as it is.
+        more. With `estimate` its notices say when it will start. `direct`: its program touches devices past their RCs;
+        see `direct_hold`. The `comment` is shown to others. What can never start is refused at once: a parameter that
+        its RC does not know, more of one than that ever carries, and, unless it is to `wait_for_device` (default:
+        `waits_for_devices`), a need that nobody knows. Raises RequestRefused where the request can't be taken as it is,
+        ValueError for too long a comment.
 
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)
+        who = replace(self.who or Who(), comment=checked_comment(comment)) if comment else self.who
         arc = await self._claim(check_name(name, "arc"), wanted)
         if arc is None:
-            seconds, now = Decimal(str(min_runtime)), self.mesh.now()
-            arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, since=now)
+            seconds, now = self._protected(min_runtime), self.mesh.now()
+            arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
+            arc.who = who
+            arc.check, arc.wait_for_device = True, self._waits(wait_for_device)
             self._store.add(arc)
         try:
             await self._rcm.submit(arc)
@@ -185,12 +256,20 @@ class Client(MovableClient):
             raise
         return arc
 
+    def _protected(self, min_runtime: float | Decimal | None) -> Decimal:
+        """In seconds; what nobody gave is the fleet's."""
+        return Decimal(self.fleet.min_runtime) / SECOND if min_runtime is None else Decimal(str(min_runtime))
+
+    def _waits(self, wait_for_device: bool | None) -> bool:
+        return self.waits_for_devices if wait_for_device is None else wait_for_device
+
     async def changed(self, arc: OpenArc) -> None:
         """Waits until there is news of `arc`."""
         await self._store.changed(arc)
 
     async def granted(self, arc: OpenArc) -> Grant | None:
-        """Waits until `arc` is granted and all its RCs have confirmed it; None if it ended instead.
+        """Waits until `arc` is granted and all its RCs have confirmed it, which they do once they have settled; None if
+        it ended instead.
 
         Nothing is entered while the client is paused, nor is what it hands over reported as ended."""
         while True:
@@ -199,53 +278,132 @@ class Client(MovableClient):
                 return None
             if arc.state == "running" and arc.grant is not None:
                 grant = arc.grant
-                refusals = await self._confirm(arc, grant)
-                if arc.grant != grant:
-                    continue
-                if not refusals:
+                if grant == arc.left:
+                    # Its RCs have been told that its program leaves, whatever a new RCM has found.
+                    over = Problem("ended", "its program was told to leave")
+                    refusals = [CommandRefused(rc, over) for rc in arc.rcs]
+                else:
+                    refusals = await self._confirm(arc, grant)
+                if arc.grant == grant and not refusals:
+                    arc.settling = None
+                    if grant in self._direct:
+                        self._direct[grant].keep_confirming(self._on_unsure)
                     return grant
-                log.warning("the grant of %s is given back: %s", arc.name, refusals[0])
-                if other := [refused for refused in refusals if refused.code not in NOT_CONFIRMED]:
-                    await self.end(arc)
-                    raise other[0]
-                rcs = [refused.rc for refused in refusals]
-                arc.not_confirmed(rcs, str(refusals[0]), self.mesh.now())
-                self._store.notify(arc)
-                self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
-                await self._rcm.submit(arc)
+                self._leave_unentered(grant)
+                if arc.grant == grant:
+                    await self._give_back(arc, grant, refusals)
             else:
                 await self.changed(arc)
 
+    def direct_hold(self, grant: Grant) -> DirectHold | None:
+        """For who runs the program of a direct request: how long its hold may be relied on, and what is to be told when
+        the program is gone. None where the request was not direct, or that has been told."""
+        return self._direct.get(grant)
+
+    async def _give_back(self, arc: OpenArc, grant: Grant, refusals: list[CommandRefused]) -> None:
+        """It is not entered. Raises CommandRefused where that is not for the RCM to mend."""
+        if other := [refused for refused in refusals if refused.code not in NOT_CONFIRMED | {SETTLING}]:
+            log.warning("the grant of %s is given back: %s", arc.name, other[0])
+            await self.end(arc)
+            raise other[0]
+        rcs = [refused.rc for refused in refusals if refused.code != SETTLING]
+        if rcs:
+            log.warning("the grant of %s is given back: %s", arc.name, refusals[0])
+            arc.not_confirmed(rcs, str(refusals[0]), self.mesh.now())
+            self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
+        else:
+            arc.not_served(grant, self.mesh.now())
+        self._store.notify(arc)
+        await self._rcm.submit(arc)
+
     async def _confirm(self, arc: OpenArc, grant: Grant) -> list[CommandRefused]:
-        """Asks all RCs of a grant, side by side, whether they know of it. Returns those that do not say so, within a
-        second in which this client did not stand still itself."""
+        """Asks all RCs of a grant, side by side, whether they know of it. Returns those that do not say so within a
+        second in which this client did not stand still itself, or that settle until its time is over."""
+        direct = self._open_direct(arc, grant) if arc.direct else None
+        asked = arc.rcs
+        while True:
+            refusals = await asyncio.gather(*(self._confirm_one(arc, grant, rc, direct) for rc in asked))
+            for rc, refused in zip(asked, refusals, strict=True):
+                await self._look_at_silence(rc, silent=refused is not None and refused.code == "unknown")
+            # What one has confirmed is old by now if another had to settle.
+            asked = [] if direct is None else direct.unanswered(self.mesh.now() - self.fleet.timing.hold_lease // 2)
+            refused_by = [refused for refused in refusals if refused is not None]
+            if refused_by or arc.grant != grant or not asked:
+                return refused_by
+
+    async def _confirm_one(
+        self, arc: OpenArc, grant: Grant, rc: str, direct: DirectHold | None
+    ) -> CommandRefused | None:
         second = round(CONFIRM_TIMEOUT * SECOND)
         deadline = self.mesh.now() + second
-
-        async def one(rc: str) -> CommandRefused | None:
-            nonlocal deadline
-            pause = BACKOFF[0]
-            while True:
-                left = (deadline - self.mesh.now()) / SECOND
-                try:
-                    await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
-                except CommandRefused as refused:
-                    if arc.grant != grant or refused.code not in CONFIRM_AGAIN:
+        pause = BACKOFF[0]
+        while True:
+            sent = self.mesh.now()
+            left = (deadline - sent) / SECOND
+            try:
+                done = await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
+            except CommandRefused as refused:
+                if arc.grant != grant or refused.code not in CONFIRM_AGAIN | {SETTLING}:
+                    return refused
+                if refused.code == SETTLING:
+                    # Neither a refusal nor silence.
+                    if arc.settling != grant:
+                        most = "" if refused.left is None else f", for {refused.left:.1f} s at most"
+                        arc.settling, arc.reason = grant, f"a former holder's program may still touch {rc}{most}"
+                        self._store.notify(arc)
+                    if not arc.keep and self.mesh.now() >= arc.end:
                         return refused
-                    if self._rcm.stood_still:
-                        deadline = self.mesh.now() + second
-                    elif left <= 0:
-                        return refused
-                else:
-                    return None
-                # The last time when all is over: a link to the RC may take that long.
-                await asyncio.sleep(max(0.0, min(pause, (deadline - self.mesh.now()) / SECOND)))
-                pause *= 2
+                    deadline, pause = self.mesh.now() + second, BACKOFF[0]
+                    await asyncio.sleep(min(LOOK_AGAIN, refused.left if refused.left is not None else LOOK_AGAIN))
+                    continue
+                if self._rcm.stood_still:
+                    deadline = self.mesh.now() + second
+                elif left <= 0:
+                    return refused
+            else:
+                if direct is not None:
+                    direct.confirmed(rc, sent, done)
+                return None
+            # The last time when all is over: a link to the RC may take that long.
+            await asyncio.sleep(max(0.0, min(pause, (deadline - self.mesh.now()) / SECOND)))
+            pause *= 2
 
-        refusals = await asyncio.gather(*(one(rc) for rc in arc.rcs))
-        for rc, refused in zip(arc.rcs, refusals, strict=True):
-            await self._look_at_silence(rc, silent=refused is not None and refused.code == "unknown")
-        return [refused for refused in refusals if refused is not None]
+    # Direct holds
+
+    def _open_direct(self, arc: OpenArc, grant: Grant) -> DirectHold:
+        if grant not in self._direct:
+            lease, spawn = self.fleet.timing.hold_lease, self._supervisor.spawn
+            self._direct[grant] = DirectHold(arc, grant, self.command, self.mesh.now, spawn, hold_lease=lease)
+        return self._direct[grant]
+
+    def _look_at_direct(self, arc: OpenArc) -> None:
+        """There is news of `arc`: its holds before the present one are over."""
+        for direct in self._direct_of(arc):
+            if direct.grant != arc.grant:
+                direct.end()
+
+    def _direct_of(self, arc: OpenArc) -> list[DirectHold]:
+        self._direct = {grant: one for grant, one in self._direct.items() if not one.gone or one.telling}
+        return [direct for direct in self._direct.values() if direct.arc is arc]
+
+    def _program_is_gone(self, arc: OpenArc) -> None:
+        for direct in self._direct_of(arc):
+            direct.end(released=True)
+
+    def _leave_unentered(self, grant: Grant) -> None:
+        """Some RCs may have confirmed what was not entered."""
+        if (direct := self._direct.get(grant)) is not None:
+            direct.end(released=True)
+
+    def _on_unsure(self, direct: DirectHold) -> None:
+        """An RC has not confirmed it for a hold lease: it is over, whatever RCMs say."""
+        arc, rcs = direct.arc, direct.unanswered(self.mesh.now() - self.fleet.timing.hold_lease)
+        direct.end()
+        if arc.grant == direct.grant:
+            arc.not_confirmed(rcs, f"{', '.join(rcs)} did not confirm it for the hold lease", self.mesh.now())
+            self._store.notify(arc)
+            self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
+            self._supervisor.spawn(self._ask_again(arc))
 
     async def _ask_when_reachable(self, arc: OpenArc, rcs: list[str]) -> None:
         """Where tokens of RCs that did not confirm go, or have gone, and come back, links are back: `arc` is held back
@@ -279,17 +437,20 @@ class Client(MovableClient):
 
     async def end(self, arc: OpenArc) -> None:
         """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed
-        over then. Tried a few times; the RCM sees our token die otherwise."""
+        over then. The program of a direct one is gone by then. Tried a few times; the RCM sees our token die
+        otherwise."""
         await self._may_end.wait()
         if self._leaving is not None:
             return
         if arc.state == "moved":
             self._store.forget(arc)
             return
+        self._program_is_gone(arc)
         await self._rcm.end(arc)
 
     def complete(self, arc: OpenArc) -> None:
-        """An ARC has had its time by this host's clock; RCs and RCM end it by theirs."""
+        """An ARC has had its time by this host's clock, and its body has returned; RCs and RCM end it by theirs."""
+        self._program_is_gone(arc)
         arc.finish("completed", "its minimum runtime is over", self.mesh.now())
         self._store.notify(arc)
         self._store.forget(arc)
@@ -317,10 +478,21 @@ class Client(MovableClient):
         return reply.message if reply is not None else None
 
     async def foresee(
-        self, name: str, needs: Needs, *, priority: int, min_runtime: Decimal, keep: bool = False
+        self,
+        name: str,
+        needs: Needs,
+        *,
+        priority: int = 0,
+        min_runtime: float | Decimal | None = None,
+        keep: bool = True,
+        wait_for_device: bool | None = None,
     ) -> Foresight | None:
         """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
-        asked = messages.Foresee(new_instance(), name, amounts(needs), priority, min_runtime, keep)
+        seconds = self._protected(min_runtime)
+        waits, wanted = self._waits(wait_for_device), amounts(needs)
+        asked = messages.Foresee(
+            new_instance(), name, wanted, priority, seconds, keep, check=True, wait_for_device=waits
+        )
         reply = await self.mesh.ask_one(self._rcm.key, asked, Foresight, timeout=QUERY_TIMEOUT)
         if reply is not None and reply.problem is not None:
             raise RequestRefused(reply.problem)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 import msgspec
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, is_pattern, matcher, new_instance
-from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release
+from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release, Who
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
 
 Needs = Mapping[str, Mapping[str, Any]]
@@ -26,12 +26,18 @@ class RequestRefused(Exception):
         self.code = problem.code
 
 
+class NoRcm(Exception):
+    """No RCM is on the mesh; the message says what to look at."""
+
+
 class CommandRefused(Exception):
     """An RC did not obey; `code` is the protocol's, or `unknown` where no answer came."""
 
     def __init__(self, rc: str, problem: Problem) -> None:
         super().__init__(f"{rc}: {problem.message}")
         self.rc, self.code = rc, problem.code
+        self.left = problem.left
+        """With `settling`: the seconds for which the RC may go on to settle."""
 
 
 class HoldEnd(NamedTuple):
@@ -59,6 +65,14 @@ class OpenArc:
     keep: bool = False
     estimate: bool = False
     """Whether the RCM is asked to estimate when it will start."""
+    direct: bool = False
+    """Whether its program touches devices past their RCs (`direct.py`)."""
+    who: Who | None = None
+    """Who asks, as others are told."""
+    check: bool = False
+    """Whether it is to be refused at once if it can never start."""
+    wait_for_device: bool = False
+    """Whether it waits for an RC that nobody knows all the same."""
     state: str = "asking"
     reason: str = ""
     why: ReasonInfo | None = None
@@ -82,11 +96,19 @@ class OpenArc:
     """When it was last queued: its present wait began then, whichever RCM leads."""
     unconfirmed: tuple[Grant, list[str]] | None = None
     """The grant that some of its RCs did not confirm, and which, until the RCM has answered that."""
+    settling: Grant | None = None
+    """The grant whose RCs have not all stopped settling: it is not entered yet."""
+    left: Grant | None = None
+    """The last grant whose program was told to leave: it is not entered again."""
+    unserved: Grant | None = None
+    """The grant whose time went by so, until the RCM has answered that."""
     ending: HoldEnd | None = None
     """How the last hold ended; `outcome` and `reason` are of the newest notice, whatever it is about."""
     shown: Term = NO_TERM
     """In which term its place was shown last, to an RCM that had given a worse one."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
+    told: Ns = 0
+    """When the newest notice came."""
     _came: Term | None = field(default=None, init=False, repr=False)
     """In which term another client handed it over, until an RCM of a later one says whose it is."""
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
@@ -98,6 +120,8 @@ class OpenArc:
             check_need(need)
         id_, name = check_name(request.id, "id"), check_name(request.arc, "arc")
         arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, place=request.place)
+        arc.direct = request.direct
+        arc.who = request.who and msgspec.structs.replace(request.who, host="")
         arc.state, arc.reason = "expected", "another client is to hand it over"
         arc.since, arc.waits_since = now, now - round(request.waited * SECOND)
         return arc
@@ -113,7 +137,8 @@ class OpenArc:
             return False
         if (bound := self._binding(notice)) is None:
             return False
-        self.last, self.unconfirmed = (notice.term, notice.step), None
+        self.last, self.unconfirmed, self.unserved = (notice.term, notice.step), None, None
+        self.told = now
         if self._came is not None and self._came < notice.term:
             self._came = None
         if notice.state != self.state or notice.grant != self.grant:
@@ -163,6 +188,11 @@ class OpenArc:
         assert self.grant is not None  # noqa: S101 - what is not confirmed was granted
         self.unconfirmed = self.grant, rcs
         self.lose(reason, now)
+
+    def not_served(self, grant: Grant | None, now: Ns) -> None:
+        """The time of this grant went by while RCs of it settled: it is asked for once more, at its place."""
+        self.lose("its time went by while its RCs settled", now)
+        self.unserved, self.settling = grant, None
 
     def finish(self, outcome: str, reason: str, now: Ns) -> None:
         """The request is over by the client's own judgement."""
@@ -215,9 +245,18 @@ class OpenArc:
 
     def ask(self, now: Ns, *, reachable: bool = False) -> Ask:
         """`reachable`: the RCs that did not confirm its last grant have shown themselves anew."""
-        grant, unconfirmed = self.unconfirmed or (self.grant, [])
+        grant, unconfirmed = self.unconfirmed or (self.grant or self.unserved, [])
         asked = self._as_asked(now, grant)
-        return Ask(**asked, estimate=self.estimate, unconfirmed=unconfirmed, reachable=reachable)
+        unserved = self.unserved is not None and grant == self.unserved
+        return Ask(
+            **asked,
+            estimate=self.estimate,
+            unconfirmed=unconfirmed,
+            reachable=reachable,
+            unserved=unserved,
+            check=self.check and self.place is None,
+            wait_for_device=self.wait_for_device and self.place is None,
+        )
 
     def open_request(self, now: Ns) -> OpenRequest:
         """As it is reported to an RCM that takes the lead."""
@@ -236,6 +275,8 @@ class OpenArc:
             "waited": max(0, now - since) / SECOND,
             "grant": grant,
             "rcs": self.rcs if grant is not None else [],
+            "direct": self.direct,
+            "who": self.who,
         }
 
 
@@ -319,7 +360,7 @@ class RequestStore:
         if notice.id != arc.id:
             # An answer that was on its way when the ARC was taken back under another id.
             return
-        granted = arc.grant is not None
+        granted, unserved = arc.grant is not None, {arc.settling, arc.unserved} - {None}
         if notice.outcome == "handed_over" and not self.resumed.is_set():
             # Not before the hand-over is answered: an RCM that dies first may not have notified the other.
             return
@@ -336,6 +377,9 @@ class RequestStore:
             self.reclaimed.discard(arc.id)
             if not arc.open and arc.outcome == "client_lost":
                 arc.reopen(self._now())
+                self.ask_again(arc)
+            elif arc.outcome == "completed" and notice.grant in unserved:
+                arc.not_served(notice.grant, self._now())
                 self.ask_again(arc)
             elif not granted and arc.outcome == "completed":
                 self._ask_anew(arc)

@@ -77,10 +77,11 @@ class OrderAnswer(msgspec.Struct, frozen=True, tag="answer"):
 
 
 class EndReport(msgspec.Struct, frozen=True, tag="ends"):
-    """The last report: how it ended, and the reason in words."""
+    """The last report: how it ended, and the reason in words. `bad_params`: its parameters are no good anywhere."""
 
     how: HowEnded
     reason: str = ""
+    bad_params: bool = False
 
 
 ComponentReport: TypeAlias = PhaseReport | OrderAnswer | EndReport

@@ -11,19 +11,23 @@ from contextlib import suppress
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Final
 
+from zscout.config.packages import how_to_get
 from zscout.keyexpr import BadName, check_name
 
 if TYPE_CHECKING:  # a node looks at this module and needs no client
     from zscout.behaviors.client.client import Client
 
 GROUP: Final = "zscout.components"
+BAD_PARAMS: Final = 78
+"""Exit code (EX_CONFIG) of a component whose parameters are no good: it is not started again, here or elsewhere."""
 
 
 class Component:
     """Base of all components. It is made in the process that runs it, before that process is on the mesh."""
 
     def __init__(self, params: dict[str, Any]) -> None:
-        """`params` are the spec's. Raise ValueError, with one line that says what to mend, for bad ones."""
+        """`params` are the spec's. Raise ValueError, with one line that says what to mend, for bad ones: then it is
+        given up, with that line. What is found later ends with `sys.exit(BAD_PARAMS)`."""
 
     async def run(self, context: ComponentContext) -> None:
         """Does the work. Cancelled when the component is to end: let `async with` give back its ARCs."""
@@ -130,7 +134,12 @@ def installed_kinds() -> dict[str, str]:
 def load_kind(kind: str, where: str) -> type[Component]:
     """The class of a kind at `where`, as `installed_kinds` gives it. Raises BadKind, and what its import raises."""
     module_name, _, attributes = where.partition(":")
-    found: Any = importlib.import_module(module_name.strip())
+    try:
+        found: Any = importlib.import_module(module_name.strip())
+    except ImportError as error:
+        if missing := how_to_get(error):
+            raise BadKind(f"kind {kind} {missing}") from error
+        raise
     for attribute in attributes.partition("[")[0].strip().split("."):
         found = getattr(found, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Component)):

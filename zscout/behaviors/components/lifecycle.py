@@ -8,11 +8,15 @@ from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import closing
 from typing import Any, Final
 
+from msgspec.structs import replace
+
 from zscout import messages
 from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.identity import bounded
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import ComponentJob, EndReport, Order, OrderAnswer, PhaseReport
 from zscout.behaviors.components.component import (
+    BAD_PARAMS,
     BadKind,
     Component,
     ComponentContext,
@@ -25,7 +29,7 @@ from zscout.behaviors.components.processes import limit_allocations
 from zscout.keyexpr import BadName, Role, Token, incarnation_of, matcher, new_instance
 from zscout.mesh import Declaration, MeshError
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import MAX_ERROR, MoveComponent, Problem, RestoreComponent
+from zscout.messages import MAX_ERROR, MoveComponent, Problem, RestoreComponent, Who
 
 STAND_BY: Final = 30.0
 """Seconds that one stands by without being restored or activated, and then again until it is activated."""
@@ -37,6 +41,10 @@ CLOSE: Final = 4.0
 """Seconds for giving back what it holds."""
 SUPERSEDED: Final = 0.5
 """Seconds that a superseded one has to clean up."""
+
+
+class BadParams(BadKind):
+    """What a component was given is no good."""
 
 
 class ComponentLifecycle:
@@ -139,9 +147,12 @@ class ComponentLifecycle:
                 kind = self._load()
             finally:
                 client = self._client = await connecting
+                client.who = replace(client.who or Who(), command=bounded(f"component {job.start.component}"))
+                # Whoever started it may have started it before its devices.
+                client.waits_for_devices = True
             made = self._component = self._make(kind)
         except (BadKind, MeshError) as error:
-            return EndReport("failed", str(error))
+            return EndReport("failed", str(error), bad_params=isinstance(error, BadParams))
         movable = is_movable(made)
         with closing(client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)):
             if job.start.standby:
@@ -168,7 +179,7 @@ class ComponentLifecycle:
         try:
             return kind(self._job.start.spec.params)
         except ValueError as error:
-            raise BadKind(f"these parameters are no good: {_words(error, named=False)}") from None
+            raise BadParams(f"these parameters are no good: {_words(error, named=False)}") from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
             raise BadKind(f"it can't be made: {_words(error)}") from None
@@ -185,6 +196,9 @@ class ComponentLifecycle:
             if self._wanted is None:
                 raise
         except SystemExit as left:
+            if left.code == BAD_PARAMS:
+                words = f"it left with code {BAD_PARAMS}: its parameters are no good; see its output"
+                return self._wanted or EndReport("failed", words, bad_params=True)
             if left.code:
                 return self._wanted or EndReport("failed", f"it left with {left.code!r}")
         except Exception as error:

@@ -23,6 +23,7 @@ import uvloop
 
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import BadFrame, ComponentJob, ComponentReport, EndReport, Order
+from zscout.behaviors.components.component import BAD_PARAMS
 from zscout.behaviors.components.lifecycle import ComponentLifecycle
 from zscout.behaviors.components.processes import kill_family
 from zscout.mesh.supervision import done_within
@@ -33,7 +34,7 @@ REPORT_LAST: Final = 2.0
 
 
 def main() -> None:
-    """Exit codes: 0 where the component ended well, 1 where it failed."""
+    """Exit codes: 0 where the component ended well, 1 where it failed, BAD_PARAMS where its parameters are no good."""
     if len(sys.argv) != 2 or not sys.argv[1].isdecimal() or os.getpgrp() != os.getpid():
         sys.exit("zscout: this program is started by a node; `zscout start` starts a component")
     logging.basicConfig(level="WARNING", format="%(levelname)s %(message)s", stream=sys.stderr)
@@ -49,6 +50,8 @@ def main() -> None:
     if job is None:
         return
     ends = uvloop.run(_live(job, connection, orders))
+    if ends.bad_params:
+        sys.exit(BAD_PARAMS)
     sys.exit(1 if ends.how == "failed" else 0)
 
 

@@ -51,7 +51,11 @@ class Counter(Component):
     async def run(self, context: ComponentContext) -> None:
         while self.rc is None:
             await self._step(context)
-        terms: dict[str, Any] = {"priority": int(self.params.priority), "min_runtime": self.params.min_runtime}
+        terms: dict[str, Any] = {
+            "priority": int(self.params.priority),
+            "min_runtime": self.params.min_runtime,
+            "keep": False,
+        }
         while True:
             try:
                 async for attempt in holds(context.client, context.component, {self.rc: {}}, **terms):

@@ -123,6 +123,8 @@ class RobotTask(Behavior):
                 # It may be about to be moved: nothing changes before that is over.
                 await context.safe_point()
                 await self._use(context, held, video)
+            if held.completed:
+                break
             if scout.no_signal and attempt.arc is not None and attempt.arc.open:
                 # It was taken away because the receiver is dead: the same needs would be given the same one.
                 await context.client.end(attempt.arc)

@@ -82,6 +82,8 @@ class Listing:
             found = [self.fleet_view.hosts.get(host or "") for host in hosts]
             return all(host is not None and (host.load or not host.has(Role.LOAD)) for host in found)
 
+        if hosts:
+            await self.fleet_view.ask_loads()
         await common.until(reported, self.fleet_view.changed, FIND_LOADS)
         await self.find_ages()
 
@@ -108,7 +110,7 @@ class Listing:
         for one in self._all():
             use, up = self._use(one), self._uptime(one)
             where = f"{one.host or '-'} > {one.to}" if one.to is not None else one.host or "-"
-            since = "-" if up is None else terminal.span(up)
+            since = "-" if up is None else f"{terminal.clock(-up)} ({terminal.span(up)})"
             moves = str(one.moves) + (f" ({one.dead * 1000:.0f} ms)" if one.dead is not None else "")
             cores, memory = ("-", "-") if use is None else (f"{use.cpu:.2f}", f"{use.memory / 2**20:.0f} MiB")
             stands = (one.component, one.spec.kind, one.state.replace("_", " "), where, since)
@@ -169,11 +171,11 @@ async def _kinds(*, as_json: bool) -> None:
             f"no host of fleet {fleet} told what it can start; start zscout-node there, or see its log"
         )
     if as_json:
-        hosts = [{"host": one.host, "kinds": sorted(one.kinds)} for one in nodes]
+        hosts = [{"host": one.host, "kinds": sorted(one.kinds or ())} for one in nodes]
         terminal.print_json({"fleet": fleet, "hosts": hosts})
         return
-    kinds = sorted({kind for one in nodes for kind in one.kinds})
-    rows = [(kind, ", ".join(one.host for one in nodes if kind in one.kinds)) for kind in kinds]
+    kinds = sorted({kind for one in nodes for kind in one.kinds or ()})
+    rows = [(kind, ", ".join(one.host for one in nodes if kind in (one.kinds or ()))) for kind in kinds]
     nothing = [one.host for one in nodes if not one.kinds]
     without = f"; nothing on {', '.join(nothing)}" if nothing else ""
     headline = f"Fleet {fleet}: {len(kinds)} kinds can be started{without}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import click
 
@@ -12,7 +13,12 @@ from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.cli.components import placing
 from zscout.cli.requests.options import timeout_option
+from zscout.config.strict import BadInput, quoted
+from zscout.keyexpr import Role
 from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
+
+LOOK_FOR_HOSTS: Final = 1.0
+"""Seconds in which nodes show themselves."""
 
 
 @click.command()
@@ -24,7 +30,7 @@ async def migrate(name: str, to: str | None, as_json: bool) -> None:
     """Move a running component to another host, with its state and all that it holds.
 
     Only what can give and take a checkpoint can be moved. Says where it went, and for how long it was out of
-    work. If it fails, the component goes on where it was.
+    work. If it fails, the component goes on where it was. Exit code 2: there is no host of that name.
 
     \b
     Examples:
@@ -60,6 +66,8 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
     except PlacerSilent:
         raise
     except RequestRefused as refused:
+        if to is not None and refused.code == "unknown_host":
+            await _check_host(placer, to)
         raise common.Failed(f"{name} was not moved: {refused}") from None
     if begun(record):
         while record.state not in ("running", *placing.OVER):
@@ -73,6 +81,15 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
     elif to == record.host:
         return record
     raise common.Failed(f"{name} was not moved: it {placing.standing(record)}")
+
+
+async def _check_host(placer: PlacerClient, host: str) -> None:
+    """Raises BadInput where no node has this name."""
+    mesh = placer.mesh
+    nodes = {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_HOSTS)}
+    if host not in nodes:
+        hint = common.hint_at(host, nodes, "nor any other; start zscout-node there", "there are")
+        raise BadInput(f"--to: there is no host {quoted(host)}{hint}")
 
 
 @click.command()

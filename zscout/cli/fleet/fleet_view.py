@@ -11,7 +11,7 @@ from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.keyexpr import BadName, Role, Sender, Token
-from zscout.messages import LoadReport, RcAsk, RcmState, RcState
+from zscout.messages import MAX_RANKED, HostRanking, LoadReport, RankAsk, RcAsk, RcmState, RcState
 from zscout.types import SECOND, Ns
 
 if TYPE_CHECKING:
@@ -19,10 +19,12 @@ if TYPE_CHECKING:
     from zscout.mesh import Reply
 
 ASK_PLACER: Final = 1.0
+ASK_BALANCER: Final = 1.0
 ASK_RCS: Final = 0.5
 """Seconds that the RCs have for their answers."""
 FIND_LOADS: Final = 1.2
-"""Seconds to wait for load reports: they come once a second."""
+"""Seconds to wait for hosts that are known to be there, and for load reports that the balancer does not tell: they come
+once a second."""
 QUIET: Final = 0.3
 """Seconds without a new host after which all have been seen."""
 STALE: Final = 3 * SECOND
@@ -60,6 +62,8 @@ class FleetView:
         # No component has this name: it only follows which hosts are cordoned, and its answers are short.
         self.placer = PlacerClient(client.mesh, {"*"})
         self._settled = False
+        self._reported: dict[str, tuple[Ns, LoadReport]] | None = None
+        """What the balancer told; None: it did not."""
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -76,6 +80,8 @@ class FleetView:
         if Sender(token.host, token.name) == self.mesh.me:
             return
         host = self.hosts.setdefault(token.host, Host())
+        if alive and host.load is None and token.host in (self._reported or {}):
+            host.reported, host.load = (self._reported or {})[token.host]
         (host.tokens.add if alive else host.tokens.discard)(token)
         host.gone = None if host.tokens else self.mesh.now()
         self.changed.set()
@@ -115,27 +121,61 @@ class FleetView:
     async def settled(self, *, loads: bool = True) -> RcmState:
         """The RCM's state, once its RCs are seen, and the hosts with their `loads`. Raises NobodyThere."""
         await common.see_rcm(self.client)
-        state = await common.state_of(self.client)
+        if not loads:
+            state = await common.state_of(self.client)
+            await common.until(lambda: self._sees_all_of(state), self.changed, FIND_LOADS)
+            return state
+        state, _, _ = await asyncio.gather(
+            common.state_of(self.client, forecast=True), self.ask_loads(), self._ask_cordons()
+        )
+        complete = self._complete(state)
+        if not complete:
+            await common.until(lambda: self._complete(state), self.changed, FIND_LOADS)
+        # Of a candidate that the balancer has not heard of nobody knows whether its token is only late.
+        if self._reported is not None and not all(host.tokens for host in self.all_hosts().values()):
+            complete = False
+            seen = lambda: all(host.tokens for host in self.all_hosts().values())  # noqa: E731
+            await common.until(seen, self.changed, QUIET)
+        self._settled = True
+        return state if complete else await self.client.state(forecast=True) or state
+
+    def _sees_all_of(self, state: RcmState) -> bool:
+        """Whether the RCs and the holders that the RCM knows are seen here too."""
         rcs = {view.rc for view in state.rcs if view.present}
         clients = {hold.client for hold in state.holds}
+        seen = {f"{token.host}/{token.name}" for token in self.tokens(Role.CLIENT)}
+        return clients <= seen and rcs <= {token.name for token in self.tokens(Role.RC)}
 
-        def complete() -> bool:
-            seen = rcs <= {token.name for token in self.tokens(Role.RC)}
-            seen &= clients <= {f"{token.host}/{token.name}" for token in self.tokens(Role.CLIENT)}
-            if not (seen and loads):
-                return seen
+    def _complete(self, state: RcmState) -> bool:
+        """Whether, besides, all hosts that are there are seen, with their loads."""
+        if not self._sees_all_of(state):
+            return False
+        if self._reported is None:
             # A candidate whose token comes last is not to be shown as missing.
-            return all(host.tokens and (host.load or not host.has(Role.LOAD)) for host in self.all_hosts().values())
+            hosts, there = self.all_hosts(), True
+        else:
+            hosts, there = self.hosts, self._reported.keys() <= self.hosts.keys()
+        return there and all(host.tokens and (host.load or not host.has(Role.LOAD)) for host in hosts.values())
 
-        await common.until(complete, self.changed, FIND_LOADS)
-        self._settled = loads
-        if not loads:
-            return state
-        # Without an answer the cordons stay as they were.
+    async def ask_loads(self) -> None:
+        """Takes from the balancer what it knows of all hosts; one of a former version tells nothing."""
+        key, asked = self.mesh.keys.rank, RankAsk(at_most=MAX_RANKED, reports=True)
+        reply = await self.mesh.ask_one(key, asked, HostRanking, timeout=ASK_BALANCER)
+        if reply is None or reply.message is None or reply.message.reports is None:
+            return
+        now = self.mesh.now()
+        told = {one.report.host: (now - round(one.age * SECOND), one.report) for one in reply.message.reports}
+        self._reported = told
+        for name, host in self.hosts.items():
+            if host.load is None and name in told:
+                host.reported, host.load = told[name]
+        self.changed.set()
+
+    async def _ask_cordons(self) -> None:
+        # Without an answer they stay as they were.
         with suppress(TimeoutError, RequestRefused):
             async with asyncio.timeout(ASK_PLACER):
                 await self.placer.try_refresh()
-        return await self.client.state(forecast=True) or state
 
 
 async def see_hosts(client: Client) -> None:
@@ -175,5 +215,6 @@ class Devices:
     def _on_state(self, key: str, state: RcState) -> None:
         with suppress(BadName):
             named = any(token.name == state.rc for token in self._fleet_view.tokens(Role.RC))
-            if named and key == self._mesh.keys.rc_state(state.rc):
+            # One that stands by says nothing of the device.
+            if named and not state.duplicate_of and key == self._mesh.keys.rc_state(state.rc):
                 self._states[state.rc] = state

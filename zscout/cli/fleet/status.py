@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import Any, Final
@@ -11,12 +11,15 @@ from typing import Any, Final
 import click
 from msgspec import structs
 
-from zscout.cli import common
+from zscout.cli import common, completion
+from zscout.cli.device_words import remarks
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
+from zscout.cli.fleet.selection import Selection
 from zscout.cli.fleet.watching import Overview, show
+from zscout.cli.requests.waiting import reason_text, whose
 from zscout.keyexpr import Role
-from zscout.messages import Notice, RcmState, RcView
-from zscout.terminal import Table, many, span
+from zscout.messages import HoldView, Notice, RcmState, RcView, WaitView
+from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, Ns
 
 MAX_NAMED: Final = 8
@@ -25,34 +28,44 @@ MAX_FIGURES_SHOWN: Final = 12
 
 
 @click.command()
-@click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
+@click.argument("names", nargs=-1, metavar="[NAME...]", shell_complete=completion.shown)
+@click.option("--watch", is_flag=True, help="Go on showing it: the arrows scroll, q or Ctrl-C ends.")
 @click.option("--devices", "every", is_flag=True, help="Show the figures of all devices: rates, drops, latency.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
 @common.runs
-async def status(watch: bool, every: bool, as_json: bool) -> None:
+async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) -> None:
     """Show the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
+
+    A NAME is that of an RC, an ARC (or its id) or a host, or a pattern: 'robot/*'. With some, only these are shown, and
+    what has to do with them: an RC with who holds it and who waits for it, an ARC with its RCs and their holders, a
+    host with its RCs and programs. Exit code 1: nothing has one of these names.
 
     The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
     where they are not there; other hosts that died only with --watch. A device that says that something is wrong with
-    it is shown with its words, and counts as lost until it is well. --watch refreshes once a second; in a pipe it
-    prints a new block when something else than a load, a time or a figure has changed. Exit code 3: no RCM.
+    it is shown with its words, and counts as lost until it is well; one that was seen within a day, or that the fleet
+    file expects, with why it is gone; one that several hosts offer, with those that stand by. --watch refreshes once a
+    second; in a pipe it prints a new block when something else than a load, a time or a figure has changed. Exit code
+    3: no RCM.
 
     \b
     Examples:
       zscout status
       zscout status --json | jq -r '.queue[] | .arc + ": " + .reason'
       zscout status --devices --watch
+      zscout status 'framegrabber/*' anvil
     """
     async with AsyncExitStack() as stack:
         client = await stack.enter_async_context(common.connected("status", need_rcm=False))
         fleet_view = stack.enter_context(FleetView(client))
-        standing = Standing(fleet_view, None, Devices(fleet_view), every)
+        standing = Standing(fleet_view, None, Devices(fleet_view), every, names)
         nobody: common.NobodyThere | None = None
         try:
             standing.state = await fleet_view.settled()
         except common.NobodyThere as error:  # hosts and RCs are shown all the same
             nobody = error
         await standing.devices.ask()
+        if nobody is None and not watch and (missing := standing.selection().missing()):
+            raise missing
         # Whatever becomes of an ARC is published to its client.
         news = asyncio.Event()
         client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
@@ -63,12 +76,18 @@ async def status(watch: bool, every: bool, as_json: bool) -> None:
 
 @dataclass(slots=True)
 class Standing:
-    """How the fleet stands; `state` is None where there is no RCM. `every`: with figures of all devices."""
+    """How the fleet stands; `state` is None where there is no RCM. `every`: with figures of all devices. `names`: only
+    these, where there are some."""
 
     fleet_view: FleetView
     state: RcmState | None
     devices: Devices
     every: bool
+    names: Sequence[str] = ()
+
+    def selection(self) -> Selection:
+        """Of what is there now, what is to be shown."""
+        return Selection(self.names, self.state, self._homes(), self.fleet_view.all_hosts())
 
     async def refresh(self) -> None:
         self.state = await self.fleet_view.client.state(forecast=True)
@@ -79,14 +98,19 @@ class Standing:
         fleet, links = self.fleet_view.client.fleet.name, many(self.fleet_view.mesh.links(), "link")
         headline = f"Fleet {fleet}: nobody leads; nothing is granted until a node does ({links})"
         tables: list[Table] = []
-        if self.state is not None:
+        chosen = self.selection()
+        if self.state is not None and chosen.state is not None:
             leader, term = self.state.host, self.state.term.counter
             headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
-            tables = [self._rcs(self.state), self._running(self.state), _waiting(self.state)]
-        return Overview(headline, [*tables, self._hosts(), self._devices()], alarm=self.state is None)
+            ranks = {f"{wait.client}/{wait.id}": number for number, wait in enumerate(self.state.queue, 1)}
+            tables = [self._rcs(chosen.state), self._running(chosen.state), _waiting(chosen.state, ranks)]
+        return Overview(headline, [*tables, self._hosts(chosen), self._devices(chosen)], alarm=self.state is None)
 
     def _homes(self) -> dict[str, str]:
-        return {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
+        """By RC: the host of the instance that is meant; of an RCM that does not say, one that offers it."""
+        offered = {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
+        views = self.state.rcs if self.state is not None else []
+        return offered | {view.rc: view.host for view in views if view.host}
 
     def _rcs(self, state: RcmState) -> Table:
         homes = self._homes()
@@ -97,7 +121,7 @@ class Standing:
             there = "held" if holders else "free"
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
-            names = ", ".join(common.with_amounts(hold.arc, hold.needs[view.rc]) for hold in holders)
+            names = ", ".join(common.with_amounts(whose(hold), hold.needs[view.rc]) for hold in holders)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
             styles.append({"absent": "red", "lost": "red", "held": "yellow", "free": "green"}[words])
         return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles)
@@ -105,18 +129,20 @@ class Standing:
     def _running(self, state: RcmState) -> Table:
         rows, styles = [], []
         for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
-            left = span(hold.remaining) if hold.remaining > 0 else "over"
-            left = f"{left}, keeps" if hold.keep else left
+            since = f"{clock(-hold.held)} ({span(hold.held)})"
+            until = f"{clock(hold.remaining, at_latest=True)} ({span(hold.remaining)})"
+            if hold.keep:
+                until = f"{until}, keeps" if hold.remaining > 0 else "kept"
             rcs = " ".join(sorted(hold.needs))
-            rows.append((hold.arc, str(hold.priority), span(hold.held), left, hold.client, rcs))
+            rows.append((hold.arc, _who(hold), str(hold.priority), since, until, rcs, hold.client))
             operator = hold.priority >= self.fleet_view.client.fleet.operator_priority
             styles.append("bold red" if operator else "")
-        columns = ("ARC", "PRIORITY", "SINCE", "LEFT", "CLIENT", "RCS")
+        columns = ("ARC", "WHO", "PRIORITY", "SINCE", "UNTIL", "RCS", "CLIENT")
         return Table("Running", columns, rows, styles, {"CLIENT"})
 
-    def _hosts(self) -> Table:
+    def _hosts(self, chosen: Selection) -> Table:
         rows, styles = [], []
-        for name, host in self.fleet_view.all_hosts().items():
+        for name, host in chosen.hosts.items():
             words, style = self._condition(name, host)
             load, cpu, memory = "-", "-", "-"
             if (report := host.load) is not None:
@@ -129,7 +155,8 @@ class Standing:
 
     def _condition(self, name: str, host: Host) -> tuple[str, str]:
         if host.gone is not None:
-            return f"gone for {span((self.fleet_view.mesh.now() - host.gone) / SECOND)}", "red"
+            gone = (self.fleet_view.mesh.now() - host.gone) / SECOND
+            return f"gone since {clock(-gone)} ({span(gone)})", "red"
         if not host.tokens:
             return "not there", "red"
         if self.fleet_view.stale(host):
@@ -137,17 +164,25 @@ class Standing:
         words, style = ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
         return (f"{words}, cordoned", "yellow") if name in self.fleet_view.placer.cordoned else (words, style)
 
-    def _devices(self) -> Table:
-        """Those that are not well; with `every` also those that report figures."""
-        known = self.devices.known().values()
-        shown = [one for one in known if one.health != "ok" or (self.every and one.figures)]
-        rows = [(one.rc, one.health, figures_text(one.figures)) for one in shown]
-        styles = ["" if one.health == "ok" else "red" for one in shown]
+    def _devices(self, chosen: Selection) -> Table:
+        """Those of which there is something to say; with `every` also those that report figures."""
+        known = self.devices.known()
+        said = {view.rc: list(remarks(view)) for view in (self.state.rcs if self.state is not None else ())}
+        rows, styles = [], []
+        for rc in filter(chosen.shows, sorted(known.keys() | said.keys())):
+            device, words = known.get(rc), said.get(rc, [])
+            figures = device.figures if device is not None else {}
+            if device is not None and device.health != "ok":
+                words = [device.health, *(one for one in words if one != device.health)]
+            if words or (self.every and figures):
+                rows.append((rc, "; ".join(words) or "ok", figures_text(figures)))
+                styles.append("red" if words else "")
         return Table("Devices", ("RC", "HEALTH", "FIGURES"), rows, styles)
 
     def as_object(self) -> dict[str, Any]:
         """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
-        state, homes, now = self.state, self._homes(), self.fleet_view.mesh.now()
+        chosen = self.selection()
+        state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
         known = self.devices.known()
 
@@ -156,7 +191,9 @@ class Standing:
             holders = [hold for hold in holds if view.rc in hold.needs]
             return structs.asdict(view) | {
                 "host": homes.get(view.rc),
-                "holders": [{"arc": hold.arc, "id": hold.id, "client": hold.client} for hold in holders],
+                "holders": [
+                    {"arc": hold.arc, "id": hold.id, "client": hold.client, "who": hold.who} for hold in holders
+                ],
                 "health": device.health if device is not None else None,
                 "figures": device.figures if device is not None else {},
                 "capacity": device.capacity if device is not None else {},
@@ -170,7 +207,7 @@ class Standing:
             "holds": list(map(structs.asdict, holds)),
             "queue": list(map(structs.asdict, queue)),
             "more": state.more if state is not None else 0,
-            "hosts": [self._host_object(name, host, now) for name, host in self.fleet_view.all_hosts().items()],
+            "hosts": [self._host_object(name, host, now) for name, host in chosen.hosts.items()],
         }
 
     def _host_object(self, name: str, host: Host, now: Ns) -> dict[str, Any]:
@@ -191,17 +228,24 @@ class Standing:
         }
 
 
-def _waiting(state: RcmState) -> Table:
+def _waiting(state: RcmState, ranks: Mapping[str, int]) -> Table:
     rows = []
-    for number, wait in enumerate(state.queue, 1):
-        starts = "?" if wait.starts_in is None else f"in {span(wait.starts_in)}"
-        spans = (span(wait.waited), span(float(wait.min_runtime)), starts)
+    for wait in state.queue:
+        number = ranks[f"{wait.client}/{wait.id}"]
+        starts = "?" if wait.starts_in is None else f"{clock(wait.starts_in)} (in {span(wait.starts_in)})"
+        spans = (f"{clock(-wait.waited)} ({span(wait.waited)})", span(float(wait.min_runtime)), starts)
+        why = reason_text(wait.reason, wait.why)
         rows.append(
-            (str(number), wait.arc, str(wait.priority), *spans, str(wait.preemptions), wait.client, wait.reason)
+            (str(number), wait.arc, _who(wait), str(wait.priority), *spans, str(wait.preemptions), why, wait.client)
         )
     title = f"Waiting, and {state.more} more" if state.more else "Waiting"
-    columns = ("#", "ARC", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "CLIENT", "WHY")
+    columns = ("#", "ARC", "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", "CLIENT")
     return Table(title, columns, rows, spare={"RUNTIME", "PREEMPTED", "CLIENT"})
+
+
+def _who(view: HoldView | WaitView) -> str:
+    """Whose it is, and what others are to know."""
+    return whose(view) + (f": {view.who.comment}" if view.who is not None and view.who.comment else "")
 
 
 def _doing(host: Host) -> str:

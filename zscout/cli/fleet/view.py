@@ -1,6 +1,7 @@
 """`zscout view`: a recording, or the fleet live, in the Rerun viewer: its own window, or a browser's.
 
-Viewer and recorder are processes beside the command: they end with it, however it ends."""
+Where a node of this host records, what it records is shown, its past too; elsewhere a recorder is started. Viewer and
+recorder are processes beside the command: they end with it, however it ends."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
 import click
@@ -27,16 +28,25 @@ from zscout.cli import common
 from zscout.config.node import RecorderConfig
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import valid_name
-from zscout.services.recorder.process import BAD_SETTINGS, RecorderJob, Recording, encode_job
+from zscout.services.recorder.process import BAD_SETTINGS, QUIET, RecorderJob, Recording, encode_job
+
+if TYPE_CHECKING:
+    from zscout.config.fleet import Fleet
+    from zscout.messages import Recorded
 
 WEB_PORT: Final = 9090
 MAGIC: Final = b"RRF"
 """How every recording begins."""
+PAGE: Final = "renderer=webgl&hide_welcome_screen=1&theme=dark"
+"""What the page's address asks for. On the light theme, which a browser may prefer, names are pale on pale."""
 HOSTING: Final = "Hosting a web-viewer at"
 START: Final = 20.0
 """Seconds within which a recorder or a viewer has come up, on a busy machine."""
-GRACE: Final = 15.0
+GRACE: Final = 40.0
 """Seconds for a child to end by itself: the recorder finishes its file."""
+LOOK_FOR_RECORDER: Final = 1.0
+"""Seconds in which a recorder tells where it records."""
+CONNECT: Final = 1.0
 MAX_LINE: Final = 65_536
 KEPT: Final = 20
 """Last lines of a child's log that are kept, to say why it failed."""
@@ -63,21 +73,23 @@ _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("runs"),
-    help="Without FILE: the folder in which the live recording is kept.",
+    help="Where no node of this host records: the folder of the live recording.",
 )
 @common.json_option("Print one JSON object as soon as it is served or recorded: url, live, file.")
 @common.runs
 async def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path, as_json: bool) -> None:
-    """Open the recording FILE (.rrd), or record the fleet and show it live.
+    """Open the recording FILE (.rrd), or show the fleet live.
 
-    The viewer is a window of its own, which ends the command when it is closed. On a host without a display
-    use --web. Ctrl-C ends everything that was started; a live recording is complete then.
+    Where a node of this host records (the table [recorder] in its file), its recording is shown with its past;
+    elsewhere the fleet is recorded from now on. The viewer is a window of its own, which ends the command when it
+    is closed. On a host without a display use --web. Ctrl-C ends everything that was started; a recording that was
+    started here is complete then.
 
     \b
     Examples:
       zscout view
       zscout view --web
-      zscout view runs/lab.rrd
+      zscout view demo.rrd
       zscout view --web --json | jq -r --unbuffered .url
     """
     try:
@@ -90,24 +102,10 @@ async def view(file: Path | None, web: bool, bind: str, port: int | None, out: P
         raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
     # The page comes last, so what it shows needs its own port first.
     async with _source(file, bind, None if web else port, out) as (recording, recorder):
-        shown = recording.url or recording.file
-        if not as_json and recorder is not None:
-            terminal.print_line(f"Recording to {recording.file}")
+        if not as_json and file is None:
+            terminal.print_line(f"{'Recording to' if recorder is not None else 'A node records to'} {recording.file}")
             terminal.print_line(f"Live at {recording.url}")
-        address: str | None = None
-        if web:
-            page = free_port(bind, port) if port is not None else free_port(bind, WEB_PORT, 0)
-            stream = free_port(bind, 0)
-            ports = ("--web-viewer-port", str(page), "--port", str(stream))
-            started = viewer("--serve-web", "--bind", bind, *ports, shown, log="info")
-        else:
-            started = viewer(*WINDOW, *(["--connect"] if file is None else []), shown)
-        async with started as window:
-            if web:
-                await window.says(HOSTING)
-                source = shown if file is None else f"rerun+http://{_host(bind)}:{stream}/proxy"
-                url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
-                address = f"http://{_host(bind)}:{page}/?url={url}&renderer=webgl&hide_welcome_screen=1"
+        async with open_viewer(recording, web=web, bind=bind, port=port if web else None) as (window, address):
             if as_json:
                 terminal.print_json({"url": address, "live": recording.url, "file": recording.file})
             elif web:
@@ -122,32 +120,87 @@ async def view(file: Path | None, web: bool, bind: str, port: int | None, out: P
 
 
 @asynccontextmanager
+async def open_viewer(
+    recording: Recording, *, web: bool, bind: str = "127.0.0.1", port: int | None = None, stream: int = 0
+) -> AsyncIterator[tuple[Child, str | None]]:
+    """A viewer that has the recording open, live if it has a `url`; and with `web`, once it is served, the address of
+    the page, on this `port` or any. A file is served to the page on the port `stream`, 0 for any. Raises BadInput and
+    Failed where it can't be."""
+    shown = recording.url or recording.file
+    if not web:
+        async with viewer(*WINDOW, *(["--connect"] if recording.url is not None else []), shown) as window:
+            yield window, None
+        return
+    page = free_port(bind, port) if port is not None else free_port(bind, WEB_PORT, 0)
+    stream = free_port(bind, stream)
+    ports = ("--web-viewer-port", str(page), "--port", str(stream))
+    async with viewer("--serve-web", "--bind", bind, *ports, shown, log="info") as window:
+        await window.says(HOSTING)
+        source = recording.url or f"rerun+http://{_host(bind)}:{stream}/proxy"
+        url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
+        yield window, f"http://{_host(bind)}:{page}/?url={url}&{PAGE}"
+
+
+@asynccontextmanager
 async def _source(
     file: Path | None, bind: str, port: int | None, out: Path
 ) -> AsyncIterator[tuple[Recording, Child | None]]:
-    """What the viewer opens, and the recorder behind it where that is a live stream."""
+    """What the viewer opens, and the recorder behind it where one was started."""
     if file is not None:
         yield Recording(str(file), None), None
         return
     fleet = common.the_fleet()
+    joined, alone = await _recorded_here(fleet, bind)
+    if joined is not None:
+        yield joined, None
+        return
     host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
-    job = RecorderJob(RecorderConfig(out, bind, port or 0), fleet, host)
+    job = RecorderJob(RecorderConfig(out, bind, port or 0), fleet, host, joined=False)
     command = [sys.executable, "-m", "zscout.services.recorder"]
-    async with child("the recorder", command, {}, job=encode_job(job)) as recorder:
+    async with child("the recorder", command, QUIET, job=encode_job(job)) as recorder:
         recording = await recorder.recording()
         if recording.url is None:
             raise common.Failed("the recorder serves no live stream; report this as a bug")
-        async with common.beside(_say_if_alone()):
-            yield recording, recorder
+        if alone:
+            terminal.print_line(f"zscout: {alone}", sys.stderr)
+        yield recording, recorder
 
 
-async def _say_if_alone() -> None:
-    """Without an RCM the view is empty: a line tells so, and it may fill later."""
+async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str]:
+    """What a node of this host records of the fleet, where it serves that for pages on `bind`. And a line where there
+    is no RCM: then a view is empty, and may fill later."""
+    from zscout.messages import Recorded, RecordedAsk
+
+    async with common.connected("view", fleet, need_rcm=False) as client:
+        alone = ""
+        try:
+            await common.see_rcm(client)
+        except common.NobodyThere as error:
+            alone = str(error)
+        mesh = client.mesh
+        replies = await mesh.ask(mesh.keys.recorded_any, RecordedAsk(), Recorded, timeout=LOOK_FOR_RECORDER)
+    for reply in replies:
+        if reply.message is not None and (recording := await _reached(reply.message, bind)) is not None:
+            return recording, ""
+    return None, alone
+
+
+async def _reached(recorded: Recorded, bind: str) -> Recording | None:
+    """The recording, if it is one of this host: then it is the same file, and its live view answers. `bind` is where
+    the page is served: whoever opens that must reach the live view as well."""
     try:
-        async with common.connected("view"):
-            pass
-    except common.NobodyThere as error:
-        terminal.print_line(f"zscout: {error}", sys.stderr)
+        served = ipaddress.ip_address(recorded.bind)
+        if (await asyncio.to_thread(os.stat, recorded.file)).st_ino != recorded.inode:
+            return None
+        if not (served.is_unspecified or str(served) == bind or ipaddress.ip_address(bind).is_loopback):
+            return None
+        address = bind if served.is_unspecified else str(served)
+        async with asyncio.timeout(CONNECT):
+            _, writer = await asyncio.open_connection(address, recorded.port)
+    except (OSError, ValueError):
+        return None
+    writer.close()
+    return Recording(recorded.file, f"rerun+http://{_bracketed(address)}:{recorded.port}/proxy")
 
 
 def _checked(file: Path) -> Path:
@@ -282,7 +335,6 @@ async def child(
     process = await asyncio.create_subprocess_exec(
         *LAUNCH,
         str(os.getpid()),
-        "-1",
         *command,
         stdin=pipe if job is not None else asyncio.subprocess.DEVNULL,
         stdout=pipe if job is not None else asyncio.subprocess.DEVNULL,

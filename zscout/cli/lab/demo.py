@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Coroutine
+from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+from urllib.parse import urlsplit
 
 import click
 
+from zscout import terminal
 from zscout.cli import common
 from zscout.cli.lab.options import DefaultGroup
 from zscout.cli.lab.simulate import BUILDING, buildings
 from zscout.config.strict import BadInput
 from zscout.types import POLICIES, Policy
+
+if TYPE_CHECKING:
+    from zscout.cli.fleet.view import Child
+    from zscout.lab.demo.screen import LiveView
 
 SCENARIOS: Final = ("at-once", "staggered")
 
@@ -26,9 +34,62 @@ def demo() -> None:
     \b
     Examples:
       zscout demo
+      zscout demo --web
       zscout demo table1 --out demo.rrd
       zscout demo placement
     """
+
+
+class _Live:
+    """The Rerun viewer beside a demo: a window, or the server of a page for a browser. The page has one address for the
+    demo and its recording."""
+
+    def __init__(self, stack: AsyncExitStack, *, web: bool) -> None:
+        self._stack, self._web = stack, web
+        self._port = self._stream = 0
+        self._window: Child | None = None
+
+    async def open(self, url: str) -> str:
+        from zscout.cli.fleet.view import WEB_PORT, free_port, open_viewer
+        from zscout.services.recorder.process import Recording
+
+        self._stream = urlsplit(url).port or 0
+        self._port = free_port("127.0.0.1", WEB_PORT, 0)
+        shown = open_viewer(Recording("", url), web=self._web, port=self._port)
+        self._window, address = await self._stack.enter_async_context(shown)
+        return f"Live: open {address}" if address is not None else "Live in the viewer's window"
+
+    async def finished(self, recording: Path) -> None:
+        from zscout.cli.fleet.view import open_viewer
+        from zscout.services.recorder.process import Recording
+
+        if self._web:
+            await self._stack.aclose()
+            shown = open_viewer(Recording(str(recording), None), web=True, port=self._port, stream=self._stream)
+            self._window, address = await self._stack.enter_async_context(shown)
+            terminal.print_line(f"The page stays at {address}; Ctrl-C ends", sys.stderr)
+        if self._window is not None:
+            await self._window.process.wait()
+
+
+def live_options(command: F) -> F:
+    """`--web` and `--view`."""
+    command = click.option("--view", is_flag=True, help="Show it live in the Rerun viewer's window.")(command)
+    return click.option("--web", is_flag=True, help="Show it live in a browser: prints the address to open.")(command)
+
+
+async def _played(web: bool, view: bool, play: Callable[[LiveView | None], Coroutine[Any, Any, int]]) -> int:
+    async with AsyncExitStack() as stack:
+        return await play(_Live(stack, web=web) if web or view else None)
+
+
+def _check_live(web: bool, view: bool) -> None:
+    from zscout.cli.fleet.view import has_display
+
+    if web and view:
+        raise BadInput("--web and --view: one of them shows it; leave one out")
+    if view and not has_display():
+        raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
 
 
 def recording_option(command: F) -> F:
@@ -55,8 +116,9 @@ def recording_option(command: F) -> F:
     help="How many of the building's seconds pass in one of ours.",
 )
 @recording_option
+@live_options
 @common.json_option("Print the summary as one JSON object.")
-def robots(building: str, seed: int, speed: float, out: Path | None, as_json: bool) -> int:
+def robots(building: str, seed: int, speed: float, out: Path | None, web: bool, view: bool, as_json: bool) -> int:
     """Hide the robots of a building in the dark, and have them watch.
 
     There are four of them, two framegrabbers and one radio. It serves a simulated building, starts three
@@ -70,19 +132,22 @@ def robots(building: str, seed: int, speed: float, out: Path | None, as_json: bo
     \b
     Examples:
       zscout demo robots
+      zscout demo robots --web
       zscout demo robots --building office --speed 1 --out office.rrd
     """
     common.check_recording("--out", out)
+    _check_live(web, view)
     # Zenoh is loaded here: the help needs none of it.
     from zscout.lab.demo.robots_screen import play
 
-    return common.run(play(building, seed, speed, out, as_json=as_json))
+    return common.run(_played(web, view, lambda live: play(building, seed, speed, out, as_json=as_json, live=live)))
 
 
 @demo.command()
 @recording_option
+@live_options
 @common.json_option("Print the tables as JSON.")
-def table1(out: Path | None, as_json: bool) -> int:
+def table1(out: Path | None, web: bool, view: bool, as_json: bool) -> int:
     """Play Table 1 of the paper on a live mesh, and compare what happens with Table 2.
 
     It starts three nodes with four devices and five programs on this machine, apart from every other fleet,
@@ -95,9 +160,10 @@ def table1(out: Path | None, as_json: bool) -> int:
       zscout demo table1 --out demo.rrd --json
     """
     common.check_recording("--out", out)
+    _check_live(web, view)
     from zscout.lab.demo.table1_screen import play
 
-    return common.run(play(out, as_json=as_json))
+    return common.run(_played(web, view, lambda live: play(out, as_json=as_json, live=live)))
 
 
 @demo.command()

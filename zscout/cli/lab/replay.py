@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from pathlib import Path
 
 import click
@@ -20,7 +21,8 @@ from zscout.scheduling.strategies import STRATEGIES
 def replay(file: Path, strategy: StrategyName, as_json: bool, rrd: Path | None) -> None:
     """Show who would hold what, and when, if the requests in FILE came.
 
-    FILE is a workload: RCs, and ARCs with the time at which they ask (TOML). No mesh is needed, and no time
+    FILE is a workload: RCs, and ARCs with the time at which they ask (TOML). table1.toml, the paper's, comes with
+    zscout: where there is no other file of that name it is taken. No mesh is needed, and no time
     passes. Without --json, a table with a row for each RC (a sharable one has a row for each holder) and a
     column for each second, or for each interval between two events where a second is not the right step.
 
@@ -33,4 +35,13 @@ def replay(file: Path, strategy: StrategyName, as_json: bool, rrd: Path | None) 
     check_rrd(rrd, writable=False)
     from zscout.lab.plots.replay_report import replay_file
 
-    replay_file(file, strategy, rrd, as_json=as_json)
+    replay_file(_found(file), strategy, rrd, as_json=as_json)
+
+
+def _found(file: Path) -> Path:
+    """The file, or the one of this name that comes with zscout."""
+    if file.parent == Path() and not file.exists():
+        bundled = Path(str(files("zscout.lab") / "paper" / file.name))
+        if bundled.suffix == ".toml" and bundled.exists():
+            return bundled
+    return file

@@ -10,12 +10,12 @@ import click
 from click.shell_completion import CompletionItem
 
 from zscout.cli import common
+from zscout.cli.requests.options import SECONDS
 from zscout.config.strict import BadInput, quoted
 from zscout.lab.building.plan_file import MAX_SEED, RANDOM, known_buildings, plan_named, shipped_plans
 
 BUILDING: Final = common.Parsed("building", lambda text, _: text)
 MAX_FRAMEGRABBERS: Final = 16
-MAX_SECONDS: Final = 1e9
 _ADDRESS: Final = re.compile(r"(?:(?P<host>\[[0-9a-fA-F:.]+\]|[^:\[\]]+):)?(?P<port>[0-9]{1,5})")
 
 
@@ -86,13 +86,7 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     "--framegrabbers", type=click.IntRange(1, MAX_FRAMEGRABBERS), default=2, help="How many the node file has."
 )
 @click.option("--mesh", is_flag=True, help="Show recorders and operators on the mesh who is where.")
-@click.option(
-    "--for",
-    "seconds",
-    metavar="SECONDS",
-    type=click.FloatRange(0, MAX_SECONDS, min_open=True),
-    help="End after so many seconds of the building. Default: at Ctrl-C.",
-)
+@click.option("--for", "seconds", type=SECONDS, help="End after so long in the building: 90s, 5m. Default: at Ctrl-C.")
 @common.json_option("Print how to reach everything as one JSON object.")
 def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **options: Any) -> None:
     """Serves a simulated building: a radio on a serial port, cameras as MJPEG over HTTP, in real time.

@@ -22,6 +22,7 @@ from zscout.cli.lab.options import (
     seed_option,
     seeds_option,
 )
+from zscout.cli.requests.options import seconds_within
 from zscout.config.strict import BadInput, quoted
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.trial import STRATEGIES, SchedulingJob, run_timed
@@ -167,7 +168,9 @@ def placement(seeds: range, as_json: bool, rrd: Path | None) -> None:
     help="One that is shipped, `drawn` (another one for each seed), or a TOML file; repeat it for several. "
     "Default: all shipped, and drawn.",
 )
-@click.option("--seconds", type=click.FloatRange(1, 3_600), default=180.0, help="Of the building, that each run takes.")
+@click.option(
+    "--seconds", type=seconds_within(1, 3_600), default="180", help="Of the building, that each run takes: 90s, 5m."
+)
 @click.option(
     "--starts",
     type=click.IntRange(1, MAX_SEEDS),

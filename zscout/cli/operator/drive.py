@@ -18,6 +18,7 @@ from zscout import terminal
 from zscout.cli import common, completion
 from zscout.cli.requests.options import parse_rc
 from zscout.config.strict import BadInput, quoted
+from zscout.scheduling.reason import waits
 from zscout.types import SECOND
 
 if TYPE_CHECKING:
@@ -205,7 +206,7 @@ class _Console(terminal.LiveLine):
             rcs = ", ".join(teleop.held.rcs if teleop.held else [])
             self.event("taken", f"{self._robot} is yours: {rcs}")
         elif teleop.state == "waiting":
-            self.event("waiting", f"{self._robot} waits: {teleop.why}", why=teleop.why)
+            self.event("waiting", f"{self._robot} {waits(teleop.why)}", why=teleop.why)
         elif before is not None:
             self.event("free", f"{self._robot} is given back")
 
@@ -225,8 +226,9 @@ class _Console(terminal.LiveLine):
         pictures = sum(now - at < SECOND for at in self._pictures)
         wheels = teleop.pilot.wheels(now / SECOND)
         colour = {"driving": "bold green", "waiting": "yellow", "free": "dim"}[teleop.state]
-        line = Text().append(f"{self._robot}  {teleop.state}", style=colour)
-        if teleop.why:
+        state = waits(teleop.why) if teleop.state == "waiting" and teleop.why else teleop.state
+        line = Text().append(f"{self._robot}  {terminal.clean(state)}", style=colour)
+        if teleop.why and teleop.state != "waiting":
             line.append(f": {terminal.clean(teleop.why)}")
         if teleop.robot is not None:
             line.append(f"  wheels {wheels.left:+.1f} {wheels.right:+.1f}  speed {teleop.pilot.speed:.1f}")

@@ -16,7 +16,7 @@ from zscout.behaviors.perception.motion import Box
 from zscout.keyexpr import new_instance
 from zscout.services.recorder.blueprint import APPLICATION, page
 from zscout.services.recorder.colours import OPERATOR, OTHER
-from zscout.services.recorder.drawing import Drawing, clean_text
+from zscout.services.recorder.drawing import Drawing, clean_text, disconnect
 from zscout.services.recorder.timeline import TimelineError
 
 MEMORY: Final = "100MB"
@@ -44,7 +44,8 @@ class PictureRecording(Drawing):
         shares: Sequence[int] = (5, 1),
     ) -> None:
         """`port` must be free. Raises TimelineError where `file` can't be written."""
-        super().__init__(rr.RecordingStream(APPLICATION, recording_id=f"{command}-{new_instance()}"))
+        self._recording = rr.RecordingStream(APPLICATION, recording_id=f"{command}-{new_instance()}")
+        super().__init__(self._recording)
         self.url = f"rerun+http://127.0.0.1:{port}/proxy" if port is not None else ""
         """Where a viewer finds it, if it is served."""
         layout = page(
@@ -63,7 +64,7 @@ class PictureRecording(Drawing):
             if file is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 sinks.append(rr.FileSink(file))
-            self.recording.set_sinks(*sinks, default_blueprint=layout)
+            self._recording.set_sinks(*sinks, default_blueprint=layout)
         except (OSError, RuntimeError, ValueError) as error:
             raise TimelineError(f"can't record to {file} ({error}); name a file that can be written") from error
 
@@ -78,9 +79,9 @@ class PictureRecording(Drawing):
 
     def __exit__(self, *_: object) -> None:
         if self.url:
-            self.disconnect(DISCONNECT_SECONDS)
+            disconnect(self._recording, DISCONNECT_SECONDS)
         else:
-            self.recording.disconnect()
+            self._recording.disconnect()
 
 
 class WatchRecording(PictureRecording):

@@ -12,8 +12,15 @@ import click
 
 from zscout.behaviors.client.client import Client
 from zscout.cli import common
-from zscout.cli.common import Failed
-from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
+from zscout.cli.common import Failed, Parsed
+from zscout.cli.requests.options import (
+    DEFAULT_NAMES,
+    CommandAfterDashes,
+    HoldOptions,
+    gather,
+    hold_options,
+    parse_comment,
+)
 from zscout.cli.requests.request import carry_out
 from zscout.cli.requests.waiting import contention_of, hold_json, hold_text
 from zscout.messages import HoldView, RcmState
@@ -24,25 +31,31 @@ MAX_ANSWER = 4_096
 
 @click.command(cls=CommandAfterDashes)
 @click.option("-y", "--yes", is_flag=True, help="Don't ask.")
-@click.option("--no-keep", is_flag=True, help="Give back when the minimum runtime is over.")
+@click.option("--no-keep", is_flag=True, hidden=True, help="--min-runtime is what --release-after is.")
+@click.option(
+    "--reason", type=Parsed("text", parse_comment), default="", help="Why: shown to whom it preempts, and in status."
+)
 @hold_options
 @common.runs
-async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, **rest: Any) -> int:
+async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: str, comment: str, **rest: Any) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
     Says who will be preempted and asks, on stderr; without a terminal it needs --yes. Then it waits, holds and runs a
     COMMAND as `zscout request` does, with the same exit codes; 1 also where the question was not answered with y. A
-    NEED is written as there.
+    NEED is written as there, and refused for the same reasons (2).
 
     \b
     Examples:
-      zscout take robot/scout33
-      zscout take robot/scout33 radio/rf0:command_rate=5 --yes -- ./drive.py
-      zscout take 'robot/*' 'framegrabber/*' --no-keep --min-runtime 2m
+      zscout take robot/scout33 --reason 'the gripper is stuck'
+      zscout take robot/scout33 radio/rf0:command_rate=5 --yes -- bash
+      zscout take 'robot/*' 'framegrabber/*' --release-after 2m
     """
     priority = common.the_fleet().operator_priority
-    wanted = gather(needs, name, "operator", priority=priority, keep=not no_keep, **rest)
+    terms: dict[str, Any] = {"priority": priority, "keep": not no_keep, "comment": reason or comment}
+    wanted = gather(needs, name, DEFAULT_NAMES[1], **terms, **rest)
     async with common.connected("take") as client:
+        # What can never start is refused before anybody is asked about anything.
+        await client.foresee(wanted.name, wanted.needs, **wanted.terms())
         await _agree(client, wanted, yes=yes)
         return await carry_out(client, wanted)
 
@@ -52,18 +65,26 @@ class TakeoverCost:
     """What taking costs others: holds that end for certain, that may end, and that do not yield. Of `either`,
     by pattern, one must end before it is met."""
 
+    priority: int
+    """At which it is asked for."""
     ends: list[HoldView] = field(default_factory=list)
     may_end: list[HoldView] = field(default_factory=list)
     stays: list[HoldView] = field(default_factory=list)
-    either: dict[str, list[HoldView]] = field(default_factory=dict)
+    either: dict[str, list[tuple[str, HoldView]]] = field(default_factory=dict)
     absent: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
+        def text(hold: HoldView) -> str:
+            return hold_text(hold, self.priority)
+
         return [
-            *(f"preempts {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends),
-            *(f"may preempt {hold_text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end),
-            *(f"waits for {hold_text(hold)}" for hold in self.stays),
-            *(f"waits for {need}: {' or '.join(map(hold_text, some))}" for need, some in self.either.items()),
+            *(f"preempts {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends),
+            *(f"may preempt {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end),
+            *(f"waits for {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.stays),
+            *(
+                f"waits for one of {', '.join(f'{rc} (held by {text(hold)})' for rc, hold in some)}"
+                for some in self.either.values()
+            ),
             *(f"waits for {rc}, which is not on the mesh" for rc in self.absent),
         ]
 
@@ -72,21 +93,21 @@ class TakeoverCost:
             "preempts": list(map(hold_json, self.ends)),
             "may_preempt": list(map(hold_json, self.may_end)),
             "waits_for": list(map(hold_json, self.stays)),
-            "waits_for_one_of": {need: list(map(hold_json, some)) for need, some in self.either.items()},
+            "waits_for_one_of": {need: [hold_json(hold) for _, hold in some] for need, some in self.either.items()},
             "absent": self.absent,
         }
 
 
 def takeover_cost(state: RcmState, wanted: HoldOptions) -> TakeoverCost:
     """What would happen if it were asked for now: as the RCM decides, but for the votes of sharable RCs."""
-    cost = TakeoverCost()
+    cost = TakeoverCost(wanted.priority)
     for need in contention_of(state, wanted.needs):
         if not need.present:
             cost.absent.append(need.need)
         if need.rc is None and need.met:
             continue
         choice = len(need.rcs) > 1
-        keeps: list[HoldView] = []
+        keeps: list[tuple[str, HoldView]] = []
         yields = False
         for rc in need.rcs:
             for hold in rc.holds:
@@ -95,10 +116,10 @@ def takeover_cost(state: RcmState, wanted: HoldOptions) -> TakeoverCost:
                     _add(cost.may_end if rc.sharable or choice else cost.ends, hold)
                     yields = True
                 elif not rc.sharable:
-                    _add(keeps, hold)
+                    keeps.append((rc.rc, hold))
         # With a choice, the RCM takes from the lowest priority that yields.
         if not choice:
-            for hold in keeps:
+            for _, hold in keeps:
                 _add(cost.stays, hold)
         elif keeps and not yields:
             cost.either[need.need] = keeps

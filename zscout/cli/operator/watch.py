@@ -16,6 +16,7 @@ from click.shell_completion import CompletionItem
 
 from zscout import terminal
 from zscout.cli import common
+from zscout.cli.requests.options import SECONDS
 from zscout.config.strict import BadInput
 from zscout.mesh import clock
 from zscout.terminal import LiveLine, many, span
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from zscout.cli.operator.picture_recording import WatchRecording
     from zscout.cli.operator.watch_source import LiveSource, VideoFile
 
-MAX_SECONDS: Final = 1e9
 DRAWN: Final = 0.1
 """Seconds from one live line to the next."""
 
@@ -55,10 +55,7 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
     help="Write pictures, boxes and events as a Rerun recording; look at it with `zscout view FILE`.",
 )
 @click.option(
-    "--limit",
-    metavar="SECONDS",
-    type=click.FloatRange(0, MAX_SECONDS, min_open=True),
-    help="End after so many seconds of the source. Default: at its end, or at Ctrl-C.",
+    "--limit", type=SECONDS, help="End after so long in the source: 90s, 5m. Default: at its end, or at Ctrl-C."
 )
 def watch(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
     """Tell when something moves: one line for each event, as soon as it is over.
@@ -71,7 +68,7 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
 
     \b
     Examples:
-      zscout watch --source garden.avi
+      zscout watch --source /dev/video0
       zscout watch --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
       zscout watch --source /dev/video0 --limit 600 --record garden.rrd
     """

@@ -111,7 +111,7 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
 
 async def _operate(client: Client, target: Target, word: str) -> Notice:
     """Has the RCM end one ARC; asking twice does no harm. Raises Failed, NobodyThere."""
-    operation = (Cancel if word == "cancel" else Release)(id=target.id, client=target.client)
+    operation = (Cancel if word == "cancel" else Release)(id=target.id, client=target.client, who=client.who)
     key = client.mesh.keys.schedule(client.mesh.me)
     for _ in range(TRIES):
         replies = await client.mesh.ask(

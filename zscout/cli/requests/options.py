@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
@@ -11,44 +12,69 @@ from pathlib import Path
 from typing import Any, Final
 
 import click
+from msgspec.structs import replace
 
 from zscout import messages
+from zscout.behaviors.client.identity import bounded, checked_comment
+from zscout.cli import completion
 from zscout.cli.common import F, Parsed, json_option
 from zscout.cli.requests.run_command import check_command
-from zscout.config.strict import BadInput, quoted
+from zscout.config import strict
+from zscout.config.strict import DURATIONS, BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
-from zscout.messages import MAX_NEEDS, MAX_PARAMS
+from zscout.messages import MAX_NEEDS, MAX_PARAMS, Who
 from zscout.scheduling.model import check_patterns
 
 Needs = dict[str, dict[str, Decimal]]
 
+DEFAULT_NAMES: Final = ("request", "operator")
+"""What ARCs of `zscout request` and `zscout take` are called that run no command."""
 MAX_ARC_NAME: Final = 200
 """Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 _NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
-_UNITS: Final = {"": Decimal(1), "s": Decimal(1), "ms": Decimal("0.001"), "m": Decimal(60), "h": Decimal(3600)}
 
 
 def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
-    """Seconds from `5`, `1.5`, `300ms`, `2m` or `1h`. Raises BadInput."""
-    remedy = "write a number of seconds, or with a unit: 1.5, 300ms, 2m, 1h"
-    number = text.rstrip("hms")
-    unit = text[len(number) :]
-    if _NUMBER.fullmatch(number) is None or unit not in _UNITS:
-        raise BadInput(f"{what}: {quoted(text)} is not a duration; {remedy}")
-    seconds = Decimal(number) * _UNITS[unit]
+    """Seconds from `5`, `1.5`, `300ms`, `90s`, `5m`, `2h` or `1d12h`. Raises BadInput."""
+    seconds = strict.parse_duration(text)
+    if seconds is None:
+        raise BadInput(f"{what}: {quoted(text)} is not a duration; write {DURATIONS}")
     if zero and seconds == 0:
         return seconds
     try:
         messages.duration(seconds, what)
     except ValueError as error:
-        raise BadInput(f"{error}; {remedy}") from None
+        raise BadInput(f"{error}; write {DURATIONS}") from None
     return seconds
 
 
 def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
     """`--timeout`, in seconds."""
-    seconds = Parsed("duration", lambda text, option: float(parse_duration(text, option)))
-    return click.option("--timeout", type=seconds, help=help)
+    return click.option("--timeout", type=SECONDS, help=help)
+
+
+def seconds_within(low: float, high: float) -> Parsed[float]:
+    """An option's duration, in seconds."""
+
+    def parse(text: str, option: str) -> float:
+        seconds = float(parse_duration(text, option))
+        if not low <= seconds <= high:
+            raise BadInput(f"{option}: {seconds:g} s is not from {low:g} to {high:g} s; write {DURATIONS}")
+        return seconds
+
+    return Parsed("duration", parse)
+
+
+SECONDS: Final = Parsed("duration", lambda text, option: float(parse_duration(text, option)))
+"""An option's duration of any length, in seconds."""
+
+
+def parse_comment(text: str, option: str) -> str:
+    """A comment as others are shown it. Raises BadInput."""
+    try:
+        return checked_comment(text)
+    except ValueError as error:
+        raise BadInput(f"{option}: {error}") from None
 
 
 def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
@@ -140,37 +166,68 @@ class HoldOptions:
     name: str
     needs: Needs
     priority: int
-    min_runtime: Decimal
+    min_runtime: Decimal | None
+    """None: the fleet's."""
     keep: bool
     timeout: float | None
-    grace: Decimal
+    grace: Decimal | None
     command: tuple[str, ...]
     again: bool
     as_json: bool
+    comment: str = ""
+    wait_for_device: bool = False
+
+    def asked_by(self, who: Who | None) -> Who:
+        """Who asks, of whom only zscout's own command is known yet: for which command, or under which name."""
+        who = who or Who()
+        own = f"{who.command} --name {self.name}" if self.name not in DEFAULT_NAMES else who.command
+        return replace(who, command=bounded(shlex.join(self.command) if self.command else own))
 
     def terms(self) -> dict[str, Any]:
         """How its needs are to be held."""
-        return {"priority": self.priority, "min_runtime": self.min_runtime, "keep": self.keep}
+        terms = {"priority": self.priority, "min_runtime": self.min_runtime, "keep": self.keep}
+        return terms | {"wait_for_device": self.wait_for_device}
 
 
 def hold_options(command: F) -> F:
     """The NEEDs and the options of all commands that hold something."""
     for option in (
-        click.argument("needs", nargs=-1, required=True, type=Parsed("need", parse_need), metavar="NEED..."),
+        click.argument(
+            "needs",
+            nargs=-1,
+            required=True,
+            type=Parsed("need", parse_need),
+            metavar="NEED...",
+            shell_complete=completion.needs,
+        ),
         json_option("Print JSON lines, one for each event."),
-        click.option("--again", is_flag=True, help="Wait and run the command again after a preemption."),
+        click.option("--wait-for-device", is_flag=True, help="Wait for a device that nobody knows, too."),
+        click.option(
+            "--again", is_flag=True, help="Ask again and run the command again, when it was ended for others."
+        ),
+        click.option(
+            "--release-after",
+            type=Parsed("duration", parse_duration),
+            help="Give back after so long, though nobody waits; instead of --min-runtime.",
+        ),
         click.option(
             "--grace",
             type=Parsed("duration", partial(parse_duration, zero=True)),
-            default="5",
-            help="Between SIGTERM and SIGKILL to the command.",
+            help="Between SIGTERM and SIGKILL to the command: at most, and by default, nine tenths of what its devices "
+            "settle (`settle`, 5 s).",
         ),
         timeout_option("Wait at most so long for a grant, then exit with 1."),
         click.option(
             "--min-runtime",
             type=Parsed("duration", parse_duration),
-            default="60",
-            help="For how long, from the grant: 5, 1.5, 300ms, 2m, 1h.",
+            help="For how long it is yours against all of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
+            "fleet's, 60 s.",
+        ),
+        click.option(
+            "--comment",
+            type=Parsed("text", parse_comment),
+            default="",
+            help="What others are to know: shown in status and to who waits for it.",
         ),
         click.option(
             "--name", help="What the ARC is called. Default: the command's name, else request (take: operator)."
@@ -180,8 +237,14 @@ def hold_options(command: F) -> F:
     return command
 
 
-def gather(needs: Any, name: str | None, default_name: str = "request", **rest: Any) -> HoldOptions:
+def gather(
+    needs: Any, name: str | None, default_name: str = DEFAULT_NAMES[0], *, keep: bool, release_after: Any, **rest: Any
+) -> HoldOptions:
     """Checks what can be checked before anybody is asked. Raises BadInput, BadName, Failed."""
+    if release_after is not None:
+        if rest["min_runtime"] is not None:
+            raise BadInput("--release-after and --min-runtime are two times for one hold; give one of them")
+        keep, rest["min_runtime"] = False, release_after
     command: tuple[str, ...] = click.get_current_context().meta["command"]
     if command:
         check_command(command)
@@ -189,7 +252,7 @@ def gather(needs: Any, name: str | None, default_name: str = "request", **rest: 
     if rest["again"] and not command:
         raise BadInput("--again runs a command again; add one after --")
     return HoldOptions(
-        name=check_name(name or default_name, "--name"), needs=gather_needs(needs), command=command, **rest
+        name=check_name(name or default_name, "--name"), needs=gather_needs(needs), command=command, keep=keep, **rest
     )
 
 
@@ -200,4 +263,4 @@ def arc_named(text: str, _option: str) -> str:
     return text
 
 
-arc_argument = click.argument("arc", type=Parsed("text", arc_named))
+arc_argument = click.argument("arc", type=Parsed("text", arc_named), shell_complete=completion.arcs)

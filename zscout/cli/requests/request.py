@@ -13,24 +13,28 @@ from msgspec.structs import replace
 
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import Client, CommandRefused
+from zscout.behaviors.client.direct import DEFAULT_SETTLE, DirectHold
 from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common
 from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
-from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
+from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, whose
+from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState
-from zscout.terminal import LiveLine, clean, print_json, print_line, span
+from zscout.scheduling.reason import waits
+from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, Ns
 
 TAKEN_AWAY: Final = 75
 """EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""
 TIME_OVER: Final = 124
-"""As `timeout` has it: the command was ended because its time was over."""
+"""As `timeout` has it: the command was ended because its time was over, and with a kept hold somebody waited."""
 MAX_PRIORITY: Final = 1_000_000
 LAST_WORD: Final = 0.5
 """Seconds in which the RCM's word about a hold whose time is over arrives."""
+UNTIL: Final = "until somebody waits for it"
 REFRESH: Final = 1.0
 """Seconds between two looks at who holds what, at least; and where somebody watches, between two pictures."""
 
@@ -39,7 +43,7 @@ REFRESH: Final = 1.0
 @click.option(
     "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Higher ones preempt lower ones."
 )
-@click.option("--keep", is_flag=True, help="Go on past the minimum runtime, until something else needs it.")
+@click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
 @click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
 @hold_options
 @common.runs
@@ -50,9 +54,13 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
     met by any one device whose name matches: 'framegrabber/*' is any framegrabber, 'robot/scout$*' any robot whose name
     begins so; twice the same is two of them. Quote it for the shell.
 
-    With a COMMAND, they are held while it runs, for the minimum runtime at most (--keep: for longer), and given back as
-    soon as it ends. When its time is over or the grant is taken away, the command's process group gets SIGTERM, and
-    SIGKILL after the grace. Without one, they are held until Ctrl-C or until the minimum runtime is over.
+    They are yours for the minimum runtime, in which only a higher priority takes them, and after it until somebody of
+    the same or a higher priority waits for one of them. --release-after gives them back though nobody waits.
+
+    With a COMMAND, they are held while it runs, and given back as soon as nothing of it is left. When its time is over
+    or the grant is taken away, the command and all that it started get SIGTERM, and SIGKILL after the grace; so they do
+    when this program dies or hangs. The next holder waits until nothing is left. --again asks anew then, and runs it
+    again. Without a COMMAND, they are held until Ctrl-C or until their time is over.
 
     \b
     The command finds in its environment:
@@ -67,22 +75,27 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
 
     \b
     Exit code: the command's own (128 + n: ended by signal n), or
-      75   the grant was taken away       124  its time was over
+      75   the grant was taken away before its time
+      124  its time was over: somebody waited after the minimum runtime, or --release-after
       126  it can't be executed           127  there is no such command
       1    not granted; without a command also: taken away    3  no RCM
+      2    it can never start: a device that nobody knows, a parameter that it does not know, or too much of one
 
     With a COMMAND all lines of zscout go to stderr.
 
     \b
     Examples:
-      zscout request robot/scout33 --min-runtime 2m
-      zscout request robot/scout33 radio/rf0:command_rate=5 --keep -- ./survey.py --fast
-      zscout request framegrabber/fgrab1 --timeout 30 --again -- ./record.sh
-      zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- ./stereo.py
+      zscout request robot/scout33 --min-runtime 2h -- sleep 7200
+      zscout request robot/scout33 --release-after 5m
+      zscout request robot/scout33 radio/rf0:command_rate=5 -- sh -c 'echo I hold $ZSCOUT_RCS; sleep 50'
+      zscout request framegrabber/fgrab1 --timeout 30 --again -- sleep 60
+      zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- python3 -i
       zscout request robot/scout33 --json | jq .event
       zscout request robot/scout33 --priority 5 --dry-run
     """
-    wanted = gather(needs, name, priority=priority, keep=keep, **rest)
+    if keep and rest["release_after"] is not None:
+        raise BadInput("--keep and --release-after contradict each other; give one of them")
+    wanted = gather(needs, name, priority=priority, keep=True, **rest)
     async with common.connected("request") as client:
         return await (_foresee(client, wanted) if dry_run else carry_out(client, wanted))
 
@@ -90,12 +103,13 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
 async def carry_out(client: Client, wanted: HoldOptions) -> int:
     """Waits, holds, runs the command, gives back. Returns the exit code. Raises Failed, RequestRefused."""
     stream = sys.stderr if wanted.command else sys.stdout
+    client.who = wanted.asked_by(client.who)
     with Report(wanted.name, client, as_json=wanted.as_json, stream=stream) as report:
         client.watch(report.news)
         arc: OpenArc | None = None
         while True:
             try:
-                arc = await _wait(client, wanted, report, arc)
+                arc = await _wait(client, wanted, report, arc if arc is not None and arc.open else None)
                 code = await _use(client, wanted, report, arc)
             except CommandRefused as refused:
                 # A device did not know of the grant: the client has given it back.
@@ -114,7 +128,14 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
     try:
         async with report.telling(report.follow_wait()), asyncio.timeout(wanted.timeout):
             if arc is None:
-                arc = await client.request(wanted.name, wanted.needs, **wanted.terms(), estimate=True)
+                arc = await client.request(
+                    wanted.name,
+                    wanted.needs,
+                    **wanted.terms(),
+                    comment=wanted.comment,
+                    estimate=True,
+                    direct=bool(wanted.command),
+                )
             grant = await client.granted(arc)
     except (TimeoutError, asyncio.CancelledError) as error:
         why = arc.reason if arc is not None else ""
@@ -139,9 +160,9 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         return await _taken(client, wanted, report, arc)
     held = Held(client, arc, grant)
     rcs, left = _held_text(held), held.remaining
-    length = "until it is needed elsewhere" if arc.keep else f"for {span(left)}"
     details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
-    report.event("granted", f"{arc.name} holds {rcs} {length}", **details, grant=grant, remaining=round(left, 3))
+    details |= {"grant": grant, "remaining": round(left, 3)}
+    report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left)}", **details)
     try:
         code = None
         if wanted.command:
@@ -160,31 +181,72 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     if held.active:
         # By our clock its time is over; the RCM's own word is on its way.
         await common.until(lambda: not held.active, report.changed, LAST_WORD)
-    if held.active or _ending(arc).outcome == "completed":
-        arc.finish("completed", "its time is over", client.mesh.now())
-        report.event("ended", f"the time of {arc.name} is over", outcome="completed")
+    ending = _ending(arc)
+    if held.active or ending.outcome == "completed":
+        why = ending.reason if arc.keep else "its time is over"
+        ended_by_hand = arc.why is not None and arc.why.code == "released"
+        again = wanted.again and arc.keep and not ended_by_hand
+        line = f"the time of {arc.name} is over" + (f": {why}" if arc.keep else "")
+        details = {"outcome": "completed", "reason": why, "by": ending.by, "again": again}
+        arc.finish("completed", why, client.mesh.now())
+        report.event("ended", f"{line}; asking anew" if again else line, **details)
+        if again:
+            return None
         return TIME_OVER if wanted.command else 0
     return await _taken(client, wanted, report, arc)
 
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
     """Runs the command until it ends (its code), or until the hold is over and it has been ended (None)."""
-    async with RunningCommand(wanted.command, environment(held, client), float(wanted.grace)) as command:
-        _, ended = await common.first_of(held.over(), command.wait())
-        if ended:
-            if held.active:
-                # At once: what it left running is ended afterwards, and may take its time.
-                await client.end(held.arc)
-            return await command.wait()
-        why = "its time is over" if held.active else _ending(held.arc).reason or "the grant is gone"
-        report.event("stopping", f"{wanted.command[0]} is stopped: {why}", reason=why)
-        await command.end()
+    direct, program = client.direct_hold(held.grant), wanted.command[0]
+    until = direct.sure_until if direct is not None else None
+    command = RunningCommand(wanted.command, environment(held, client), _grace(wanted, report, direct), until)
+
+    def follow(hold: DirectHold) -> None:
+        command.hold_until(hold.sure_until)
+        if hold.ended_at is not None:
+            command.terminate(hold.ended_at)
+
+    try:
+        async with command:
+            if direct is not None:
+                direct.watch(follow)
+                follow(direct)
+            _, ended = await common.first_of(held.over(), command.wait())
+            if ended and command.why_ended not in ("client", "deadline"):
+                if held.active:
+                    await client.end(held.arc)
+                return await command.wait()
+            why = "its time is over" if held.active else _ending(held.arc).reason or "the grant is gone"
+            report.event("stopping", f"{program} is stopped: {why}", reason=why)
+    finally:
+        if direct is not None and command.gone:
+            direct.returned()
+    if command.why_ended == "deadline" and held.active and not held.completed:
+        # This process stood still then, and has not looked at its hold since.
+        await common.until(lambda: not held.active, report.changed, LAST_WORD)
+        if held.active:
+            await client.end(held.arc)
     return None
+
+
+def _grace(wanted: HoldOptions, report: Report, direct: DirectHold | None) -> float:
+    """Seconds from SIGTERM to SIGKILL: no more than the RCs wait."""
+    most = float((direct.grace if direct is not None else DEFAULT_SETTLE) / SECOND)
+    if wanted.grace is None:
+        return most
+    asked = float(wanted.grace)
+    if asked > most:
+        text = f"--grace {span(asked)} is more than the devices allow: SIGKILL follows {span(most)} after SIGTERM"
+        report.event("grace", text, asked=asked, grace=most)
+    return min(asked, most)
 
 
 async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
     """The grant was taken away. Raises Failed where there is no command and no second try."""
-    ending, again = _ending(arc), wanted.again and arc.open
+    ending = _ending(arc)
+    # What lost an RC after its minimum runtime is not queued again.
+    again = wanted.again and (arc.open or ending.outcome == "lost")
     line = f"{arc.name} lost its grant: {ending.reason or ending.outcome}"
     details = {"outcome": ending.outcome, "reason": ending.reason, "by": ending.by, "again": again}
     if again:
@@ -196,6 +258,11 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
     if wanted.command:
         return TAKEN_AWAY
     raise Failed(f"{line}; ask again, or with a higher priority")
+
+
+def _yours(arc: OpenArc, left: float) -> str:
+    """For how long a hold goes on, of which so many seconds are protected."""
+    return f"yours for {span(left)} (until {clock(left)}), then {UNTIL if arc.keep else 'given back'}"
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
@@ -210,7 +277,7 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
     if foretold is None:
         raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
     if wanted.as_json:
-        found = {name: getattr(foretold, name) for name in ("starts_in", "preempts", "reason")}
+        found = {name: getattr(foretold, name) for name in ("starts_in", "preempts", "victims", "reason", "why")}
         print_json({"arc": wanted.name, **found})
     else:
         for line in _words(foretold):
@@ -219,15 +286,17 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
 
 
 def _words(foretold: Foresight) -> Iterator[str]:
-    if foretold.starts_in is None:
-        yield f"{foretold.arc} would wait, and no start can be foretold: {foretold.reason}"
-    elif foretold.reason:
-        yield f"{foretold.arc} would start in {span(foretold.starts_in)}, if nothing else comes"
-        yield f"until then: {foretold.reason}"
+    reason, start = reason_text(foretold.reason, foretold.why), foretold.starts_in
+    if start is None:
+        yield f"{foretold.arc} would wait, and no start can be foretold: {reason}"
+    elif reason:
+        yield f"{foretold.arc} would start at {clock(start)} (in {span(start)}), if nothing else comes"
+        yield f"until then: {reason}"
     else:
         yield f"{foretold.arc} would start at once"
     if foretold.preempts:
-        yield f"it would preempt {', '.join(foretold.preempts)}"
+        told = [f"{one.arc} of {whose(one)}" for one in foretold.victims]
+        yield f"it would preempt {', '.join(told or foretold.preempts)}"
 
 
 class Report(LiveLine):
@@ -277,6 +346,8 @@ class Report(LiveLine):
             arc = self._arc
             if arc is None:
                 self.draw(f"{self._name}: asking the RCM")
+            elif arc.state == "running" and arc.settling == arc.grant:
+                self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:
                 news = arc.last != self._seen if self.watched else _how(arc) != self._printed
                 if arc.state == "queued" and news:
@@ -291,8 +362,8 @@ class Report(LiveLine):
         while True:
             self.changed.clear()
             left = (arc.end - self._mesh.now()) / SECOND
-            rest = f"held for {span(self._since(arc))}, kept" if arc.keep else f"{span(left)} left"
-            self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}; Ctrl-C gives back")
+            rest = _yours(arc, left) if left > 0 or not arc.keep else f"for {span(self._since(arc))}, {UNTIL}"
+            self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}\n  Ctrl-C gives back")
             await done_within(REFRESH if self.watched else None, self.changed.wait())
 
     def _show_wait(self, arc: OpenArc) -> None:
@@ -301,7 +372,9 @@ class Report(LiveLine):
         if arc.start is not None:
             starts_in = round(max(0, arc.start - now) / SECOND, 3)
         if arc.state == "queued":
-            start = "no start can be foretold" if starts_in is None else f"starts in {span(starts_in)}"
+            start = "no start can be foretold"
+            if starts_in is not None:
+                start = f"starts at {clock(starts_in)} (in {span(starts_in)})"
             if self._state is not None and self._looked is not None:
                 # The state as it is now, if nothing has happened since that look.
                 past = (now - self._looked) / SECOND
@@ -313,17 +386,30 @@ class Report(LiveLine):
         # met by one RC: it is listed once.
         met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
-        holders = [f"{rc.rc}: {'; '.join(map(hold_text, rc.holds))}" for rc in in_way]
-        ahead = f", {arc.ahead} ahead" if arc.ahead else ""
-        waits = f"{arc.name} waits {span(self._since(arc))}{ahead}{f', {start}' if start else ''}: {arc.reason}"
-        self.draw("\n  ".join([waits, *holders]))
+        holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority) for hold in rc.holds)}" for rc in in_way]
+        holders += [f"{rc.rc}: {rc.lost}" for need in needs if need.rc for rc in need.rcs if rc.lost]
+        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc.told) / SECOND))}"
+        ahead = f"{arc.ahead} ahead" if arc.ahead else ""
+        waited = self._since(arc)
+        since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))
+        self.draw("\n  ".join([words, since, *holders]))
         # Without the estimate: it changes all the time.
         if self.watched or self._printed == _how(arc):
             return
         self._printed = _how(arc)
-        text = "; ".join(filter(None, (f"{arc.name} waits{ahead}: {arc.reason}", start, *holders)))
+        text = "; ".join(filter(None, (words, ahead, start, *holders)))
         stand = [need.as_json() for need in needs]
-        self.event("waits", text, id=arc.id, reason=arc.reason, ahead=arc.ahead, starts_in=starts_in, needs=stand)
+        self.event(
+            "waits", text, id=arc.id, reason=arc.reason, why=arc.why, ahead=arc.ahead, starts_in=starts_in, needs=stand
+        )
+
+    def _show_settling(self, arc: OpenArc) -> None:
+        text = f"{arc.name} is granted {_held_text(arc)}, and waits {span(self._since(arc))}: {arc.reason}"
+        self.draw(text)
+        if self._printed != arc.grant:
+            self._printed = arc.grant
+            text = "" if self.watched else f"{arc.name} is granted {_held_text(arc)}, and waits: {arc.reason}"
+            self.event("settling", text, id=arc.id, rcs=arc.rcs, grant=arc.grant, reason=arc.reason)
 
     def _since(self, arc: OpenArc) -> float:
         return (self._mesh.now() - arc.since) / SECOND

@@ -1,4 +1,4 @@
-"""A command that runs under a grant: in a process group of its own, ended as a whole.
+"""A command that runs under a grant: started by its guardian, ended as a whole.
 
 At a terminal it has the foreground, so that Ctrl-C and job control are its own (else Ctrl-C reaches `cli/common.run`,
 which cancels the request); it can't be suspended with Ctrl-Z, as what it holds would stand idle. In a pipeline it gets
@@ -13,6 +13,7 @@ import errno
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import termios
@@ -22,17 +23,19 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
 
-from zscout.behaviors.launch import LAUNCH
-from zscout.cli.common import Failed, fleet_file
+from zscout.behaviors.guardian import GUARD, NOT_EXECUTABLE, NOT_FOUND, ROUND, SLOWEST, be_subreaper, descendants, now
+from zscout.cli.common import Failed, first_of, fleet_file
 from zscout.terminal import print_line
+from zscout.types import SECOND, Ns
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.arc import Held
     from zscout.behaviors.client.client import Client
 
-NOT_EXECUTABLE, NOT_FOUND = 126, 127
 LOOK_AGAIN: Final = 0.3
-"""Seconds between two looks at a terminal, or at a group without its leader: neither reports changes."""
+"""Seconds between two looks at a terminal, which reports no changes."""
+KILLED: Final = -signal.SIGKILL
+CANT_END: Final = "runs as another user and can't be ended: end it by hand"
 
 
 def check_command(command: Sequence[str]) -> None:
@@ -63,33 +66,47 @@ def environment(held: Held, client: Client) -> dict[str, str]:
 
 
 class RunningCommand:
-    """A command from its start to the end of its last process. Use as an async context manager: whatever
-    happens in the body, nothing of it is left afterwards."""
+    """A command from its start to the end of the last process that came of it. Use as an async context manager:
+    whatever happens in the body, nothing of it is left afterwards.
 
-    def __init__(self, command: Sequence[str], env: Mapping[str, str], grace: float) -> None:
+    `grace` in seconds, `until` as `hold_until` has it."""
+
+    def __init__(self, command: Sequence[str], env: Mapping[str, str], grace: float, until: Ns | None = None) -> None:
         self._command, self._env, self._grace = list(command), env, grace
         self._loop = asyncio.get_running_loop()
-        self._ended: asyncio.Future[int] = self._loop.create_future()
+        self._gone: asyncio.Future[None] = self._loop.create_future()
         self._tty = _Terminal()
         self._timer: asyncio.TimerHandle | None = None
-        self._noted = self._gone = self._foreign = False
+        self._channel, self._theirs = socket.socketpair()
+        self._received = b""
+        self._noted = self._told = self._exited = False
+        self._code = KILLED
+        self._stuck = asyncio.Event()
+        self.pid = 0
+        """Of the command, and of its process group."""
+        self.why_ended = ""
+        """Why the guardian ended it: `deadline`, `client`, `signal`; empty: it ended by itself."""
+        if until is not None:
+            self.hold_until(until)
 
     async def __aenter__(self) -> Self:
-        # First the handler, then the child: it may end at once.
-        self._loop.add_signal_handler(signal.SIGCHLD, self._look)
+        # All that comes of the command is ours, should the guardian be killed.
+        be_subreaper()
+        self._channel.setblocking(False)
+        self._loop.add_reader(self._channel, self._receive)
         self._loop.add_signal_handler(signal.SIGTSTP, self._note_suspension)
-        handed = self._tty.fd if self._tty.ours_to_give() else -1
+        theirs, tty = self._theirs.fileno(), self._tty.fd if self._tty.ours_to_give() else -1
         try:
             self._process: subprocess.Popen[Any] = subprocess.Popen(  # noqa: S603, ASYNC220 - returns at once
-                [*LAUNCH, str(os.getpid()), str(handed), *self._command],
+                [*GUARD, str(theirs), str(tty), str(round(self._grace * SECOND)), *self._command],
                 env=dict(self._env),
                 process_group=0,
-                pass_fds=() if handed < 0 else (handed,),
+                pass_fds=(theirs,) if tty < 0 else (theirs, tty),
             )
         except OSError as error:
             self._close()
             raise Failed(f"{self._command[0]} can't be run: {error.strerror}", NOT_EXECUTABLE) from None
-        self._look()
+        self._theirs.close()
         return self
 
     async def __aexit__(self, *exc: object) -> None:
@@ -98,84 +115,125 @@ class RunningCommand:
         finally:
             self._close()
 
-    @property
-    def pid(self) -> int:
-        """Of the command, and of its process group."""
-        return self._process.pid
+    def hold_until(self, at: Ns) -> None:
+        """The command is ended then, by the clock of a fleet's programs, unless a later time is given before."""
+        self._say(f"until {at}")
 
     async def wait(self) -> int:
-        """Waits until the command itself has ended. Its exit code, 128 + n where signal n ended it."""
-        code = await asyncio.shield(self._ended)
-        return code if code >= 0 else 128 - code
+        """Waits until nothing of the command is left: what it left running is ended with it. Its own exit code,
+        128 + n where signal n ended it."""
+        await self._wait_until_gone()
+        return self._code if self._code >= 0 else 128 - self._code
+
+    @property
+    def gone(self) -> bool:
+        """Whether nothing of it is left."""
+        return self._gone.done()
+
+    def terminate(self, at: Ns) -> None:
+        """SIGTERM to all of it; SIGKILL follows a grace after `at`. Once, however often it is called."""
+        if not self._told:
+            self._told = True
+            self._say(f"end {at}")
 
     async def end(self) -> None:
-        """Ends the whole group: SIGTERM, and SIGKILL after the grace or where this is cancelled."""
-        if not self._signal(signal.SIGTERM):
-            return
-        self._signal(signal.SIGCONT)  # a stopped process gets SIGTERM only when it goes on
+        """Ends all of it, and returns when it has ended: SIGTERM, and SIGKILL after the grace or where this is
+        cancelled. What runs as another user and can't be ended is named, and left."""
+        self.terminate(now())
         try:
-            async with asyncio.timeout(self._grace):
-                await asyncio.shield(self._ended)
-                while self._signal(0):  # noqa: ASYNC110 - the end of orphans is reported to init, not to us
-                    await asyncio.sleep(LOOK_AGAIN / 10)
-        except TimeoutError:
-            pass
-        finally:
-            self._signal(signal.SIGKILL)
-        if self._foreign and not self._ended.done():
-            print_line(
-                f"zscout: {self._command[0]} runs as another user now and can't be ended: end it by hand", sys.stderr
-            )
-            return
-        await asyncio.shield(self._ended)
+            await first_of(self._wait_until_gone(), self._stuck.wait())
+        except asyncio.CancelledError:
+            self._say("kill")
+            await first_of(self._wait_until_gone(), self._stuck.wait())
+            raise
+
+    async def _wait_until_gone(self) -> None:
+        await asyncio.shield(self._gone)
 
     def _close(self) -> None:
-        for number in (signal.SIGCHLD, signal.SIGTSTP):
-            self._loop.remove_signal_handler(number)
+        self._loop.remove_reader(self._channel)
+        self._loop.remove_signal_handler(signal.SIGTSTP)
+        self._channel.close()
+        self._theirs.close()
         if self._timer is not None:
             self._timer.cancel()
-        if hasattr(self, "_process"):
-            self._tty.take_back(self.pid, restore=self._process.returncode not in (0, None))
+        if self.pid:
+            self._tty.take_back(self.pid, restore=self._code != 0)
         self._tty.close()
 
-    def _signal(self, number: int) -> bool:
-        """Signals the whole group. False if there is nobody left in it."""
-        if not self._gone:
-            try:
-                os.killpg(self.pid, number)
-            except ProcessLookupError:
-                self._gone = True  # from now on the number may be another's
-            except PermissionError:
-                self._foreign = True
-        return not self._gone
+    # The guardian's words
 
-    def _look(self) -> None:
-        """Something happened to a child: it ended, or was stopped."""
-        if not hasattr(self, "_process") or self._ended.done():
+    def _say(self, words: str) -> None:
+        with contextlib.suppress(OSError):  # it has ended
+            self._channel.send(f"{words}\n".encode())
+
+    def _receive(self) -> None:
+        try:
+            text = self._channel.recv(4096)
+        except BlockingIOError:
             return
-        while True:
-            try:
-                pid, status = os.waitpid(self.pid, os.WNOHANG | os.WUNTRACED)
-            except ChildProcessError:
-                pid, status = self.pid, 0
-            if pid == 0:
-                return
-            if not os.WIFSTOPPED(status):
-                self._process.returncode = os.waitstatus_to_exitcode(status)
-                self._ended.set_result(self._process.returncode)
-                return
-            if os.WSTOPSIG(status) in (signal.SIGTTIN, signal.SIGTTOU):
-                self._want_terminal()
-            elif os.WSTOPSIG(status) == signal.SIGTSTP:
-                self._note_suspension()
-                self._signal(signal.SIGCONT)
+        except OSError:
+            text = b""
+        *lines, self._received = (self._received + text).split(b"\n")
+        for line in lines:
+            self._take(*line.decode().split())
+        if not text:
+            self._loop.remove_reader(self._channel)
+            self._process.wait()
+            if not self._gone.done():
+                self._sweep(ROUND / SECOND)
+
+    def _take(self, word: str, number: str = "0") -> None:
+        match word:
+            case "started":
+                self.pid = int(number)
+            case "stopped":
+                self._stopped(int(number))
+            case "exited":
+                self._code = int(number)
+                self._exited = True
+            case "ending" if not self._exited:
+                self.why_ended = number
+            case "stuck":
+                print_line(f"zscout: process {number} of {self._command[0]} {CANT_END}", sys.stderr)
+                self._stuck.set()
+            case "gone":
+                self._over()
+
+    def _over(self) -> None:
+        if not self._gone.done():
+            self._gone.set_result(None)
+
+    def _sweep(self, pause: float) -> None:
+        """The guardian was killed: what it guarded is, too."""
+        left = descendants(os.getpid())
+        for one in left:
+            with contextlib.suppress(PermissionError):
+                one.signal(signal.SIGKILL)
+        with contextlib.suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+        if left:
+            self._timer = self._loop.call_later(pause, self._sweep, min(2 * pause, SLOWEST / SECOND))
+            return
+        print_line(f"zscout: {self._command[0]} is ended: its guardian was killed", sys.stderr)
+        self._over()
+
+    # The terminal
+
+    def _stopped(self, number: int) -> None:
+        if number in (signal.SIGTTIN, signal.SIGTTOU):
+            self._want_terminal()
+        elif number == signal.SIGTSTP:
+            self._note_suspension()
+            self._say("continue")
 
     def _want_terminal(self) -> None:
         """The command was stopped for want of the terminal: it goes on as soon as it can have it."""
-        if self._ended.done():
+        if self._gone.done():
             return
         if self._tty.give(self.pid):
-            self._signal(signal.SIGCONT)
+            self._say("continue")
         else:
             self._timer = self._loop.call_later(LOOK_AGAIN, self._want_terminal)
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from zscout.cli import common
+from zscout.cli.device_words import absence
 from zscout.keyexpr import is_pattern, matcher
-from zscout.messages import HoldView, RcmState
-from zscout.terminal import clean, span
+from zscout.messages import HoldView, RcmState, ReasonInfo, ReasonParty, WaitView, Who
+from zscout.scheduling.reason import Party, Reason, ReasonCode, named
+from zscout.terminal import clean, clock, span
+from zscout.types import SECOND, Ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +23,8 @@ class RcContention:
     present: bool
     sharable: bool
     holds: list[HoldView]
+    lost: str = ""
+    """Why it is not present, in words, if that is known."""
 
 
 @dataclass(slots=True)
@@ -66,7 +72,9 @@ def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> lis
     def seen(rc: str) -> RcContention:
         view = views.get(rc)
         theirs = [hold for hold in holds if rc in hold.needs]
-        return RcContention(rc, view is not None and view.present, view is not None and view.sharable, theirs)
+        if view is None:
+            return RcContention(rc, False, False, theirs)
+        return RcContention(rc, view.present, view.sharable, theirs, absence(view))
 
     found = []
     for need in sorted(needs):
@@ -81,13 +89,52 @@ def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> lis
     return found
 
 
-def hold_text(hold: HoldView) -> str:
-    """Whose hold it is and since when, in words."""
-    left = "kept" if hold.keep else f"{span(hold.remaining)} left"
-    return clean(f"{hold.arc} (priority {hold.priority}, {hold.client}) for {span(hold.held)}, {left}")
+def whose(view: HoldView | WaitView | ReasonParty) -> str:
+    """Whose ARC that is: `alice@ws1 (survey.py)`."""
+    return clean(named(view.who, view.client, view.arc))
+
+
+def reason_text(reason: str, why: ReasonInfo | None, age: float = 0) -> str:
+    """A reason to wait in words, with times of day by this host's clock; `age` seconds ago it was so."""
+    if why is None or why.code not in (ReasonCode.HELD, ReasonCode.VETOED) or not why.rcs:
+        return reason  # nobody holds it, or an RCM that tells no more
+    parties = [
+        Party(f"{one.client}/{one.id}", one.arc, one.priority, one.who, _ns(one.yields_in, age)) for one in why.by
+    ]
+    words = Reason(
+        ReasonCode(why.code), tuple(why.rcs), tuple(parties), why.detail, why.count, why.pattern, tuple(why.patterns)
+    )
+    return words.text(lambda until: clock(until / SECOND, at_latest=True))
+
+
+def _ns(seconds: float | None, age: float) -> Ns | None:
+    return None if seconds is None else round((seconds - age) * SECOND)
+
+
+def hold_text(hold: HoldView, priority: int) -> str:
+    """Whose hold it is, since and until when, in words, for who asks at this priority."""
+    return hold_words(hold_json(hold), priority)
+
+
+def hold_words(hold: Mapping[str, Any], priority: int) -> str:
+    """The same of what `hold_json` made, with `params` if it has any."""
+    who: Who | None = hold["who"]
+    whose = common.with_amounts(named(who, hold["client"], hold["arc"]), hold.get("params", {}))
+    since = f"since {clock(-hold['held'])} ({span(hold['held'])})"
+    comment = f": {who.comment}" if who is not None and who.comment else ""
+    return clean(f"{whose}, priority {hold['priority']}, {since}, {_until(hold, priority)}{comment}")
+
+
+def _until(hold: Mapping[str, Any], priority: int) -> str:
+    """Until when it is protected against who asks at this priority, or holds at all."""
+    stays, left = hold["keep"] and priority < hold["priority"], hold["remaining"]
+    if left <= 0:
+        return "kept for as long as it wants" if stays else "its minimum runtime is over"
+    end = f"until {clock(left, at_latest=True)} ({span(left)})"
+    return f"{end} at least, and kept for as long as it wants" if stays else f"{end} at the latest"
 
 
 def hold_json(hold: HoldView) -> dict[str, Any]:
     """The same for programs."""
-    said = {name: getattr(hold, name) for name in ("arc", "id", "client", "priority", "keep")}
+    said = {name: getattr(hold, name) for name in ("arc", "id", "client", "who", "priority", "keep")}
     return said | {"held": round(hold.held, 3), "remaining": round(hold.remaining, 3)}

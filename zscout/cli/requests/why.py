@@ -11,8 +11,9 @@ from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.cli import common
 from zscout.cli.requests.options import arc_argument
-from zscout.cli.requests.waiting import NeedContention, contention_of, hold_json
+from zscout.cli.requests.waiting import NeedContention, contention_of, hold_json, hold_words, reason_text
 from zscout.messages import HoldView, RcAsk, RcmState, RcState, WaitView
+from zscout.scheduling.reason import named
 
 MAX_DESCRIBED: Final = 20
 """ARCs of one name."""
@@ -74,13 +75,14 @@ async def _described(client: Client, view: View, state: RcmState) -> dict[str, A
 
 
 async def _health(client: Client, need: NeedContention) -> str | None:
-    """Why an RC that counts as lost does so, in its own words; None where it is well or does not answer."""
+    """Why an RC that counts as lost does so, in its own words, or in the RCM's; None where nobody knows."""
     if need.rc is None or need.present:
         return None
+    lost = need.rcs[0].lost or None
     mesh = client.mesh
     reply = await mesh.ask_one(mesh.keys.rc_state(need.rc), RcAsk(), RcState, timeout=ASK_RC)
     state = None if reply is None else reply.message
-    return None if state is None or state.health == "ok" else state.health
+    return lost if state is None or state.health == "ok" else state.health
 
 
 def _full(view: View) -> str:
@@ -99,38 +101,53 @@ def _print(arc: dict[str, Any]) -> None:
         _print_standing(arc)
         _say("Holds" if arc["state"] == "running" else "Needs", bold=True)
         for need in arc["needs"]:
-            _print_need(need)
+            _print_need(need, arc["priority"])
     _say("Story", bold=True)
-    spans = [f"{terminal.span(line['ago'])} ago" for line in arc["story"]]
+    spans = [f"{terminal.clock(-line['ago'])} ({terminal.span(line['ago'])} ago)" for line in arc["story"]]
     width = max(map(len, spans), default=0)
     for span, line in zip(spans, arc["story"], strict=True):
         _say(f"  {span:>{width}}  {line['text']}")
 
 
 def _print_standing(arc: dict[str, Any]) -> None:
-    who = f"{arc['arc']} (id {arc['id']}, of {arc['client']}, priority {arc['priority']})"
+    whose = named(arc["who"], arc["client"], arc["arc"])
+    comment = f": {arc['who'].comment}" if arc["who"] is not None and arc["who"].comment else ""
+    who = f"{arc['arc']} of {whose}, priority {arc['priority']},"
+    names = f"  id {arc['id']}, client {arc['client']}{comment}"
     runtime = terminal.span(float(arc["min_runtime"]))
     if arc["state"] == "running":
-        _say(f"{who} has run for {terminal.span(arc['held'])}", bold=True, fg="green")
-        left = f"{terminal.span(arc['remaining'])} left" if arc["remaining"] > 0 else "nothing left"
+        _say(f"{who} has run since {_past(arc['held'])}", bold=True, fg="green")
+        _say(names)
+        left = "its minimum runtime is over"
+        if arc["remaining"] > 0:
+            left = f"until {_end(arc['remaining'])}, its minimum runtime of {runtime}"
         after = "; it keeps what it has after that" if arc["keep"] else ""
-        _say(f"  {left} of its minimum runtime of {runtime}{after}")
+        _say(f"  {left}{after}")
         return
-    _say(f"{who} has waited for {terminal.span(arc['waited'])}", bold=True, fg="yellow")
-    _say(f"  {arc['reason']}")
+    _say(f"{who} has waited since {_past(arc['waited'])}", bold=True, fg="yellow")
+    _say(names)
+    _say(f"  {reason_text(arc['reason'], arc['why'])}")
     ahead = arc["ahead"]
     place = "nobody is ahead of it" if not ahead else f"{ahead} {'is' if ahead == 1 else 'are'} ahead of it"
     _say(f"  {place} in the queue of {arc['queued']}; it wants {runtime}")
     start = "no start can be foretold as things stand"
-    if arc.get("starts_in") is not None:
-        start = f"it may start in {terminal.span(arc['starts_in'])}, if nothing else comes"
+    if (starts := arc.get("starts_in")) is not None:
+        start = f"it may start at {terminal.clock(starts)} (in {terminal.span(starts)}), if nothing else comes"
     _say(f"  {start}")
     if arc["preemptions"]:
         times = "once" if arc["preemptions"] == 1 else f"{arc['preemptions']} times"
         _say(f"  it was preempted {times}")
 
 
-def _print_need(need: dict[str, Any]) -> None:
+def _past(ago: float) -> str:
+    return f"{terminal.clock(-ago)} ({terminal.span(ago)})"
+
+
+def _end(left: float) -> str:
+    return f"{terminal.clock(left, at_latest=True)} ({terminal.span(left)})"
+
+
+def _print_need(need: dict[str, Any], priority: int) -> None:
     rc = need["rc"]
     what = need["need"] if rc in (None, need["need"]) else f"{rc} for {need['need']}"
     name = f"  {common.with_amounts(what, need['params'])}"
@@ -141,13 +158,6 @@ def _print_need(need: dict[str, Any]) -> None:
     elif not need["holders"]:
         _say(f"{name}: no other ARC holds it", fg="green")
     for holder in need["holders"] if need["present"] else ():
-        who = common.with_amounts(holder["arc"], holder["params"])
         which = "" if rc is not None else f"{holder['rc']} "
         relation = "shared with" if need["sharable"] else "held by"
-        left = "its minimum runtime is over"
-        if holder["remaining"] > 0:
-            left = f"{terminal.span(holder['remaining'])} left" + (" at least" if holder["keep"] else "")
-        _say(
-            f"{name}: {which}{relation} {who} of {holder['client']}, priority {holder['priority']}, for "
-            f"{terminal.span(holder['held'])}; {left}"
-        )
+        _say(f"{name}: {which}{relation} {hold_words(holder, priority)}")

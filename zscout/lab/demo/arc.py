@@ -10,7 +10,7 @@ import asyncio
 import os
 import sys
 from decimal import Decimal
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import msgspec
 
@@ -46,12 +46,14 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
     from zscout.behaviors.client.client import Client
     from zscout.behaviors.client.request import OpenArc
     from zscout.keyexpr import Role, Token
+    from zscout.messages import Who
 
     def report(what: Milestone, detail: str = "") -> None:
         sys.stdout.write(msgspec.json.encode(ArcReport(spec.arc, what, clock.now(), detail)).decode() + "\n")
         sys.stdout.flush()
 
     async with await Client.connect(spec.arc, host=spec.host) as client:
+        client.who = Who(command=spec.arc)
         missing, complete = {Role.RCM, *spec.needs}, asyncio.Event()
 
         def seen(token: Token, alive: bool) -> None:
@@ -76,7 +78,8 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
 
         client.watch(on_state)
         needs: dict[str, dict[str, Decimal]] = {rc: {} for rc in spec.needs}
-        asking = holds(client, spec.arc, needs, priority=spec.priority, min_runtime=spec.min_runtime)
+        how: dict[str, Any] = {"priority": spec.priority, "min_runtime": spec.min_runtime, "keep": False}
+        asking = holds(client, spec.arc, needs, **how)
         async for attempt in asking:
             async with attempt:
                 report("entered")

@@ -10,7 +10,7 @@ from zscout import terminal
 from zscout.config.strict import BadInput
 from zscout.lab.building.plan_file import plan_named
 from zscout.lab.demo.robots_run import RobotsDemo, RobotsObserved
-from zscout.lab.demo.screen import DemoScreen, how_to_view
+from zscout.lab.demo.screen import DemoScreen, LiveView, how_to_view
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -35,14 +35,16 @@ STYLES: Final = {
 """What a robot does."""
 
 
-async def play(building: str, seed: int, speed: float, out: Path | None, *, as_json: bool) -> int:
+async def play(
+    building: str, seed: int, speed: float, out: Path | None, *, as_json: bool, live: LiveView | None = None
+) -> int:
     """Plays it; returns the exit code. Raises what `RobotsDemo` raises."""
     # Known to be good before anything is started.
     ids = {f"robot/{robot.name}": robot.id for robot in plan_named(building).robots}
     if not ids:
         raise BadInput(f"--building {building}: there is no robot in it; add a [[robot]]")
     began = time.monotonic()
-    screen = DemoScreen(as_json=as_json, decimals=1)
+    screen = DemoScreen(as_json=as_json, decimals=1, live=live)
     screen.print_line(f"{_title(building, speed, len(ids))}; {HARDWARE}; starting")
     demo, path = await screen.play(
         lambda folder: RobotsDemo(folder, building, ids, seed=seed, speed=speed, show=screen.show),
@@ -54,6 +56,7 @@ async def play(building: str, seed: int, speed: float, out: Path | None, *, as_j
         terminal.print_json(demo.seen.summary() | {"recording": str(path), "seconds": round(took, 1)})
     else:
         _report(demo.seen, took, path)
+    await screen.linger(path)
     return 0 if demo.seen.placed_at is not None else 1
 
 

@@ -27,8 +27,10 @@ RECORDINGS: Final = "recordings"
 """The folder of its recording, below the demo's."""
 BUILDING: Final = "building"
 """The process that simulates one, where there is one."""
-GRACE: Final = 12.0
-"""Seconds for the processes to end in order."""
+GRACE: Final = 45.0
+"""Seconds for the processes to end in order, the recording finished."""
+LIVE: Final = 40.0
+"""Seconds within which the recorder has begun."""
 MAX_LINE: Final = 65_536
 SHOWN: Final = 600
 """Characters of a log that explain a failure."""
@@ -55,6 +57,8 @@ class DemoRunner(ABC):
         """Where each host's node listens."""
         self._live = 0
         """The port of the recorder's live view."""
+        self.on_live: Callable[[str], Awaitable[None]] | None = None
+        """Gets the address of the live view before anything is shown."""
 
     @abstractmethod
     async def play(self) -> None:
@@ -114,8 +118,20 @@ class DemoRunner(ABC):
             file = self.folder / f"{host}.toml"
             file.write_text(text + extra.get(host, ""))
             # The launcher has the kernel end the node with this process, however that may end.
-            node = [*LAUNCH[1:], str(os.getpid()), "-1", sys.executable, "-m", "zscout.node", str(file)]
+            node = [*LAUNCH[1:], str(os.getpid()), sys.executable, "-m", "zscout.node", str(file)]
             await self.start(f"node {host}", node)
+        if self.on_live is not None:
+            await self.within(LIVE, self._served(), "the recorder did not begin")
+            await self.on_live(f"rerun+http://127.0.0.1:{self._live}/proxy")
+
+    async def _served(self) -> None:
+        """Returns once the live view answers."""
+        while True:
+            with suppress(OSError):
+                _, writer = await asyncio.open_connection("127.0.0.1", self._live)
+                writer.close()
+                return
+            await asyncio.sleep(0.1)
 
     async def start(self, name: str, arguments: Sequence[str], *, piped: bool = False) -> asyncio.subprocess.Process:
         """Starts a Python process; one that is `piped` talks through pipes, else its output is logged."""

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 from zscout import terminal
 from zscout.lab.demo.runner import RECORDINGS, DemoRunner
@@ -26,11 +26,24 @@ FRAMES: Final = 4
 D = TypeVar("D", bound="DemoRunner")
 
 
+class LiveView(Protocol):
+    """What shows a demo while it runs, and its recording afterwards."""
+
+    async def open(self, url: str) -> str:
+        """Shows the live view that is served there; returns where people see it, in words."""
+
+    async def finished(self, recording: Path) -> None:
+        """Shows the recording in its place; returns once nobody looks any more."""
+
+
 class DemoScreen:
     """Events as lines in a pipe; at a terminal a picture with the latest of them; nothing with `--json`."""
 
-    def __init__(self, *, as_json: bool, decimals: int) -> None:
+    def __init__(self, *, as_json: bool, decimals: int, live: LiveView | None = None) -> None:
         """`decimals` of the events' seconds."""
+        self._live = live
+        self._where = ""
+        self._as_json = as_json
         self._plain = not as_json and not terminal.at_terminal()
         self._drawn = not as_json and not self._plain
         self._decimals = decimals
@@ -50,13 +63,16 @@ class DemoScreen:
         """The latest events, for a picture."""
         from rich.text import Text
 
-        return [Text(line, overflow="ellipsis", no_wrap=True) for line in self._events[-count:]]
+        lines = [Text(line, overflow="ellipsis", no_wrap=True) for line in self._events[-count:]]
+        # An address that is cut off is none.
+        return [*([Text(self._where, overflow="fold")] if self._where else []), *lines]
 
     async def play(self, make: Callable[[Path], D], draw: Callable[[D], Group], out: Path | None) -> tuple[D, Path]:
         """Runs the demo that `make` makes for a temporary folder, and returns it and its recording, which
         stays even where the demo failed. `draw` gives the picture at any moment."""
         with _recording(out) as path, tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
             demo = make(Path(folder))
+            demo.on_live = self._open if self._live is not None else None
             try:
                 # The picture stays until all processes have ended: that takes some seconds.
                 with picture(lambda: draw(demo)) if self._drawn else nullcontext():
@@ -68,6 +84,18 @@ class DemoScreen:
                 raise
             keep_recording(Path(folder), path)
         return demo, path
+
+    async def _open(self, url: str) -> None:
+        assert self._live is not None  # noqa: S101
+        self._where = await self._live.open(url)
+        if self._as_json:
+            terminal.print_line(self._where, sys.stderr)
+        self.print_line(self._where)
+
+    async def linger(self, path: Path) -> None:
+        """With a live view: shows the recording in it until nobody looks any more."""
+        if self._live is not None:
+            await self._live.finished(path)
 
 
 def picture(draw: Callable[[], Group]) -> Live:

@@ -20,6 +20,7 @@ from zscout.lab.demo.tables import Observed
 from zscout.lab.workload import Arrival, Workload
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.messages import Grants, LoadReport, RcmState, StateAsk, decimal_seconds
+from zscout.scheduling.reason import ended, waits
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 START: Final = 30.0
@@ -125,7 +126,7 @@ class Table1Demo(DemoRunner):
                     needs = f"{', '.join(arc.needs)}; priority {arc.priority}"
                     self.event(f"{arc.arc} asks for {needs}", report.at)
                 case "answered" if report.detail:
-                    self.event(f"{arc.arc} waits: {report.detail}", report.at)
+                    self.event(f"{arc.arc} {waits(report.detail)}", report.at)
                 case "entered":
                     self.seen.entered(arc.arc, arc.needs, report.at)
                 case "left":
@@ -141,10 +142,7 @@ class Table1Demo(DemoRunner):
             return
         self._newest = (grants.term, grants.seq)
         for revoked in grants.revoked:
-            # These reasons begin with the outcome.
-            whole = revoked.why is not None and revoked.why.code in ("preempted", "cancelled", "released")
-            why = revoked.reason if whole else ""
-            self.event(f"{revoked.arc} {why or f'{revoked.outcome}: {revoked.reason}'}", at)
+            self.event(f"{revoked.arc} {ended(revoked.outcome, revoked.reason)}", at)
         for holder in (holder for held in grants.rcs.values() for holder in held):
             if holder.grant not in self._shown:
                 self._shown.add(holder.grant)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from zscout import terminal
-from zscout.lab.demo.screen import DemoScreen, how_to_view
+from zscout.lab.demo.screen import DemoScreen, LiveView, how_to_view
 from zscout.lab.demo.table1_run import Table1Demo
 from zscout.lab.demo.tables import Difference, Observed, Paper, Table, differences, paper
 from zscout.mesh import clock
@@ -35,12 +35,12 @@ WIDE: Final = 26
 """Columns left of the first second."""
 
 
-async def play(out: Path | None, *, as_json: bool) -> int:
+async def play(out: Path | None, *, as_json: bool, live: LiveView | None = None) -> int:
     """Plays it; returns the exit code. Raises what `Table1Demo` raises."""
     expected = paper()
     rcs, seconds = list(expected.table), len(next(iter(expected.table.values())))
     began = clock.now()
-    screen = DemoScreen(as_json=as_json, decimals=2)
+    screen = DemoScreen(as_json=as_json, decimals=2, live=live)
     screen.print_line("Table 1 of the paper on three nodes of this machine; starting them")
     demo, path = await screen.play(
         lambda folder: Table1Demo(folder, expected.workload, screen.show),
@@ -69,6 +69,7 @@ async def play(out: Path | None, *, as_json: bool) -> int:
             terminal.print_line(LATE if as_paper else DIFFERENT)
         for words in how_to_view(path):
             terminal.print_line(words)
+    await screen.linger(path)
     return 0 if as_paper else 1
 
 

@@ -108,7 +108,7 @@ class Worker(Component):
         try:
             while self.handed or not deeds.over():
                 deeds.busy[_here()] = {"work"}
-                arc = self.arc = await client.request("work", needs, priority=-1, min_runtime=LONGER)
+                arc = self.arc = await client.request("work", needs, priority=-1, min_runtime=LONGER, keep=False)
                 if self.handed not in ("", arc.id):
                     deeds.broken(f"{_here()} asks anew for what was handed to it as {self.handed}")
                 self.handed = ""

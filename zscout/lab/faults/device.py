@@ -28,6 +28,8 @@ class Device:
     log: Callable[[str], None]
     holders: dict[Grant, tuple[Process, Holder]] = field(default_factory=dict)
     """Who drives it, and in which process the driver is that let them."""
+    programs: dict[Grant, str] = field(default_factory=dict)
+    """Programs that touch it past its driver, by grant: whose they are."""
     newest: tuple[Process, Grant] | None = None
     """Of all commands that it has carried out; and the process that its driver was in. One that starts anew knows of
     none, and obeys the RCM that it finds."""
@@ -41,6 +43,7 @@ class Device:
         if self.capacity is None and self.holders:
             other = next(one for _, one in self.holders.values())
             self.broken(f"two holders of {self.name}: {other.client} and {holder.client}")
+        self._is_alone(holder.grant, holder.client)
         self.holders[holder.grant] = process, holder
         if self.capacity is not None:
             for parameter, most in self.capacity.items():
@@ -66,6 +69,23 @@ class Device:
             self.broken(f"{self.name} obeyed {holder.client}, who does not hold it")
         if holder.grant >= newest:
             self.newest = process, holder.grant
+
+    def touch(self, grant: Grant, client: str) -> None:
+        """A program begins to touch it past its driver."""
+        self.log(f"{self.name} is touched by a program of {client} {number(grant)}")
+        self._is_alone(grant, client)
+        self.programs[grant] = client
+
+    def leave(self, grant: Grant) -> None:
+        """Such a program is gone."""
+        if self.programs.pop(grant, None) is not None:
+            self.log(f"{self.name} is left by a program {number(grant)}")
+
+    def _is_alone(self, grant: Grant, client: str) -> None:
+        if self.capacity is None:
+            for other, of in self.programs.items():
+                if other != grant:
+                    self.broken(f"two programs at {self.name}: that of {of} {number(other)}, and {client}'s")
 
     def _forget_dead(self) -> None:
         # What a driver let in that was killed drives nothing any more: commands went through it.

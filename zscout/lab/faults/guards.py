@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from msgspec.structs import replace
 
 from zscout.behaviors.client import rcm_link
+from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.rcm_link import RcmLink
 from zscout.behaviors.client.request import OpenArc, RequestStore
@@ -28,7 +29,7 @@ from zscout.services.rcm.election import Election
 from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.registry import RequestRegistry
-from zscout.types import NO_TERM, Grant, Ns, Term
+from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 ABSENT: Final = object()
 
@@ -136,6 +137,15 @@ def _alone(rc: str, _states: object) -> set[str]:
     return {rc}
 
 
+_confirmed = HoldTable.confirmed
+_no_deadline: Final = property(lambda self: self._now() + 3600 * SECOND)
+
+
+def _confirmed_once(self: HoldTable, grant: Grant, now: Ns) -> None:
+    if self.held[grant].gone_by is None:
+        _confirmed(self, grant, now)
+
+
 GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
     {
         "promise": Guard("an RC that answered a new leader obeys no older one", {(HoldTable, "promise"): _promise}),
@@ -185,6 +195,13 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
         "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),
+        "settling": Guard("an RC settles before the next holder begins", {(HoldTable, "settles"): _nothing}),
+        "confirmed": Guard("an RC settles from the last confirmation on", {(HoldTable, "confirmed"): _confirmed_once}),
+        "deadline": Guard("a program is gone by its deadline", {(DirectHold, "gone_by"): _no_deadline}),
+        "remembered": Guard(
+            "an RC that starts anew settles where it may have been held directly",
+            {(HoldTable, "settle_at_start"): _nothing},
+        ),
         "withdrawn": Guard(
             "what nobody asks for is given back",
             {(RcmLink, "give_back"): _do_nothing, (Membership, "ask_requests"): _nothing},

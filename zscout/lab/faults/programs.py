@@ -5,14 +5,50 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextvars import Context
 from dataclasses import dataclass
 from typing import Any, Final
 
 from zscout.behaviors.client.arc import Held, Revoked, hold, holds
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.client.direct import DirectHold
 from zscout.keyexpr import RANDOM
+from zscout.lab.faults.device import Device
+from zscout.lab.faults.virtual_time import PROCESS
+from zscout.types import SECOND
 
 LONG: Final = 4
+CLEARS_UP: Final = (0.0, 0.0, 0.2, 1.0, 60.0)
+"""Seconds that a program takes to end when it is told to; the last is killed before."""
+
+
+class Program:
+    """A program that touches devices past their RCs, with a guardian that keeps its deadline. It is a process of its
+    own, which neither stands still nor dies with its client."""
+
+    def __init__(self, devices: Mapping[str, Device], direct: DirectHold, client: str, now: Callable[[], int]) -> None:
+        self._devices = [devices[rc] for rc in direct.rcs]
+        self._grant, self._now = direct.grant, now
+        self._timer: asyncio.TimerHandle | None = None
+        for device in self._devices:
+            device.touch(direct.grant, client)
+        direct.watch(self.keep)
+        self.keep(direct)
+
+    def keep(self, direct: DirectHold) -> None:
+        """Its guardian is given the deadline anew."""
+        if self._timer is not None:
+            self._timer.cancel()
+        left = max(0.0, (direct.gone_by - self._now()) / SECOND)
+        # The guardian is no part of the client's process, and its clock is its own.
+        self._timer = Context().run(asyncio.get_running_loop().call_later, left, self.end)
+
+    def end(self) -> None:
+        """Nothing of it is left."""
+        if self._timer is not None:
+            self._timer.cancel()
+        for device in self._devices:
+            device.leave(self._grant)
 
 
 @dataclass(slots=True)
@@ -25,6 +61,8 @@ class Work:
     counts: Counter[str]
     log: Callable[[str], None]
     broken: Callable[[str], None]
+    touched: Mapping[str, Device] | None = None
+    """By RC: its device, where programs touch it past the RC."""
     over: bool = False
 
     async def run(self, client: Client, arc: str, busy: set[str]) -> None:
@@ -41,23 +79,43 @@ class Work:
                 "min_runtime": round(rng.uniform(0.3, 3) * times, 3),
                 "keep": rng.random() < 0.1,
             }
+            if self.touched is not None:
+                how["direct"] = rng.random() < 0.6
             self.counts["requests"] += 1
             self.log(f"{arc} asks for {' '.join(rcs)} {how}")
             busy.add(arc)
             try:
                 if rng.random() < 0.5:
                     async with hold(client, arc, needs, **how) as held:
-                        await self._body(held, times)
+                        await self._use(client, held, times)
                 else:
                     async for attempt in holds(client, arc, needs, **how):
                         async with attempt as held:
-                            await self._body(held, times)
+                            await self._use(client, held, times)
             except Revoked as revoked:
                 self.counts[f"revoked {revoked.outcome}"] += 1
             except (RequestRefused, CommandRefused) as refused:
                 self.broken(f"{arc} was thrown away: {refused.code}: {refused}")
             busy.discard(arc)
             await asyncio.sleep(rng.uniform(0.05, self.pause))
+
+    async def _use(self, client: Client, held: Held, times: int) -> None:
+        direct = client.direct_hold(held.grant)
+        if direct is None or self.touched is None:
+            await self._body(held, times)
+            return
+        self.counts["programs"] += 1
+        program, process = Program(self.touched, direct, str(client.mesh.me), client.mesh.now), PROCESS.get()
+        try:
+            await self._body(held, times)
+        finally:
+            # One that is killed sees to nothing: its guardian does.
+            if process is not None and not process.dead:
+                try:
+                    await asyncio.sleep(RANDOM.get().choice(CLEARS_UP))
+                finally:
+                    if not process.dead:
+                        program.end()
 
     async def _body(self, held: Held, times: int) -> None:
         rng = RANDOM.get()

@@ -118,6 +118,10 @@ class Promises:
         if what["do"] == "over":
             self._ended_by.setdefault(str(what["term"]), set()).add(what["arc"])
             return
+        if what["do"] == "reopened":
+            # Its time went by while its RCs settled.
+            self._ended_by.get(str(what["term"]), set()).discard(what["arc"])
+            return
         rc, instance, known = what["rc"], what["instance"], (what["term"], what["seq"])
         before = self._heard.get(instance, known)
         if known < before:
@@ -169,7 +173,7 @@ class Promises:
             self._granted[full] = granted, arc.rcs
         self._follow_hand_over(name, arc, held, touched=touched)
         lost = (arc.outcome in LOSSES or granted not in ("", held[0])) and self._stood(*held)
-        if (lost or arc.outcome == "client_lost") and arc.unconfirmed is None and not touched:
+        if (lost or arc.outcome == "client_lost") and arc.unconfirmed is None and arc.unserved is None and not touched:
             how = f"was granted anew {granted}" if granted else arc.outcome
             self._broken(f"{name} {arc.name} {how}, though no fault touched it: {arc.reason}")
         if arc.place is not None:

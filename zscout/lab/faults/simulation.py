@@ -26,6 +26,7 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
 from zscout.config.fleet import default_fleet
 from zscout.config.node import ComponentsConfig
+from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.lab.faults import plan
@@ -63,6 +64,8 @@ IMPATIENCE: Final = 0.25
 """Part of the lease before whose end a link may be given up already, as Zenoh does."""
 FORGOTTEN: Final = 0.3
 """Of what was declared, where links come back without all of it."""
+SETTLE: Final = 2.0
+"""Seconds that RCs settle."""
 LOOK_EVERY: Final = 0.05
 FORGED_EVERY: Final = 0.25
 OPERATOR: Final = "h0/operator"
@@ -81,13 +84,18 @@ class Size:
     """Seconds with faults and new requests."""
     pause: float = 3.0
     """Seconds from one request of a program to its next, at most."""
+    direct: bool = False
+    """Many programs touch devices past their RCs."""
     moves_only: bool = False
     """Nothing fails but nodes, in the steps of a component's move: no other fault excuses what breaks."""
 
     @classmethod
     def of(cls, seed: int) -> Size:
-        """Every tenth run is a long one of many, and every tenth one of moves that fail."""
+        """Every tenth run is a long one of many, every tenth one of moves that fail, and every tenth one of programs
+        that touch devices past their RCs."""
         match seed % 10:
+            case 8:
+                return cls(direct=True, span=40.0)
             case 9:
                 return cls(hosts=4, clients=20, faults=30, span=300.0, pause=60.0)
             case 7:
@@ -168,6 +176,11 @@ class Simulation:
             drawn = plan.draw_moves(seed, self.everybody, count=size.faults, span=size.span)
         else:
             drawn = plan.draw(seed, self.everybody, self.hosts, sorted(DEVICES), count=size.faults, span=size.span)
+        if size.direct:
+            # A second instance has a device of its own, which no program of the first touches.
+            drawn = [fault for fault in drawn if fault.kind != "double"]
+        self.last_holders = {rc: LastHolder() for rc in DEVICES}
+        """What RCs keep on disk."""
         self.faults = drawn if faults is None else list(faults)
         self.cuts: Counter[tuple[str, str]] = Counter()
         self.result = Result(seed, self.faults)
@@ -189,7 +202,8 @@ class Simulation:
         calm = lambda: 0.0 if self.present else loop.now - self.calm_since  # noqa: E731
         DEEDS.set(Deeds(self.broken, calm, lambda: self.work.over, self.busy))
         self.component = type("Component", (SimulatedComponent,), {"processes": self})
-        self.work = Work(DEVICES, self.size.pause, self.result.counts, self.log, self.broken)
+        touched = self.devices if self.size.direct else None
+        self.work = Work(DEVICES, self.size.pause, self.result.counts, self.log, self.broken, touched)
         self.promises = Promises(
             self.broken,
             lambda: loop.now,
@@ -355,7 +369,9 @@ class Simulation:
     async def _offer(self, name: str, device: Device, mesh: MemoryMesh, stall: StallWatch) -> ResourceController:
         driver = WatchedExclusive(device) if device.capacity is None else WatchedCapacity(device)
         lease = self.fleet.timing.hold_lease / SECOND
-        rc = ResourceController(mesh, name, driver, hold_lease=lease, stall=stall, on_failure=self._on_failure)
+        last = self.last_holders[name] if device is self.devices[name] else LastHolder()
+        how: dict[str, Any] = {"settle": SETTLE, "last_holder": last, "on_failure": self._on_failure}
+        rc = ResourceController(mesh, name, driver, hold_lease=lease, stall=stall, **how)
         await rc.start()
         self.rcs[f"{mesh.me} {name}"] = rc
         return rc
@@ -385,6 +401,8 @@ class Simulation:
 
     async def _client(self, name: str, mesh: MemoryMesh) -> None:
         client = self.programs[name] = Client(mesh, self.fleet).start()
+        # A leader that has just begun may know nothing of an RC that is down.
+        client.waits_for_devices = True
         busy = self.busy[name] = set()
         self.watch(name, client)
         await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))

@@ -9,6 +9,7 @@ from zscout.config.strict import BadInput
 from zscout.lab.replay import HoldRecord, Replay
 from zscout.lab.workload import Workload
 from zscout.scheduling.model import Effect, Granted, HoldEnded, Outcome, Queued
+from zscout.scheduling.reason import waits
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import SECOND, ArcId, Ns, RcName
@@ -48,7 +49,7 @@ class ReplayRecording:
                 timeline.arc(at, arc, "done", outcome.value)
                 timeline.event(at, f"{arc} {outcome.value}")
             case Queued(arc=arc, reason=reason, settled=True):
-                timeline.event(at, f"{arc} waits: {reason}")
+                timeline.event(at, f"{arc} {waits(str(reason))}")
                 if arc not in self._evicted:
                     timeline.arc(at, arc, "waiting", str(reason))
             case _:

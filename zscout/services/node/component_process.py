@@ -19,6 +19,7 @@ import msgspec
 from zscout import messages
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import EndReport, Order, OrderAnswer
+from zscout.behaviors.components.component import BAD_PARAMS
 from zscout.behaviors.components.processes import VARIABLE, kill_family
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import new_instance
@@ -56,6 +57,7 @@ class ComponentProcess:
         self.phase: Phase = "starting"
         self.ended: HowEnded | None = None
         self.reason = ""
+        self.bad_params = False
         self.movable = False
         self.moved: Moved | None = None
         self.output = OutputRing()
@@ -109,6 +111,7 @@ class ComponentProcess:
             ended=self.ended,
             reason=self.reason if self.ended is not None else self._group.missing,
             tail=self.output.tail() if self.ended == "failed" else "",
+            bad_params=self.bad_params,
         )
 
     # Orders. Each raises Refused.
@@ -325,7 +328,7 @@ class ComponentProcess:
         ends = self._end_report or self._how()
         await asyncio.to_thread(self._group.close)
         self._lasted = self._now() - self._began
-        self.phase, self.ended, self.reason = "ended", ends.how, ends.reason
+        self.phase, self.ended, self.reason, self.bad_params = "ended", ends.how, ends.reason, ends.bad_params
         words = f"{ends.how}: {ends.reason}" if ends.reason else ends.how
         log.info("%s.%d %s", self.start.component, self.start.incarnation, words)
         for waiting in self._waiting.values():
@@ -347,7 +350,8 @@ class ComponentProcess:
         if code is not None and code < 0:
             known = {number.value: number.name for number in signal.Signals}
             return EndReport("failed", f"killed by {known.get(-code, f'signal {-code}')}")
-        return EndReport("failed", f"its process left with code {code} and without a word")
+        words = f"its process left with code {code} and without a word"
+        return EndReport("failed", words, bad_params=code == BAD_PARAMS)
 
 
 async def _speak(connection: socket.socket, frames: asyncio.Queue[bytes]) -> None:

@@ -11,10 +11,10 @@ from typing import Final
 from zscout.keyexpr import RANDOM, Role, Token, check_name
 from zscout.mesh import IncomingQuery, Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import HostRanking, LoadReport, RankAsk
+from zscout.messages import HostRanking, KnownLoad, LoadReport, RankAsk
 from zscout.placement.balancer import Balancer
 from zscout.placement.model import RankQuery
-from zscout.types import HostName
+from zscout.types import SECOND, HostName
 
 log = logging.getLogger(__name__)
 
@@ -80,6 +80,12 @@ class LoadBalancer:
         ask = query.message
         for host in ask.hosts or ():
             check_name(host, "host")
-        ranking = self.core.rank(self.mesh.now(), RankQuery.of(ask), ask.at_most)
+        now = self.mesh.now()
+        ranking = self.core.rank(now, RankQuery.of(ask), ask.at_most)
         left_out = dict(itertools.islice(ranking.left_out.items(), ask.at_most))
-        query.answer(HostRanking(list(ranking.hosts), ranking.metric, ranking.why, left_out, ranking.more))
+        reports = None
+        if ask.reports:
+            named = [*(one.host for one in ranking.hosts), *left_out]
+            known = (self.core.reports[host] for host in named if host in self.core.reports)
+            reports = [KnownLoad((now - at) / SECOND, report) for at, report in known]
+        query.answer(HostRanking(list(ranking.hosts), ranking.metric, ranking.why, left_out, ranking.more, reports))

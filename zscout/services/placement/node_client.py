@@ -8,6 +8,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from zscout import messages
+from zscout.config.node import MAX_KINDS
 from zscout.mesh import Mesh, Reply
 from zscout.placement import events
 from zscout.types import SECOND, HostName, Ns
@@ -38,7 +39,10 @@ class NodeClient:
                 reply = await self._ask(command.host, listing, messages.ComponentList, LIST_TIMEOUT)
                 if reply is None or reply.message is None:
                     return None
-                return events.ComponentsListed(command.host, reply.message.components, listing.component)
+                told = reply.message.kinds
+                # Of a list that was cut short nobody knows what it lacks.
+                kinds = None if told is None or len(told) >= MAX_KINDS else frozenset(told)
+                return events.ComponentsListed(command.host, reply.message.components, listing.component, kinds)
 
     async def _start(self, host: HostName, start: messages.StartComponent) -> events.StartAnswered:
         answered = partial(events.StartAnswered, start.component, start.incarnation, host)
@@ -52,7 +56,7 @@ class NodeClient:
         if view.phase in ("running", "standby"):
             return answered("ok", movable=view.movable)
         if view.phase == "ended":
-            return answered("failed", view.reason, view.tail[: messages.MAX_TAIL])
+            return answered("failed", view.reason, view.tail[: messages.MAX_TAIL], bad_params=view.bad_params)
         return answered("unknown", f"it is still {view.phase}")
 
     async def _stop(self, host: HostName, stop: messages.StopComponent) -> events.StopAnswered:

@@ -10,6 +10,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TypeVar
 
 from zscout.config.fleet import Fleet
@@ -22,6 +23,7 @@ from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.election import Election
+from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import aged, take_over
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
@@ -42,7 +44,8 @@ BACKOFF_RESET_AFTER: Ns = 60 * SECOND
 class Candidate:
     """Stands by, leads when it must, steps down when a higher term is seen or when anything fails."""
 
-    def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
+    def __init__(self, mesh: Mesh, fleet: Fleet, folder: Path | None = None) -> None:
+        """`folder`: where it keeps what it must know after a restart; None: it does not."""
         self.mesh, self.fleet = mesh, fleet
         self.known: Term = NO_TERM
         """The highest term seen anywhere."""
@@ -52,6 +55,7 @@ class Candidate:
         self._leader: str | None = None
         """The host of the leader that was seen last."""
         self.ledger = PlacementLedger(mesh)
+        self.inventory = Inventory(mesh, fleet, folder)
         self._timeout = fleet.timing.rebuild / SECOND
         self._leading = ExitStack()
         """Ends the RCM, and the load balancer and the placer beside it, while this node leads."""
@@ -82,6 +86,8 @@ class Candidate:
             self._candidacy.callback(self._stall.stop)
             self._candidacy.callback(self.ledger.stop)
             self.ledger.start(self._supervisor)
+            self._candidacy.callback(self.inventory.stop)
+            self.inventory.start(self._supervisor)
             for declared in (
                 mesh.subscribe(keys.grants, Grants, guard(self._on_grants)),
                 mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)),
@@ -263,12 +269,12 @@ class Candidate:
         return messages
 
     def _lead(self, term: Term, states: list[RcState], open_requests: list[ClientRequests]) -> None:
-        recovered = take_over(states, open_requests, self.mesh.now())
+        recovered = take_over(states, open_requests, self.mesh.now(), self.inventory.devices.home_of)
         recovered.patient = self.election.links_return(self.mesh.now(), self._leader)
         self.known, self._goes_above = term, False
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
-        rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed)
+        rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed, self.inventory)
         rcm.membership.on_disbelieved = self._disbelieved
         self._leading.callback(rcm.stop)
         rcm.start(recovered)

@@ -21,6 +21,7 @@ from zscout.mesh.supervision import Supervisor
 from zscout.messages import ClientRequests, RcAsk, RcState, disbelieved
 from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.services.rcm.absence import Absence, Asked
+from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.recovery import aged, gangs_of, recover
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
@@ -35,6 +36,8 @@ DYING: Final = 0.003
 """Seconds within which all tokens of one link go."""
 LEASES_AT_MOST: Final = 3
 """For which a pending RC waits, whoever of its gangs goes on answering."""
+MAX_WORDS: Final = 500
+"""Characters of what an RC says of its health."""
 NEAR_END: Ns = SECOND // 20
 """A hold with less than this left may have ended at its RC already: clocks differ a little."""
 
@@ -64,8 +67,9 @@ class Membership:
         emit: Callable[..., None],
         on_reported: Callable[[RcName, RcState], None],
         on_newer: Callable[[Term, str | None], object],
+        devices: ExpectedDevices,
     ) -> None:
-        self.mesh, self.term = mesh, term
+        self.mesh, self.term, self._devices = mesh, term, devices
         self._lease = fleet.mesh.lease
         self._hold_lease = fleet.timing.hold_lease / SECOND
         self._timeout = fleet.timing.rebuild / SECOND
@@ -103,6 +107,8 @@ class Membership:
         """Clients that went as it was not known whether this leader was away."""
         self._sought: dict[str, int] = {}
         """By key: how often those whose tokens went without them are still asked."""
+        self._missed: set[RcName] = set()
+        """Expected devices that this reign has not seen, and has said so."""
         self._departed: dict[RcName, RcState] = {}
         """RCs that went less than a hold lease ago: they may still let their holders command."""
 
@@ -118,7 +124,7 @@ class Membership:
             self._hold_up(state, patient=patient or alone)
         # One that died before its token was watched would never be seen to go.
         self._supervisor.call_later(self._lease, self._drop_unseen)
-        return [RcJoined(name, state.sharable) for name, state in rcs.items() if state.health == "ok"]
+        return [_as_it_is(state) for state in rcs.values()]
 
     def watch(self) -> list[Declaration]:
         keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
@@ -374,7 +380,7 @@ class Membership:
         self._blinked.discard(gone.instance)
         self._supervisor.call_later(self._hold_lease, self._free, gone)
         self._seek(self.mesh.keys.rc_state(name), RcState, lambda: name in self._rc_tokens)
-        self._emit(RcLost(name))
+        self._emit(RcLost(name, why=self._devices.why_gone(name, gone.host)))
         if gone.leaving:
             self._free(gone)
         for other in self._rc_tokens.get(name, {}).values():
@@ -396,6 +402,14 @@ class Membership:
         """Whether this RC counts as there, or did until just now."""
         return rc not in self._pending and (rc in self._joined or rc in self._departed)
 
+    def reported(self, rc: RcName) -> RcState | None:
+        """An RC that counts as there, as it reported itself last."""
+        return self._joined.get(rc)
+
+    def is_known(self, rc: RcName) -> bool:
+        """Whether anybody offers it."""
+        return rc in self._joined or rc in self._pending or rc in self._rc_tokens
+
     def named(self, rcs: Iterable[RcName]) -> dict[RcName, tuple[str, HostName]]:
         """The instance that is meant of each of these RCs, and its host."""
         return {rc: self._named[rc] for rc in rcs if rc in self._named}
@@ -404,6 +418,15 @@ class Membership:
         for name, state in list(self._joined.items()):
             if state.instance not in self._rc_tokens.get(name, {}):
                 self._drop(name)
+        self._miss()
+
+    def _miss(self) -> None:
+        """Has who waits for a device that this reign has never seen know why it is not there."""
+        there = self._joined.keys() | self._pending.keys() | self._rc_tokens.keys() | self._departed.keys()
+        for name in sorted(self._devices.names - there):
+            if name not in self._missed and (home := self._devices.latest_home(name)) is not None:
+                self._missed.add(name)
+                self._emit(RcLost(name, why=self._devices.why_gone(name, home)))
 
     async def _join(self, token: Token) -> None:
         """Asks a new RC for its promise to obey this term, until it has joined or is gone."""
@@ -470,8 +493,7 @@ class Membership:
             for hold in recovered
             if all((rc, hold.grant) in held or rc not in self._joined for rc in hold.rcs)
         ]
-        if well:
-            self._emit(*(RcJoined(state.rc, state.sharable) for state in well.values()), *adopted)
+        self._emit(*map(_as_it_is, states), *adopted)
         for state in states:
             self._on_reported(state.rc, state)
             if state.duplicate_of or len(self._rc_tokens.get(state.rc, ())) > 1:
@@ -504,11 +526,11 @@ class Membership:
             self._drop(name)
             return
         if state.health != "ok":
-            if known.health == "ok":
-                self._emit(RcLost(name, state.health))
+            if known.health != state.health:
+                self._emit(_as_it_is(state))
             return
         if known.health != "ok":
-            self._emit(RcJoined(name, state.sharable))
+            self._emit(_as_it_is(state))
         if state.rules != known.rules:
             self._emit(RcReported(name, rules_changed=True))
         self._on_reported(name, state)
@@ -517,6 +539,11 @@ class Membership:
         """A term that somebody has heard of; `obeyed_by` an RC or a client that is seen."""
         if term > self.term:
             self._on_newer(term, obeyed_by)
+
+
+def _as_it_is(state: RcState) -> RcJoined | RcLost:
+    words = state.health[:MAX_WORDS]
+    return RcJoined(state.rc, state.sharable) if words == "ok" else RcLost(state.rc, why=words)
 
 
 def _sign(key: str) -> str:

@@ -42,12 +42,14 @@ from zscout.scheduling.model import (
     RecoveredHold,
     Released,
     Requested,
+    Status,
     Tick,
     Vote,
     VoteOverdue,
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.services.rcm.registry import RequestRegistry, reason_info, request_id
@@ -75,16 +77,23 @@ class Rcm:
         term: Term,
         on_newer: Callable[[Term, str | None], object],
         on_failure: Callable[[Exception], object],
+        inventory: Inventory | None = None,
     ) -> None:
+        """`inventory`: that of its candidate, if it has one."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         self.core = Core(STRATEGIES[fleet.strategy](), fleet.scheduling)
         supervisor, receive = self.supervisor, self._receive
         self.registry = RequestRegistry(mesh, self.core, term, supervisor)
-        self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer)
+        self._own_inventory = inventory is None
+        self.inventory = inventory or Inventory(mesh, fleet)
+        devices = self.inventory.devices
+        self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer, devices)
         self.membership.on_requests = self._on_requests
         self.membership.on_named = lambda rc: self._publish([], [rc])
-        self.requests = RequestHandler(mesh, fleet, self.core, self.registry, self.membership, supervisor, receive)
+        self.requests = RequestHandler(
+            mesh, fleet, self.core, self.registry, self.membership, devices, supervisor, receive
+        )
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
         self.seq = 0
@@ -108,6 +117,8 @@ class Rcm:
     def start(self, recovered: RecoveredState) -> None:
         """Begins to lead. Everything that is declared here is declared by the leader only."""
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
+        if self._own_inventory:
+            self.inventory.start(self.supervisor)
         joined = self.membership.join(recovered.rcs, recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
             self.registry.give_up(arc, Outcome.RELEASED)
@@ -135,6 +146,8 @@ class Rcm:
         for declared in reversed(self._declared):
             declared.close()
         self.supervisor.cancel()
+        if self._own_inventory:
+            self.inventory.stop()
         self.registry.close()
         self.requests.close()
         self._grants.close()
@@ -234,10 +247,12 @@ class Rcm:
         changed = [effect for effect in effects if isinstance(effect, (Granted, HoldEnded))]
         if not changed and rcs is None:
             return
-        revoked = [
-            _revocation(effect, self.registry.name(effect.arc)) for effect in changed if isinstance(effect, HoldEnded)
-        ]
         now = self.mesh.now()
+        revoked = [
+            _revocation(effect, self.registry.name(effect.arc), now, own=self._is_own(effect))
+            for effect in changed
+            if isinstance(effect, HoldEnded)
+        ]
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
         # One that has not joined holds what is not known here: to name it would end that.
         concerned = filter(self.membership.has_joined, {rc for effect in changed for rc in effect.rcs})
@@ -246,6 +261,10 @@ class Rcm:
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
         instances = {rc: instance for rc, (instance, _) in self.membership.named(names).items()}
         self._put(number, holders, revoked, instances)
+
+    def _is_own(self, effect: HoldEnded) -> bool:
+        """Whether its own client has given this hold back, in the burst that is being decided."""
+        return effect.outcome in (Outcome.RELEASED, Outcome.CANCELLED) and effect.arc in self.requests.given_up
 
     async def _send_heartbeats(self) -> None:
         """Repeats the last number whenever nothing was published for a while."""
@@ -310,6 +329,10 @@ class Rcm:
 
     def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
         asked, now = query.message, self.mesh.now()
+        if asked.devices_only:
+            rcs = self._devices(self.core.status(0), now)
+            query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs))
+            return
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
         instances = self.membership.named(sorted({rc for hold in holds for rc in hold.needs}))
@@ -319,14 +342,30 @@ class Rcm:
             state = replace(
                 state,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
-                rcs=[
-                    messages.RcView(rc.name, rc.present, rc.sharable, [*map(request_id, rc.holders)])
-                    for rc in status.rcs
-                ],
+                rcs=self._devices(status, now),
                 story=self.registry.story(asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
             )
         query.answer(state)
+
+    def _devices(self, status: Status, now: Ns) -> list[messages.RcView]:
+        """All RCs that are there or expected. What somebody asks for and nobody ever offered is not among them."""
+        known = {rc.name: rc for rc in status.rcs}
+        devices = self.inventory.devices
+        devices.forget_old(now)
+        named = self.membership.named(known)
+        there = {rc.name for rc in status.rcs if rc.present}
+        views = []
+        for name in sorted(there | devices.names):
+            rc, state = known.get(name), self.membership.reported(name)
+            view = messages.RcView(name, present=False, sharable=False)
+            if rc is not None:
+                view = messages.RcView(name, rc.present, rc.sharable, [*map(request_id, rc.holders)])
+            if state is not None:
+                reason = "" if state.health == "ok" else state.health[:MAX_REASON]
+                view = replace(view, sharable=state.sharable, reason=reason, parameters=state.parameters)
+            views.append(devices.view(view, now, named[name][1] if name in named else None))
+        return views
 
 
 # The core's values as messages
@@ -341,6 +380,7 @@ def _of(arc: ArcStatus) -> dict[str, Any]:
         "priority": arc.request.priority,
         "place": arc.place,
         "min_runtime": messages.decimal_seconds(arc.request.min_runtime),
+        "who": arc.request.who,
     }
 
 
@@ -354,13 +394,14 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Hol
             keep=arc.request.keep,
             params=messages.decimals(arc.needs[rc]),
             bound=dict(arc.bound),
+            direct=arc.request.direct,
         )
         for arc in arcs
         if arc.hold is not None
     ]
 
 
-def _revocation(effect: HoldEnded, name: str) -> messages.Revocation:
+def _revocation(effect: HoldEnded, name: str, now: Ns, *, own: bool) -> messages.Revocation:
     return messages.Revocation(
         id=request_id(effect.arc),
         arc=name,
@@ -370,7 +411,8 @@ def _revocation(effect: HoldEnded, name: str) -> messages.Revocation:
         outcome=effect.outcome,
         reason=str(effect.reason),
         by=effect.by,
-        why=reason_info(effect.reason),
+        why=reason_info(effect.reason, now),
+        own=own,
     )
 
 
@@ -383,6 +425,7 @@ def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> messages.HoldView:
         remaining=(hold.end - now) / SECOND,
         keep=arc.request.keep,
         bound=dict(arc.bound),
+        direct=arc.request.direct,
     )
 
 
@@ -394,5 +437,5 @@ def _wait_view(arc: ArcStatus, now: Ns, start: Ns | None) -> messages.WaitView:
         reason=str(arc.reason or ""),
         preemptions=arc.preemptions,
         starts_in=None if start is None else (start - now) / SECOND,
-        why=reason_info(arc.reason),
+        why=reason_info(arc.reason, now),
     )

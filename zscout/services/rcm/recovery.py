@@ -8,7 +8,7 @@ more is not carried on: it gave it up while nobody led."""
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from operator import attrgetter
@@ -19,7 +19,7 @@ from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of,
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
 from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
 from zscout.services.rcm.registry import arc_id, request_id
-from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, Need, Ns, RcName
+from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, RcName
 
 log = logging.getLogger(__name__)
 
@@ -48,10 +48,17 @@ def aged(state: RcState, by: Ns) -> RcState:
     return replace(state, holders=[replace(one, remaining=one.remaining - by / SECOND) for one in state.holders])
 
 
-def take_over(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:
-    """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided."""
-    # Of two instances of one RC the one with the newest hold is meant.
+def take_over(
+    states: Iterable[RcState],
+    clients: Collection[ClientRequests],
+    now: Ns,
+    home_of: Callable[[RcName], HostName | None] = lambda _: None,
+) -> RecoveredState:
+    """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided.
+    `home_of`: the host at which the fleet file has an RC."""
+    # Of two instances of one RC the one with the newest hold is meant, else the one at home.
     by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
+    by_host.sort(key=lambda state: state.host == home_of(state.rc))
     answered = {state.rc: state for state in sorted(by_host, key=_newest_grant)}
     pending = {rc for rc in answered if not gangs_of(rc, answered) <= answered.keys()}
     result = recover([state for rc, state in answered.items() if rc not in pending], clients, now)
@@ -141,7 +148,8 @@ def _recover_hold(
     if asked is not None:
         needs |= {need: params for need, params in asked[1].needs.items() if need in needs}
     needs |= {patterns.get(name, name): holder.params for name, holder in held.items()}
-    request = _request(arc, some.client, needs, some)
+    direct = any(holder.direct for holder in held.values()) or (asked is not None and asked[1].direct)
+    request = _request(arc, some.client, needs, replace(some, direct=direct))
     # The core ends a gang with an absent RC, and names what was lost; a present RC without it breaks it.
     if all(name in held or name not in result.rcs for name in some.rcs):
         end = now + round(min(holder.remaining for holder in held.values()) * SECOND)
@@ -177,6 +185,8 @@ def _request(arc: str, client: str, needs: dict[str, Amounts], source: OpenReque
         min_runtime=duration(Decimal(source.min_runtime), "min_runtime"),
         keep=source.keep,
         label=source.arc,
+        direct=source.direct,
+        who=source.who,
     )
 
 

@@ -20,7 +20,7 @@ from zscout.messages import Notice, ReasonInfo, ReasonParty, State, StoryLine
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.reason import Reason
+from zscout.scheduling.reason import Party, Reason, ended, waits
 from zscout.types import SECOND, ArcId, ClientId, Grant, Ns, Term
 
 log = logging.getLogger(__name__)
@@ -58,11 +58,17 @@ def client_id(arc: ArcId) -> ClientId:
     return arc.rpartition("/")[0]
 
 
-def reason_info(reason: Reason | None) -> ReasonInfo | None:
+def reason_info(reason: Reason | None, now: Ns) -> ReasonInfo | None:
     if reason is None:
         return None
-    by = [ReasonParty(request_id(one.arc), one.name, client_id(one.arc), one.priority) for one in reason.by]
-    return ReasonInfo(reason.code, list(reason.rcs), by, reason.detail, reason.number, reason.pattern)
+    by = [party_info(one, now) for one in reason.by]
+    rcs, patterns = list(reason.rcs), list(reason.patterns)
+    return ReasonInfo(reason.code, rcs, by, reason.detail, reason.number, reason.pattern, patterns)
+
+
+def party_info(party: Party, now: Ns) -> ReasonParty:
+    yields_in = None if party.until is None else max(0, party.until - now) / SECOND
+    return ReasonParty(request_id(party.arc), party.name, client_id(party.arc), party.priority, party.who, yields_in)
 
 
 class RequestRegistry:
@@ -100,13 +106,19 @@ class RequestRegistry:
     def ended(self, arc: ArcId) -> bool:
         return arc in self._ended
 
-    def reopens(self, arc: ArcId) -> bool:
-        """Whether `arc` ended only because its client seemed gone, and may be asked for again: from now on it has not
-        ended."""
-        if arc in self._ended and self._ended[arc][1].outcome == Outcome.CLIENT_LOST:
-            del self._ended[arc]
-            return True
-        return False
+    def reopens(self, arc: ArcId, unserved: Grant | None = None) -> bool:
+        """Whether `arc` ended only because its client seemed gone, or had its time under the grant `unserved` while RCs
+        of it settled, and may be asked for again: from now on it has not ended."""
+        if arc not in self._ended:
+            return False
+        _, notice = self._ended[arc]
+        completed = notice.outcome == Outcome.COMPLETED and notice.grant is not None and notice.grant == unserved
+        if not completed and notice.outcome != Outcome.CLIENT_LOST:
+            return False
+        if completed and trace.enabled():
+            trace.write(self._mesh.now(), "reopened", term=self._term, arc=arc)
+        del self._ended[arc]
+        return True
 
     def give_up(self, arc: ArcId, outcome: Outcome) -> None:
         """Its client wants no more of `arc`, which has ended or is unknown: it is not reopened."""
@@ -114,6 +126,9 @@ class RequestRegistry:
         notice = known[1] if known is not None else self._notice(arc, "ended", reason="given up by its client")
         if known is None or notice.outcome == Outcome.CLIENT_LOST:
             self._remember(arc, replace(notice, outcome=outcome))
+        elif notice.outcome == Outcome.COMPLETED:
+            # Nor as one whose time went by while its RCs settled.
+            self._ended[arc] = known[0], replace(notice, grant=None)
 
     # Notices
 
@@ -132,7 +147,8 @@ class RequestRegistry:
             "queued" if hold is None else "running",
             priority=arc.request.priority,
             reason=str(arc.reason or ""),
-            why=reason_info(arc.reason),
+            why=reason_info(arc.reason, self._mesh.now()),
+            who=arc.request.who,
             place=arc.place,
             ahead=arc.ahead,
             grant=hold.grant if hold is not None else None,
@@ -207,10 +223,10 @@ class RequestRegistry:
 
     def _close(self, effect: HoldEnded | Dropped) -> Notice:
         """Records how a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
-        why = reason_info(effect.reason)
+        why = reason_info(effect.reason, self._mesh.now())
         details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
         requeued = isinstance(effect, HoldEnded) and effect.requeued
-        self.record(effect.arc, f"{effect.outcome}: {effect.reason}{'; queued again' if requeued else ''}")
+        self.record(effect.arc, f"{ended(effect.outcome, str(effect.reason))}{'; queued again' if requeued else ''}")
         arc = self._core.arc(effect.arc)
         if isinstance(effect, HoldEnded):
             details |= {"by": effect.by, "grant": effect.grant, "rcs": list(effect.rcs)}
@@ -283,7 +299,7 @@ class RequestRegistry:
         changed, self._changed = self._changed, {}
         for arc in filter(None, map(self._core.arc, changed)):
             if arc.hold is None:
-                self.record(arc.id, f"waits: {arc.reported}")
+                self.record(arc.id, waits(str(arc.reported)))
 
     def _write_log(self) -> None:
         lines, self._unlogged = self._unlogged, []

@@ -22,6 +22,7 @@ from zscout.messages import (
     HandOver,
     Notice,
     Operation,
+    Parameters,
     Release,
     absurd,
     duration,
@@ -44,8 +45,11 @@ from zscout.scheduling.model import (
     Requested,
     Unconfirmed,
 )
+from zscout.scheduling.reason import Party, named
+from zscout.services.rcm.devices import ExpectedDevices
+from zscout.services.rcm.door import check_door
 from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.registry import RequestRegistry, arc_id, request_id
+from zscout.services.rcm.registry import RequestRegistry, arc_id, party_info, reason_info, request_id
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
 Query: TypeAlias = IncomingQuery[Operation]
@@ -67,10 +71,13 @@ class RequestHandler:
         core: Core,
         registry: RequestRegistry,
         membership: Membership,
+        devices: ExpectedDevices,
         supervisor: Supervisor,
         emit: Callable[..., None],
     ) -> None:
-        self.mesh, self.limits, self.core = mesh, fleet.limits, core
+        self.mesh, self.limits, self.core, self._devices = mesh, fleet.limits, core, devices
+        self._knows_all = mesh.now() + fleet.timing.hold_lease
+        """From when on an RC that was not seen yet is none of this fleet."""
         self._first_answer_timeout = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
         self._registry, self._membership, self._supervisor = registry, membership, supervisor
         self._flush_guarded = supervisor.guard(self.flush)
@@ -138,13 +145,15 @@ class RequestHandler:
             if ask.reachable:
                 self._emit(Reachable(arc))
             query.answer(self._standing(arc, ask))
-        elif self._registry.ended(arc) and not self._registry.reopens(arc):
+        elif self._registry.ended(arc) and not self._registry.reopens(arc, ask.grant if ask.unserved else None):
             query.answer(self._registry.notice(arc))
         elif self._goes_on_elsewhere(ask):
             query.answer(self._registry.handed_over(arc, ask.arc))
         else:
             self._check_room(str(sender))
             request = admit(ask, sender, arc, self.core, self.limits)
+            if ask.check and ask.place is None and ask.grant is None:
+                self._check_door(ask)
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
             self._registry.record(arc, f"asked for {', '.join(sorted(ask.needs))} at priority {ask.priority}")
             since = None if ask.place is None else self.mesh.now() - round(ask.waited * SECOND)
@@ -155,10 +164,20 @@ class RequestHandler:
             else:
                 self._gather(query, arc, Requested(request, ask.place, since))
 
+    def _check_door(self, ask: Ask | Foresee) -> None:
+        """Raises Refused for what can never start."""
+        known = {*self._devices.names, *filter(self._membership.is_known, ask.needs)}
+        waits = ask.wait_for_device or self.mesh.now() < self._knows_all
+        check_door(ask.needs, known, self._parameters, waits=waits)
+
+    def _parameters(self, rc: RcName) -> Parameters | None:
+        state = self._membership.reported(rc)
+        return state.parameters if state is not None else self._devices.parameters(rc)
+
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
         """Whether its client believes in a grant of an earlier RCM of which this one does not know."""
         known = self.core.arc(arc)
-        unknown = ask.grant is not None and ask.grant.term < self.core.term and not ask.unconfirmed
+        unknown = ask.grant is not None and ask.grant.term < self.core.term and not ask.unconfirmed and not ask.unserved
         return unknown and (known is None or known.hold is None) and not self._registry.ended(arc)
 
     def _may_be_held(self, arc: ArcId) -> bool:
@@ -167,7 +186,7 @@ class RequestHandler:
 
     def _standing(self, arc: ArcId, ask: Ask) -> Notice:
         """How an open ARC stands, for a client that may not have heard how its last hold ended."""
-        if ask.grant is not None and not ask.unconfirmed and self.core.is_queued(arc):
+        if ask.grant is not None and not ask.unconfirmed and not ask.unserved and self.core.is_queued(arc):
             return self._registry.interrupted(arc, ask.grant)
         return self._registry.notice(arc)
 
@@ -193,7 +212,8 @@ class RequestHandler:
             if self.core.arc(arc) is None:
                 self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
         event = Cancelled if isinstance(operation, Cancel) else Released
-        self._gather(query, arc, event(arc, "its client" if owner == sender else str(sender)))
+        by = str(sender) if operation.who is None else named(operation.who, str(sender), operation.id)
+        self._gather(query, arc, event(arc, "its client" if owner == sender else by))
 
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
@@ -216,8 +236,11 @@ class RequestHandler:
             raise Refused("bad_request", f"{asked.id} is a request already; ask how it stands")
         now = self.mesh.now()
         request = admit(asked, sender, arc, self.core, self.limits)
+        if asked.check:
+            self._check_door(asked)
         expected = forecast(self.core, now, request)
         start = expected.starts.get(arc)
+        victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]
         query.answer(
             Foresight(
                 id=asked.id,
@@ -225,6 +248,8 @@ class RequestHandler:
                 starts_in=None if start is None else (start - now) / SECOND,
                 preempts=[self._registry.name(victim) for victim in expected.preempts],
                 reason=str(expected.reason or ""),
+                victims=[party_info(Party(one.arc, one.name, one.priority, one.who), now) for one in victims],
+                why=reason_info(expected.reason, now),
             )
         )
 
@@ -385,6 +410,8 @@ def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: Rc
             min_runtime=duration(ask.min_runtime, "min_runtime"),
             keep=ask.keep,
             label=ask.arc,
+            direct=isinstance(ask, Ask) and ask.direct,
+            who=ask.who if isinstance(ask, Ask) else None,
         )
     except (BadName, ValueError) as error:
         raise Refused("bad_request", str(error)) from None

@@ -8,21 +8,50 @@ import logging
 import os
 import signal
 import sys
-from contextlib import suppress
-from typing import BinaryIO
+import time
+from contextlib import ExitStack, suppress
+from typing import BinaryIO, Final
+from urllib.parse import urlsplit
 
 import msgspec
 
+from zscout.config.fleet import Fleet
+from zscout.config.node import RecorderConfig
+from zscout.config.packages import how_to_get
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Sender
 from zscout.mesh import MeshError, ZenohMesh
-from zscout.services.recorder.process import BAD_SETTINGS, RecorderJob, Recording, decode_job, new_recording, prune
-from zscout.services.recorder.recorder import Recorder, RecorderFailed
-from zscout.services.recorder.timeline import Timeline
+from zscout.messages import Recorded
+from zscout.services.recorder.process import (
+    BAD_SETTINGS,
+    MEGABYTE,
+    RecorderJob,
+    Recording,
+    decode_job,
+    new_recording,
+    prune,
+    writing,
+)
+
+try:
+    from zscout.services.recorder.finish import Job
+    from zscout.services.recorder.recorder import Recorder, RecorderFailed
+    from zscout.services.recorder.timeline import Timeline
+except ImportError as error:
+    if not (missing := how_to_get(error)):
+        raise
+    sys.stderr.write(f"the recorder {missing}\n")
+    sys.exit(BAD_SETTINGS)
 
 log = logging.getLogger("zscout.recorder")
 
-MAX_JOB = 1_000_000
+MAX_JOB: Final = 1_000_000
+PART: Final = 3_600.0
+"""Seconds after which a recording goes on in another file."""
+MAX_PART: Final = 250 * MEGABYTE
+"""Bytes, likewise."""
+CHECK_EVERY: Final = 30.0
+"""Seconds between two looks at that, and at the limit of all recordings."""
 
 
 def main() -> None:
@@ -56,19 +85,85 @@ async def _record(job: RecorderJob, out: BinaryIO) -> None:
     with suppress(PermissionError):  # a plain file has no other end
         loop.add_reader(0, read)
     settings, fleet = job.recorder, job.fleet
-    path = new_recording(settings.path, fleet.name)
-    try:
-        timeline = Timeline(fleet.name, path=path, bind=settings.bind, port=settings.port)
-    except BadInput:
-        path.unlink(missing_ok=True)
-        raise
-    prune(settings.path, fleet.name)
-    with timeline:
+    with ExitStack() as stack:
+        files = _Files(settings, fleet)
+        stack.callback(files.close)
+        timeline = stack.enter_context(files.timeline)
+        files.prune()
         async with await ZenohMesh.open(fleet.name, Sender(job.host, "recorder"), fleet.mesh) as mesh:
-            out.write(msgspec.json.encode(Recording(str(path.absolute()), timeline.url)) + b"\n")
+            out.write(msgspec.json.encode(Recording(str(files.path.absolute()), timeline.url)) + b"\n")
             out.flush()
-            await Recorder(mesh, fleet, timeline, settings.frames).run(stop)
-    log.info("the recording is %s", path)
+            recorder = Recorder(mesh, fleet, timeline, settings.frames, files.where if job.joined else None)
+            rolling = asyncio.create_task(files.keep(recorder))
+            try:
+                await recorder.run(stop)
+            finally:
+                rolling.cancel()
+                await asyncio.gather(rolling, return_exceptions=True)
+    log.info("the recording is %s", files.path)
+
+
+class _Files:
+    """The file that is written, and those before it. Raises BadInput where it can't be written or served."""
+
+    def __init__(self, settings: RecorderConfig, fleet: Fleet) -> None:
+        self._settings, self._fleet = settings, fleet
+        self.path = new_recording(settings.path, fleet.name)
+        self._written = ExitStack()
+        self._written.enter_context(writing(self.path))
+        self._began = time.monotonic()
+        try:
+            self.timeline = Timeline(fleet.name, path=self.path, bind=settings.bind, port=settings.port, wall=True)
+        except BadInput:
+            self.close()
+            self.path.unlink(missing_ok=True)
+            raise
+
+    def where(self) -> Recorded:
+        port = urlsplit(self.timeline.url or "").port
+        return Recorded(str(self.path.absolute()), self.path.stat().st_ino, self._settings.bind, port or 1)
+
+    def prune(self) -> None:
+        prune(self._settings.path, self._fleet.name, limit=self._settings.limit * MEGABYTE)
+
+    async def keep(self, recorder: Recorder) -> None:
+        """Goes on in another file now and then, and removes the oldest. Does not return."""
+        while True:
+            await asyncio.sleep(CHECK_EVERY)
+            try:
+                if time.monotonic() - self._began >= PART or self.path.stat().st_size >= MAX_PART:
+                    await self._roll(recorder.now())
+            except (OSError, BadInput) as error:
+                log.warning("the recording goes on in the same file: %s", error)
+            self.prune()
+
+    async def _roll(self, at: float) -> None:
+        path = new_recording(self._settings.path, self._fleet.name)
+        try:
+            job = self.timeline.roll(at, path)
+        except BadInput:
+            path.unlink(missing_ok=True)
+            raise
+        before, self.path, self._began = self._written.pop_all(), path, time.monotonic()
+        self._written.enter_context(writing(path))
+        with before:
+            if job is not None:
+                await _finished(job)
+
+    def close(self) -> None:
+        self._written.close()
+
+
+async def _finished(job: Job) -> None:
+    """Has a process of its own write the file anew: its memory goes with it."""
+    command = (sys.executable, "-m", "zscout.services.recorder.finish")
+    process = await asyncio.create_subprocess_exec(*command, stdin=asyncio.subprocess.PIPE)
+    try:
+        await process.communicate(msgspec.json.encode(job, enc_hook=str))
+    finally:
+        if process.returncode is None:
+            process.terminate()
+            await process.wait()
 
 
 if __name__ == "__main__":

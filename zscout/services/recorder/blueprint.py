@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final, Literal, NamedTuple
 
+import msgspec
 import rerun as rr
 import rerun.blueprint as rrb
 
 APPLICATION: Final = "zscout"
 """Rerun's application id: recordings and blueprints find each other by it."""
 TIME: Final = "mesh_time"
-"""The one timeline: a duration, in seconds from whatever zero the caller chose.
+"""The timeline of what has no place in our time: a duration, in seconds from whatever zero the caller chose.
 
 The viewer makes the column of times in the event list as wide as this name: "time" cuts off `+10s`."""
+WALL_TIME: Final = "wall_clock_time"
+"""The timeline of a fleet that is recorded as it works. The viewer shows it in UTC, or in local time if set so."""
 # Legends stand in titles: they would cover the curves, or the plan.
 MARK_WORDS: Final = "▲ placed  ● restarted  ◀ moved away  ▶ moved here  \u00d7 given up"
 FLOOR_WORDS: Final = "green hidden, amber not yet, red operator, violet people"
@@ -49,29 +53,38 @@ class RobotLayout(NamedTuple):
 NO_ROBOTS: Final = RobotLayout()
 
 
-def blueprint(
-    span: tuple[float, float] | None = None,
-    *,
-    rc_rows: int = 6,
-    arc_rows: int = 6,
-    host_rows: int = 0,
-    robots: RobotLayout = NO_ROBOTS,
-) -> rrb.Blueprint:
-    """The layout: who holds what, what each ARC does and the loads on one time axis, events beside them; with
-    components, also what runs on each host and what it uses.
+class Layout(msgspec.Struct, frozen=True):
+    """What there is to lay out.
 
     `span`: begin and end of a run that is over, in seconds of the timeline. Without it the layout is live: the window
-    slides with the newest data and shows the last minute. `rc_rows`, `arc_rows` and `host_rows` are the rows expected
-    in the upper panes, which share the height accordingly. Without components `host_rows` is 0; a pane of RCs or ARCs
-    that would be empty beside them is left out. With `robots`, their behaviors follow the ARCs, loads and hosts share a
-    place, and floor and cameras are at the right, above the events."""
+    slides with the newest data and shows the last minute. `wall`: whether the timeline has wall-clock times. `rc_rows`,
+    `arc_rows` and `host_rows` are the rows expected in the upper panes, which share the height accordingly. Without
+    components `host_rows` is 0. `contended` and `absent` are rows by entity of RCs that several want, and of those that
+    are not there: panes of their own, above the other RCs and below them."""
+
+    span: tuple[float, float] | None = None
+    wall: bool = False
+    rc_rows: int = 6
+    contended: Mapping[str, int] = {}
+    absent: Mapping[str, int] = {}
+    arc_rows: int = 6
+    host_rows: int = 0
+    robots: RobotLayout = NO_ROBOTS
+
+
+def blueprint(layout: Layout) -> rrb.Blueprint:
+    """Who holds what, what each ARC does and the loads on one time axis, events beside them; with components, also what
+    runs on each host and what it uses.
+
+    A pane of RCs or ARCs that would be empty beside components is left out. With robots, their behaviors follow the
+    ARCs, loads and hosts share a place, and floor and cameras are at the right, above the events."""
+    span, robots, host_rows = layout.span, layout.robots, layout.host_rows
     axis = rrb.archetypes.TimeAxis(view_range=_window(span))
     behavior_rows = LIVE_BEHAVIOR_ROWS if span is None and robots.behavior_rows else robots.behavior_rows
-    lanes = {
+    lanes = _rc_panes(layout, axis) | {
         origin: (_share(rows), rrb.StateTimelineView(origin=origin, name=name, time_view=axis))
         for origin, name, rows, alone in (
-            ("/rc", "Who holds each resource", rc_rows, not host_rows),
-            ("/arc", "What each ARC is doing", arc_rows, not host_rows),
+            ("/arc", "What each ARC is doing", layout.arc_rows, not host_rows),
             ("/host", "What runs on each host", host_rows, False),
             ("/behavior", "What each behavior is doing", behavior_rows if robots.any else 0, False),
         )
@@ -88,8 +101,32 @@ def blueprint(
         load = rrb.Tabs(load, lanes.pop("/host")[1])
     shares = [*(share for share, _ in lanes.values()), 5 if robots.any else 7]
     panes = rrb.Vertical(*(view for _, view in lanes.values()), load, row_shares=shares)
-    beside = _beside(axis, host_rows > 0, robots)
-    return page(rrb.Horizontal(panes, beside, column_shares=[57, 43] if robots.any else [62, 38]))
+    time = WALL_TIME if layout.wall else TIME
+    beside = _beside(axis, host_rows > 0, robots, time)
+    root = rrb.Horizontal(panes, beside, column_shares=[57, 43] if robots.any else [62, 38])
+    return page(root, timeline=time)
+
+
+def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View]]:
+    """Share of the height and view, by any name. Within a view lanes are sorted by their names: what is to stand above
+    them has a view of its own."""
+    apart = {**layout.contended, **layout.absent}
+    rest = layout.rc_rows - sum(apart.values())
+    panes: dict[str, tuple[int, rrb.View]] = {}
+
+    def add(name: str, rows: int, least: int, *contents: str) -> None:
+        view = rrb.StateTimelineView(origin="/rc", contents=contents or "$origin/**", name=name, time_view=axis)
+        panes[name] = _share(rows, least), view
+
+    if layout.contended:
+        add("Resources that several want, and who holds them", sum(layout.contended.values()), 1, *layout.contended)
+    if apart and rest > 0:
+        add("Who holds each other resource", rest, 1, "$origin/**", *(f"- {entity}" for entity in apart))
+    elif not apart and (layout.rc_rows or not layout.host_rows):
+        add("Who holds each resource", rest, 3)
+    if layout.absent:
+        add("Resources that are not there", sum(layout.absent.values()), 1, *layout.absent)
+    return panes
 
 
 def page(
@@ -106,26 +143,24 @@ def page(
     )
 
 
-def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout) -> rrb.View | rrb.Container:
+def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout, time: str) -> rrb.View | rrb.Container:
     """The panes at the right, from the top: the floor, the cameras, events and curves; as tabs if there are robots."""
 
     def curves(origin: str, name: str) -> rrb.View:
         # A legend of many would cover the curves.
         return rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis, plot_legend=rrb.PlotLegend(visible=False))
 
-    events = rrb.TextLogView(
-        origin="/events",
-        name="Events",
-        columns=rrb.archetypes.TextLogColumns(timeline_columns=[TIME], text_log_columns=["loglevel", "body"]),
-    )
-    below: list[rrb.View] = [events]
+    columns = rrb.archetypes.TextLogColumns(timeline_columns=[time], text_log_columns=["loglevel", "body"])
+    events = rrb.TextLogView(origin="/events", name="Events", columns=columns)
+    presence = rrb.TextLogView(origin="/presence", name="Who comes and goes", columns=columns)
+    below: list[rrb.View | rrb.Container] = [events, presence] if robots.any else [rrb.Tabs(events, presence)]
     if uses:
         # As tabs they have little room for words.
         more = ("", "") if robots.any else (" of the heaviest components", ", in the colours of the lanes")
         below.append(curves("/use/cpu", f"CPU{more[0]} (cores){more[1]}"))
         below.append(curves("/use/memory", f"Memory{more[0]} (MB)"))
     if not robots.any:
-        return rrb.Vertical(*below, row_shares=[5, 3, 3]) if uses else events
+        return rrb.Vertical(*below, row_shares=[5, 3, 3]) if uses else below[0]
     if robots.devices:
         below.append(curves("/device", "Devices (point at a curve)"))
     panes: list[tuple[int, rrb.View | rrb.Container]] = []
@@ -140,7 +175,7 @@ def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout) -> r
             for first in range(0, len(views), BESIDE)
         ]
         panes.append((5, rows[0] if len(rows) == 1 else rrb.Tabs(*rows)))
-    panes.append((6, rrb.Tabs(*below) if len(below) > 1 else events))
+    panes.append((6, rrb.Tabs(*below)))
     return rrb.Vertical(*(pane for _, pane in panes), row_shares=[share for share, _ in panes])
 
 
@@ -160,6 +195,6 @@ def _window(span: tuple[float, float] | None) -> rr.TimeRange:
     return rr.TimeRange(start=absolute(seconds=begin), end=absolute(seconds=begin + length))
 
 
-def _share(rows: int) -> int:
+def _share(rows: int, least: int = 3) -> int:
     """Height of a pane in rows, with its title and axis; it scrolls past twelve rows."""
-    return 2 + min(max(rows, 3), 12)
+    return 2 + min(max(rows, least), 12)

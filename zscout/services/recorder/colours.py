@@ -29,6 +29,8 @@ PALETTE: Final[tuple[int, ...]] = (
 """RGBA of ARCs, in order of appearance; the fifteenth has the colour of the first."""
 OTHER: Final = 0x8A8A94FF
 """RGBA of what has no colour of its own: a summary, or an ARC past the limit of names."""
+ABSENT: Final = 0x55555CFF
+"""RGBA of an RC that is not there."""
 STATES: Final[dict[str, int]] = {
     "waiting": 0x6E5A20FF,
     "running": 0x2A7A46FF,

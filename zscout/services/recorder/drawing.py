@@ -15,8 +15,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import rerun as rr
 
-from zscout.services.recorder.blueprint import TIME
-from zscout.services.recorder.colours import OTHER
+from zscout.services.recorder.blueprint import TIME, WALL_TIME
+from zscout.services.recorder.colours import OPERATOR, OTHER
 
 MAX_SECONDS: Final = 9e9
 """Rerun counts nanoseconds in 64 bits."""
@@ -34,15 +34,19 @@ _UNKNOWN: Final = re.compile(
 
 
 class Drawing:
-    """One recording on one timeline. `at` is seconds, of a size below `MAX_SECONDS`; any other number is a
-    ValueError. After `closed` nothing is written."""
+    """One recording on one timeline, written to each of `streams`. `at` is seconds, of a size below `MAX_SECONDS`; any
+    other number is a ValueError. After `closed` nothing is written."""
 
-    def __init__(self, recording: rr.RecordingStream) -> None:
-        self.recording = recording
+    def __init__(self, *streams: rr.RecordingStream) -> None:
+        self.streams = list(streams)
+        self.epoch: float | None = None
+        """The wall-clock time of second 0, as `time.time()` has it; None: the timeline has durations."""
         self.closed = False
         self.begin, self.end = math.inf, -math.inf
-        self._shown: dict[str, object] = {}
-        """What was logged last, by entity."""
+        self._static: dict[str, tuple[rr.AsComponents, ...]] = {}
+        """What was logged for all times, by entity."""
+        self._shown: dict[str, tuple[Callable[..., rr.AsComponents], dict[str, Any]]] = {}
+        """Shape and fields of what was shown last, by entity."""
         self._noted: set[str] = set()
 
     def log(self, at: float | None, entity: str, *what: rr.AsComponents) -> None:
@@ -53,21 +57,34 @@ class Drawing:
             if not abs(at) < MAX_SECONDS:
                 raise ValueError(f"timeline: {at} is no time in seconds; give a number below {MAX_SECONDS:g}")
             self.begin, self.end = min(self.begin, at), max(self.end, at)
-            # Rerun keeps it for each thread.
-            self.recording.set_time(TIME, duration=at)
-        self.recording.log(entity, *what, static=at is None)
+        else:
+            self._static[entity] = what
+        for stream in self.streams:
+            self._write(stream, at, entity, *what)
+
+    def restate(self, stream: rr.RecordingStream, at: float) -> None:
+        """Writes to a stream that begins at `at` what was logged for all times, and what is shown now."""
+        for entity, what in self._static.items():
+            self._write(stream, None, entity, *what)
+        for entity, (shape, fields) in self._shown.items():
+            self._write(stream, at, entity, _shaped(shape, fields))
+
+    def _write(self, stream: rr.RecordingStream, at: float | None, entity: str, *what: rr.AsComponents) -> None:
+        # Rerun keeps the time for each thread.
+        if at is not None and self.epoch is None:
+            stream.set_time(TIME, duration=at)
+        elif at is not None and self.epoch is not None:
+            stream.set_time(WALL_TIME, timestamp=self.epoch + at)
+        stream.log(entity, *what, static=at is None)
 
     def show(self, at: float, entity: str, shape: Callable[..., rr.AsComponents], **fields: Any) -> None:
         """From `at` on, the entity shows this shape; nothing if its first field is empty."""
         if not next(iter(fields.values())):
             if entity in self._shown:
                 self.erase(at, entity)
-        elif self._shown.get(entity) != fields:
-            self._shown[entity] = fields
-            if "colors" in fields:
-                # Of a list of three or four, Rerun could not tell whether they are one.
-                fields = fields | {"colors": np.array(fields["colors"], np.uint32)}
-            self.log(at, entity, shape(**fields))
+        elif self._shown.get(entity) != (shape, fields):
+            self._shown[entity] = shape, fields
+            self.log(at, entity, _shaped(shape, fields))
 
     def erase(self, at: float, entity: str) -> None:
         """What the entity shows ends, and so does a curve: no line goes on to its next point."""
@@ -78,13 +95,18 @@ class Drawing:
         """How the points of this entity are joined."""
         self.log(None, entity, rr.SeriesLines(names=[clean_text(name)], colors=[colour], widths=[width], **more))
 
-    def event(self, at: float, text: str, level: str = "INFO") -> None:
-        """One line in words; `level` is one of Rerun's."""
-        self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=level))
+    def event(self, at: float, text: str, level: str = "INFO", *, operator: bool = False) -> None:
+        """One line in words; `level` is one of Rerun's, `operator` whether an operator did it."""
+        colour = OPERATOR if operator else None
+        self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=level, color=colour))
 
-    def warn(self, at: float, text: str) -> None:
+    def warn(self, at: float, text: str, *, operator: bool = False) -> None:
         """An event that people should look at."""
-        self.event(at, text, "WARN")
+        self.event(at, text, "WARN", operator=operator)
+
+    def presence(self, at: float, text: str, level: str = "INFO") -> None:
+        """Who comes and goes: a list of its own, which would bury the events."""
+        self.log(at, "presence", rr.TextLog(clean_text(text, MAX_EVENT), level=level))
 
     def note(self, at: float, text: str) -> None:
         """Reports, once, that something is left out."""
@@ -102,11 +124,26 @@ class Drawing:
     def arrange(self) -> None:
         """There may be something new to lay out."""
 
-    def disconnect(self, seconds: float) -> None:
-        """A viewer that hangs can hold this up: then it is left to a thread that dies with the process."""
-        thread = threading.Thread(target=self.recording.disconnect, name="rerun-disconnect", daemon=True)
-        thread.start()
-        thread.join(seconds)
+    def flush(self, seconds: float) -> None:
+        """Returns when all is written. Raises RuntimeError and ValueError where it can't be."""
+        for stream in self.streams:
+            stream.flush(timeout_sec=seconds)
+
+
+def disconnect(stream: rr.RecordingStream, seconds: float) -> bool:
+    """Whether the stream has ended in time. A viewer that hangs can hold this up: then it is left to a thread that dies
+    with the process."""
+    thread = threading.Thread(target=stream.disconnect, name="rerun-disconnect", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return not thread.is_alive()
+
+
+def _shaped(shape: Callable[..., rr.AsComponents], fields: dict[str, Any]) -> rr.AsComponents:
+    if "colors" in fields:
+        # Of a list of three or four, Rerun could not tell whether they are one.
+        fields = fields | {"colors": np.array(fields["colors"], np.uint32)}
+    return shape(**fields)
 
 
 class HolderRow(NamedTuple):
@@ -143,6 +180,14 @@ class Lanes:
     @property
     def rows(self) -> int:
         return sum(lane.rows for lane in self._lanes.values())
+
+    @property
+    def entities(self) -> dict[str, int]:
+        """Rows by entity."""
+        return {entity: lane.rows for entity, lane in self._lanes.items()}
+
+    def entity(self, name: str) -> str:
+        return clean_path(self._folder, name, self._depth)
 
     def texts(self, name: str) -> Mapping[str, int] | None:
         """The texts that have a colour in the lane of this name; None if there is no such lane."""

@@ -6,11 +6,14 @@ local time, of which the newest are kept."""
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import logging
+import os
 import re
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -29,12 +32,17 @@ RESTARTS: Final = 5
 PAUSE: Final = 1.0
 LONG_ENOUGH: Final = 60.0
 """A recorder that ran for this many seconds is no failure in a row any more."""
-GRACE: Final = 15.0
+GRACE: Final = 40.0
 """Seconds for the recorder to finish its file."""
+QUIET: Final = {"RUST_LOG": "error"}
+"""Rerun would warn of each file that is to have no footer before it is finished."""
 BAD_SETTINGS: Final = 2
 """Its exit code where trying again would not help."""
-KEEP: Final = 50
+KEEP: Final = 500
 """Recordings of one fleet in one folder; older ones are removed."""
+MEGABYTE: Final = 1_000_000
+HALF_DONE: Final = 3_600.0
+"""Seconds after which what was to become a finished recording is a leftover."""
 MAX_A_SECOND: Final = 100
 
 _ENDPOINT: Final = re.compile(r"([a-z]+)/(\[[^\]]*\]|[^:]*):(\d+)(.*)")
@@ -47,6 +55,8 @@ class RecorderJob(msgspec.Struct, frozen=True):
     recorder: RecorderConfig
     fleet: Fleet
     host: str
+    joined: bool = True
+    """Whether others may look at what it records: not at what ends with somebody's view."""
 
 
 class Recording(msgspec.Struct, frozen=True):
@@ -96,17 +106,44 @@ def new_recording(folder: Path, fleet: str) -> Path:
     raise BadInput(f"{folder} has {MAX_A_SECOND} recordings of this second; remove some")
 
 
-def prune(folder: Path, fleet: str, keep: int = KEEP) -> None:
-    """Removes all but the newest `keep` recordings of a fleet.
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """No other recorder removes the file meanwhile."""
+    with path.open("ab") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        yield
+
+
+def prune(folder: Path, fleet: str, keep: int = KEEP, limit: int | None = None) -> None:
+    """Removes the oldest recordings of a fleet, until at most `keep` are left, of `limit` bytes in all; but none that
+    is being written.
 
     Nothing is touched that is not named as `new_recording` names files."""
-    ours = re.compile(rf"{re.escape(fleet)}-\d{{8}}-\d{{6}}(-\d+)?\.rrd")
+    name = rf"{re.escape(fleet)}-\d{{8}}-\d{{6}}(-\d+)?"
+    ours, half_done = re.compile(rf"{name}\.rrd"), re.compile(rf"\.{name}\.finishing")
     try:
-        found = [path for path in folder.iterdir() if ours.fullmatch(path.name) and path.is_file()]
-        for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True)[keep:]:
-            path.unlink()
+        found = [(path, path.stat()) for path in folder.iterdir() if path.is_file()]
+        for path, stat in found:
+            if half_done.fullmatch(path.name) and time.time() - stat.st_mtime > HALF_DONE:
+                path.unlink()
+        recordings = [(path, stat) for path, stat in found if ours.fullmatch(path.name)]
+        size = 0
+        for number, (path, stat) in enumerate(sorted(recordings, key=lambda one: one[1].st_mtime_ns, reverse=True)):
+            size += stat.st_size
+            if (number >= keep or (limit is not None and size > limit)) and not _is_written(path):
+                path.unlink()
+                size -= stat.st_size
     except OSError as error:
         log.warning("old recordings in %s can't be removed: %s", folder, error.strerror)
+
+
+def _is_written(path: Path) -> bool:
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 class RecorderProcess:
@@ -159,6 +196,7 @@ class RecorderProcess:
             *("-m", "zscout.services.recorder"),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
+            env=os.environ | QUIET,
             start_new_session=True,
         )
         assert child.stdin is not None  # noqa: S101

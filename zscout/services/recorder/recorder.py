@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
+from collections.abc import Callable
 from contextlib import closing
 from typing import Final
 
 from zscout import messages
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
-from zscout.mesh import Declaration, Mesh, Supervisor
+from zscout.mesh import Declaration, IncomingQuery, Mesh, Supervisor
 from zscout.mesh.supervision import done_within
 from zscout.services.recorder.hosts import MAX_FOLLOWED
 from zscout.services.recorder.request_tracker import RequestTracker
@@ -46,13 +48,13 @@ MAX_REPORT: Final = 8_192
 MAX_POSES: Final = 65_536
 """Bytes."""
 
-EVENTS: Final = {
+PRESENCE: Final = {
     Role.NODE: ("node {host} is gone", "node {host} is there"),
-    Role.RCM: ("{host} does not lead any more", "{host} leads"),
     Role.RC: ("{name} is gone from {host}", "{name} is offered by {host}"),
     Role.CLIENT: ("client {host}/{name} left", "client {host}/{name} joined"),
 }
-"""By role: what is shown when its token goes, and when it comes."""
+"""By role: what is said when its token goes, and when it comes; not among the events."""
+LEADS: Final = ("{host} does not lead any more", "{host} leads")
 
 
 class RecorderFailed(RuntimeError):
@@ -65,9 +67,18 @@ class Recorder:
     Of each camera at most `frames` pictures a second are shown, and with 0 none are subscribed to: then the
     framegrabber sends none."""
 
-    def __init__(self, mesh: Mesh, fleet: Fleet, timeline: Timeline, frames: float = 2.0) -> None:
-        self.mesh, self.timeline, self.frames = mesh, timeline, frames
+    def __init__(
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        timeline: Timeline,
+        frames: float = 2.0,
+        where: Callable[[], messages.Recorded] | None = None,
+    ) -> None:
+        """`where` answers who asks for the recording; without it nobody is answered."""
+        self.mesh, self.timeline, self.frames, self._where = mesh, timeline, frames, where
         self._zero = mesh.now()
+        timeline.start_clock(time.time())
         self._hosts, self._robots = timeline.hosts, timeline.robots
         self._requests = RequestTracker(timeline, fleet.operator_priority)
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
@@ -93,6 +104,8 @@ class Recorder:
             self.mesh.watch(keys.alive_any(), guard(self._on_token)),
         ]
         self.mesh.watch_links()
+        if self._where is not None:
+            self._declared.append(self.mesh.serve(keys.recorded(self.mesh.me), messages.RecordedAsk, self._tell_where))
         # Apart: of what these miss, the RCM's state has nothing.
         behavior, poses = guard(self._on_behavior), guard(self._on_poses)
         robots = [
@@ -115,28 +128,33 @@ class Recorder:
             for declared in [*robots, *reversed(self._declared)]:
                 declared.close()
 
-    def _now(self) -> float:
+    def now(self) -> float:
+        """Seconds of the timeline."""
         return (self.mesh.now() - self._zero) / SECOND
 
+    def _tell_where(self, request: IncomingQuery[messages.RecordedAsk]) -> None:
+        if self._where is not None:
+            request.answer(self._where())
+
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
-        if self._requests.grants(self._now(), grants):
+        if self._requests.grants(self.now(), grants):
             self._wanted.set()
 
     def _on_notice(self, key: str, notice: messages.Notice) -> None:
         if str(self.mesh.keys.sender_of(key)) == notice.client:
-            self._requests.notice(self._now(), notice)
+            self._requests.notice(self.now(), notice)
 
     def _on_rc_state(self, key: str, state: messages.RcState) -> None:
         """A hold that ended at the device has ended, whether an RCM is there to publish it or not."""
         if self.mesh.keys.rc_of(key) != state.rc:
             return
-        at = self._now()
+        at = self.now()
         if state.ended:
             self._requests.dropped(at, state.rc, {ended.grant for ended in state.ended})
         self._robots.state(at, state)
 
     def _on_load(self, key: str, report: messages.LoadReport) -> None:
-        host, at = self.mesh.keys.host_of(key), self._now()
+        host, at = self.mesh.keys.host_of(key), self.now()
         if host == report.host:
             self._hosts.load(at, host, report.load_average[0], report.cpu / 100)
             self._hosts.uses(at, host, report.components)
@@ -153,14 +171,16 @@ class Recorder:
                 self._placer_wanted.set()
         elif bool(instances) == before:
             return
-        at = self._now()
+        at = self.now()
         if token.role == Role.CLIENT and not alive:
             self._robots.left(at, Sender(token.host, token.name))
         if token.role == Role.RC and token.name.startswith(CAMERAS) and self.frames:
             self._follow_camera(at, token.name, alive)
-        if token.role in EVENTS:
-            words = EVENTS[token.role][alive].format(host=token.host, name=token.name)
-            self.timeline.event(at, words, "INFO" if alive or token.role == Role.CLIENT else "WARN")
+        level = "INFO" if alive or token.role == Role.CLIENT else "WARN"
+        if token.role == Role.RCM:
+            self.timeline.event(at, LEADS[alive].format(host=token.host), level)
+        elif token.role in PRESENCE:
+            self.timeline.presence(at, PRESENCE[token.role][alive].format(host=token.host, name=token.name), level)
         # Before the state was read, nobody knows that a new RC is free.
         if token.role == Role.RC and self._caught_up:
             self._requests.rc(at, token.name, alive)
@@ -188,7 +208,7 @@ class Recorder:
         replies = await self.mesh.ask(key, ask, messages.RcmState, timeout=READ_TIMEOUT)
         states = [reply.message for reply in replies if reply.message is not None]
         newest = max(states, key=lambda state: (state.term, state.seq), default=None)
-        if newest is None or not self._requests.state(self._now(), newest):
+        if newest is None or not self._requests.state(self.now(), newest):
             return False
         if not self._caught_up:
             self._caught_up = True
@@ -210,20 +230,22 @@ class Recorder:
                 failed += 1
             else:
                 failed = 0
-                self._hosts.placements(self._now(), reply.message, fresher)
+                self._hosts.placements(self.now(), reply.message, fresher)
 
     def _on_placements(self, _key: str, news: messages.Placements) -> None:
         if self._fresher is not None and len(self._fresher) < MAX_FOLLOWED:
             self._fresher.update(one.component for one in news.components)
             self._fresher.update(news.forgotten)
-        self._hosts.placements(self._now(), news)
+        self._hosts.placements(self.now(), news)
 
     # Robots
 
     async def _tick(self) -> None:
         while True:
             await asyncio.sleep(TICK)
-            self._robots.tick(self._now())
+            at = self.now()
+            self._robots.tick(at)
+            self.timeline.regroup(at)
 
     def _follow_camera(self, at: float, camera: str, alive: bool) -> None:
         if alive and camera not in self._cameras and len(self._cameras) < MAX_CAMERAS:
@@ -238,16 +260,16 @@ class Recorder:
             while True:
                 frame = await watch.next(NO_PICTURE)
                 if frame is None:
-                    self._robots.no_frame(self._now(), camera)
+                    self._robots.no_frame(self.now(), camera)
                     continue
-                self._robots.frame(self._now(), camera, frame.head, frame.jpeg)
+                self._robots.frame(self.now(), camera, frame.head, frame.jpeg)
                 await asyncio.sleep(1 / self.frames)
 
     def _on_behavior(self, key: str, report: messages.BehaviorSaid) -> None:
-        self._robots.behavior(self._now(), self.mesh.keys.sender_of(key), report)
+        self._robots.behavior(self.now(), self.mesh.keys.sender_of(key), report)
 
     def _on_poses(self, key: str, poses: messages.BuildingPoses) -> None:
-        at = self._now()
+        at = self.now()
         self._robots.floor.poses(at, self.mesh.keys.sender_of(key), poses)
         if self._asking is None or self._asking.done():
             sender = self._robots.floor.wants_plan(at)
@@ -261,4 +283,4 @@ class Recorder:
         )
         for reply in replies:
             if reply.message is not None:
-                self._robots.floor.plan(self._now(), sender, reply.message)
+                self._robots.floor.plan(self.now(), sender, reply.message)

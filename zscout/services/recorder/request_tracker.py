@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, Revocation, absurd
+from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, Revocation, WaitView, absurd
+from zscout.scheduling.reason import ended, named, waits
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import NO_TERM, Grant, Term
@@ -24,11 +25,23 @@ Key = tuple[str, str]
 class _Request:
     label: str
     """The ARC's name; of several that are open at one time, a numbered one."""
+    who: str = ""
+    """Whose it is, where that was told."""
     state: str = ""
     detail: str = ""
     grant: Grant | None = None
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
     """The newest notice."""
+
+    def tell(self, told: Holder | HoldView | WaitView | Notice) -> None:
+        """Takes whose it is from what the RCM says of it."""
+        if told.who is not None and told.who.user:
+            self.who = named(told.who, told.client, told.arc)
+
+    @property
+    def subject(self) -> str:
+        """As a sentence about it begins."""
+        return f"{self.label} of {self.who}" if self.who else self.label
 
 
 class RequestTracker:
@@ -42,6 +55,8 @@ class RequestTracker:
         self._requests: dict[Key, _Request] = {}
         self._labels: set[str] = set()
         self._rcs = timeline.robots.holds
+        self._absent: dict[str, str] = {}
+        """What is said of RCs that are not there: they had holders, or could have had."""
 
     def grants(self, at: float, grants: Grants) -> bool:
         """What the RCM publishes; returns whether something before it was missed."""
@@ -69,9 +84,10 @@ class RequestTracker:
         if request is None or (notice.term, notice.step) <= request.last:
             return
         request.last = (notice.term, notice.step)
+        request.tell(notice)
         # That it runs is read from the publication. What was preempted stays so until it runs again.
         if notice.state == "queued" and request.state not in ("preempted", "running"):
-            self._waits(at, request, notice.reason)
+            self._waits(at, request, notice.reason, notice.why)
 
     def state(self, at: float, state: RcmState) -> bool:
         """The RCM's whole state; False if it is older than what was published."""
@@ -89,31 +105,43 @@ class RequestTracker:
             request = self._track((wait.client, wait.id), wait.arc)
             if request is None:
                 continue
+            request.tell(wait)
             if request.grant is not None or not request.state:
                 request.grant = None
                 if wait.preemptions:
-                    self._set(at, request, "preempted", wait.reason)
+                    self._set(at, request, "preempted", _blocked(wait.reason))
             if request.state != "preempted":
-                self._waits(at, request, wait.reason)
+                self._waits(at, request, wait.reason, wait.why)
         for key in [key for key in self._requests if key not in open_now]:
             # What the answer left out may still wait.
             if not state.more or self._requests[key].grant is not None:
                 self._ended(at, key, "ended", "while nobody listened")
+        # An RC of a request that nobody has yet offered is not there either, but nobody misses it.
+        for view in state.rcs:
+            if view.present:
+                self._absent.pop(view.rc, None)
+            elif view.rc in self._rcs:
+                self._absent.setdefault(view.rc, "not there")
         for rc, held in holders.items():
             self._show(at, rc, held)
         return True
 
     def rc(self, at: float, rc: str, alive: bool) -> None:
         """An RC has come or gone. One that is not known yet is free."""
+        was = self._absent.pop(rc, None)
+        if not alive and rc in self._rcs:
+            self._absent[rc] = "not there"
         if not alive or rc not in self._rcs:
             self._show(at, rc, [])
+        elif was is not None:
+            self._draw(at, rc)
 
     def dropped(self, at: float, rc: str, grants: set[Grant]) -> None:
         """These holds of an RC are over, by the RCM's word or by the RC's own."""
         held = self._rcs.get(rc, {})
         if grants & held.keys():
-            rows = self._rcs[rc] = {grant: holder for grant, holder in held.items() if grant not in grants}
-            self.timeline.holders(at, rc, list(rows.values()))
+            self._rcs[rc] = {grant: holder for grant, holder in held.items() if grant not in grants}
+            self._draw(at, rc)
 
     def _revoked(self, at: float, revoked: Revocation, grants: Grants) -> None:
         for rc in revoked.rcs:
@@ -125,13 +153,15 @@ class RequestTracker:
         request.grant = None
         match revoked.outcome:
             case "preempted":
-                party = revoked.why.by[0] if revoked.why is not None and revoked.why.by else None
-                by = f"by {party.arc}, priority {party.priority}" if party is not None else f"by {revoked.by}"
-                self._set(at, request, "preempted", by)
-                self.timeline.warn(at, f"{request.label} is preempted {by}, and waits again")
+                how = ended("preempted", revoked.reason)
+                self._set(at, request, "preempted", how.removeprefix("preempted "))
+                by = revoked.why.by if revoked.why is not None else []
+                operator = any(party.priority >= self.operator_priority for party in by)
+                self.timeline.warn(at, f"{request.subject} is {how}, and waits again", operator=operator)
+                self.timeline.contended(at, revoked.rcs)
             case "lost":
                 self._set(at, request, "waiting", revoked.reason)
-                self.timeline.warn(at, f"{request.label} lost its hold: {revoked.reason}")
+                self.timeline.warn(at, f"{request.subject} lost its hold: {revoked.reason}")
             case "handed_over":
                 self._move(at, revoked, grants)
             case outcome:
@@ -140,7 +170,7 @@ class RequestTracker:
     def _move(self, at: float, revoked: Revocation, grants: Grants) -> None:
         """The ARC goes on in another client: it keeps its lane."""
         request = self._requests.pop((revoked.client, revoked.id))
-        self.timeline.event(at, f"{request.label} goes on elsewhere: {revoked.reason}")
+        self.timeline.event(at, f"{request.subject} goes on elsewhere: {revoked.reason}")
         for holder in (holder for rc in revoked.rcs for holder in grants.rcs.get(rc, [])):
             if holder.id == revoked.id and holder.client != revoked.client and holder.arc == revoked.arc:
                 self._requests[holder.client, holder.id] = request
@@ -152,13 +182,20 @@ class RequestTracker:
         if request is None or request.grant == hold.grant:
             return
         request.grant = hold.grant
-        self._set(at, request, "running", f"priority {hold.priority} · min {float(hold.min_runtime):g} s")
-        self.timeline.event(at, f"{request.label} runs on {', '.join(sorted(_rcs_of(hold)))}")
+        request.tell(hold)
+        operator = hold.priority >= self.operator_priority
+        details = [f"priority {hold.priority}", f"min {float(hold.min_runtime):g} s", *filter(None, [request.who])]
+        self._set(at, request, "running", " · ".join(details), operator)
+        runs = f"{request.subject} runs on {', '.join(sorted(_rcs_of(hold)))}"
+        self.timeline.event(at, runs, operator=operator)
 
-    def _waits(self, at: float, request: _Request, reason: str) -> None:
-        if (request.state, request.detail) != ("waiting", reason):
-            self._set(at, request, "waiting", reason)
-            self.timeline.event(at, f"{request.label} waits: {reason}")
+    def _waits(self, at: float, request: _Request, reason: str, why: ReasonInfo | None) -> None:
+        if why is not None and why.by:
+            self.timeline.contended(at, why.rcs)
+        detail = _blocked(reason)
+        if (request.state, request.detail) != ("waiting", detail):
+            self._set(at, request, "waiting", detail)
+            self.timeline.event(at, f"{request.subject} {waits(reason)}")
 
     def _ended(self, at: float, key: Key, outcome: str, reason: str) -> None:
         request = self._requests.pop(key, None)
@@ -167,7 +204,7 @@ class RequestTracker:
         self._labels.discard(request.label)
         self.timeline.arc(at, request.label, "done", "" if outcome == "completed" else outcome)
         level = "WARN" if outcome == "client_lost" else "INFO"
-        self.timeline.event(at, f"{request.label} {outcome.replace('_', ' ')}: {reason}", level)
+        self.timeline.event(at, f"{request.subject} {ended(outcome, reason)}", level)
 
     def _track(self, key: Key, name: str) -> _Request | None:
         """The request, followed from now on; None where too many are open."""
@@ -181,21 +218,32 @@ class RequestTracker:
             request = self._requests[key] = _Request(label)
         return request
 
-    def _set(self, at: float, request: _Request, state: str, detail: str) -> None:
+    def _set(self, at: float, request: _Request, state: str, detail: str, operator: bool = False) -> None:
         request.state, request.detail = state, detail
-        self.timeline.arc(at, request.label, state, detail)
+        self.timeline.arc(at, request.label, state, detail, operator=operator)
+
+    def _label(self, client: str, number: str, arc: str) -> str:
+        request = self._requests.get((client, number))
+        return request.label if request is not None else arc
 
     def _show(self, at: float, rc: str, holders: Sequence[Holder | HoldView]) -> None:
         if rc not in self._rcs and len(self._rcs) >= MAX_RCS:
             return
         rows: dict[Grant, HolderRow] = {}
         for hold in holders:
-            request = self._requests.get((hold.client, hold.id))
-            label = request.label if request is not None else hold.arc
+            label = self._label(hold.client, hold.id, hold.arc)
             robots = tuple(sorted(name for name in _rcs_of(hold) if name.startswith("robot/")))
             rows[hold.grant] = HolderRow(label, hold.priority >= self.operator_priority, robots)
         self._rcs[rc] = rows
-        self.timeline.holders(at, rc, list(rows.values()))
+        self._draw(at, rc)
+
+    def _draw(self, at: float, rc: str) -> None:
+        self.timeline.holders(at, rc, list(self._rcs[rc].values()), self._absent.get(rc, ""))
+
+
+def _blocked(reason: str) -> str:
+    """Who is in its way: in a short bar only the beginning can be read."""
+    return reason.removeprefix("waits ")
 
 
 def _rcs_of(hold: Holder | HoldView) -> Iterable[str]:

@@ -145,6 +145,8 @@ class RobotTracker:
         self._behaviors = Lanes(drawing, "behavior", MAX_LANES, "behaviors: the others have no lane", depth=MAX_DEPTH)
         self._cameras: dict[str, _Camera] = {}
         self._health: dict[str, _Health] = {}
+        self._duplicates: dict[tuple[str, str], str] = {}
+        """By RC and host: for whom an instance stands by."""
         self._figures: dict[tuple[str, str], tuple[float, float]] = {}
         """When and what was drawn last, by RC and figure."""
 
@@ -299,7 +301,16 @@ class RobotTracker:
     # Devices
 
     def state(self, at: float, state: RcState) -> None:
-        """What an RC publishes of itself: its device's figures, and its health."""
+        """What an RC publishes of itself: its device's figures, and its health; or that it stands by."""
+        instance = state.rc, state.host
+        if state.duplicate_of != self._duplicates.get(instance, "") and len(self._duplicates) < MAX_FOLLOWED:
+            self._duplicates[instance] = state.duplicate_of
+            stands = f"stands by: duplicate of {state.duplicate_of}" if state.duplicate_of else "serves"
+            (self._drawing.warn if state.duplicate_of else self._drawing.event)(
+                at, f"{state.rc} at {state.host} {stands}"
+            )
+        if state.duplicate_of:
+            return
         if state.figures:
             self._draw_figures(at, state.rc, state.figures)
         if state.rc in self._health or (state.health != "ok" and len(self._health) < MAX_FOLLOWED):

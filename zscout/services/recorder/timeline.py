@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 import rerun as rr
-import rerun.blueprint as rrb
 
 from zscout.config.strict import BadInput
-from zscout.services.recorder.blueprint import APPLICATION, LIVE_HOST_ROWS, LIVE_ROWS, NO_ROBOTS, blueprint
-from zscout.services.recorder.colours import OPERATOR, OTHER, PALETTE, STATES
-from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_text, with_detail
+from zscout.services.recorder.blueprint import APPLICATION, LIVE_HOST_ROWS, LIVE_ROWS, NO_ROBOTS, Layout, blueprint
+from zscout.services.recorder.colours import ABSENT, OPERATOR, OTHER, PALETTE, STATES
+from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_text, disconnect, with_detail
+from zscout.services.recorder.finish import Job, finish
 from zscout.services.recorder.hosts import HostTracker
 from zscout.services.recorder.robots import RobotTracker
+
+log = logging.getLogger(__name__)
 
 SERVER_MEMORY: Final = "200MB"
 """What the live server keeps for viewers that come late; the oldest goes first."""
@@ -29,6 +32,13 @@ MAX_COLOURS: Final = 10_000
 ARC_STATES: Final = 16
 OPERATOR_MARK: Final = " (operator)"
 """Follows the ARC's name in an RC's lane where an operator holds it."""
+CONTENDED: Final = 300.0
+"""Seconds for which an RC for which nobody waits any more stands among the contended ones of a live view."""
+REGROUP: Final = 5.0
+"""Seconds between two times at which a live view's RCs may change their panes."""
+FILE_TICK: Final = 1.0
+"""Seconds for which a file gathers what it writes: a file that is written to its end is made of few, large chunks
+only then, and one whose recorder was killed stays as it is."""
 FLUSH_SECONDS: Final = 5.0
 DISCONNECT_SECONDS: Final = 8.0
 
@@ -42,14 +52,19 @@ class Timeline(Drawing):
 
     `fleet` names the recording, together with the time of the start. `path`: the `.rrd` file, replaced if it is there,
     or None. `port`: the live server's TCP port on the IP address `bind`, 0 for a free one, or None for no server; one
-    of file and server there must be. Raises TimelineError if the port is taken or the file can't be written."""
+    of file and server there must be. `wall`: the timeline has wall-clock times, once `start_clock` was called. Raises
+    TimelineError if the port is taken or the file can't be written."""
 
-    def __init__(self, fleet: str, *, path: Path | None, bind: str = "127.0.0.1", port: int | None = None) -> None:
-        start = datetime.now(UTC)
-        super().__init__(rr.RecordingStream(APPLICATION, recording_id=f"{fleet}-{start.strftime('%Y%m%dT%H%M%S.%fZ')}"))
+    def __init__(
+        self, fleet: str, *, path: Path | None, bind: str = "127.0.0.1", port: int | None = None, wall: bool = False
+    ) -> None:
+        super().__init__()
+        self._fleet, self._wall = fleet, wall
         self.url: str | None = None
         """Where a viewer finds the live server: `rerun URL`."""
-        self._path = path
+        self._path: Path | None = None
+        self._live: rr.RecordingStream | None = None
+        self._file: rr.RecordingStream | None = None
         self._arcs: set[str] = set()
         self._colours: dict[str, int] = {}
         """Of ARCs and components, by order of appearance: a component has that of the ARC with its name."""
@@ -57,57 +72,125 @@ class Timeline(Drawing):
         self._arc_lanes = Lanes(self, "arc", MAX_ARCS, "ARCs: the others have no lane", colours=ARC_STATES)
         self.hosts = HostTracker(self, self._colour_of)
         self.robots = RobotTracker(self)
-        self._arranged: object = (False, NO_ROBOTS)
-        self.recording.set_log_time_enabled(False)
-        self.recording.set_log_tick_enabled(False)
-        self._open(path, bind, port)
-        self.recording.send_recording_name(f"{fleet}, {start:%Y-%m-%d %H:%M:%S} UTC")
-        self.recording.send_recording_start_time_nanos(int(start.timestamp() * 1e9))
-
-    def _open(self, path: Path | None, bind: str, port: int | None) -> None:
-        sinks: list[rr.GrpcServerSink | rr.FileSink] = []
+        self._arranged: object = (False, NO_ROBOTS, (), ())
+        self._contended: dict[str, float] = {}
+        """When somebody waited last for an RC, by entity."""
+        self._absent: set[str] = set()
+        self._grouped = -REGROUP
+        """When RCs were grouped last for the live view."""
+        self._groups: tuple[tuple[str, ...], tuple[str, ...]] = (), ()
         if port is not None:
             port = _free_port(bind, port)
             host = f"[{bind}]" if ":" in bind else bind
             self.url = f"rerun+http://{host}:{port}/proxy"
-            sinks.append(rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=SERVER_MEMORY))
+            server = rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=SERVER_MEMORY)
+            self._live = self._open(server, self.url)
         if path is not None:
             try:
-                path.open("ab").close()
-            except OSError as error:
-                raise TimelineError(
-                    f"timeline: can't write the recording {path} ({error.strerror}); "
-                    "give a file in a directory that is there and can be written"
-                ) from error
-            sinks.append(rr.FileSink(path))
-        try:
-            self.recording.set_sinks(*sinks, default_blueprint=blueprint())
-            # The server comes up in a thread of its own; only a flush shows its failure.
-            self.recording.flush(timeout_sec=FLUSH_SECONDS)
-        except (RuntimeError, ValueError) as error:
-            self.disconnect(DISCONNECT_SECONDS)
-            raise TimelineError(
-                f"timeline: can't write to {path or self.url} ({error}); make room there, or choose another"
-            ) from error
+                self._file = self._open_file(path)
+            except TimelineError:
+                self._end()
+                raise
 
-    def holders(self, at: float, rc: str, holders: Sequence[HolderRow]) -> None:
-        """From `at` on, the RC (`kind/name`) is held by exactly these ARCs; by nobody if empty.
+    def _open_file(self, path: Path) -> rr.RecordingStream:
+        try:
+            path.open("ab").close()
+        except OSError as error:
+            raise TimelineError(
+                f"timeline: can't write the recording {path} ({error.strerror}); "
+                "give a file in a directory that is there and can be written"
+            ) from error
+        # A footer needs memory for each chunk, for as long as a fleet is recorded. The finished file has one.
+        stream = self._open(rr.FileSink(path, write_footer=not self._wall), str(path), FILE_TICK)
+        self._path = path
+        return stream
+
+    def _open(self, sink: rr.GrpcServerSink | rr.FileSink, where: str, tick: float | None = None) -> rr.RecordingStream:
+        start = datetime.now(UTC)
+        stream = rr.RecordingStream(
+            APPLICATION,
+            recording_id=f"{self._fleet}-{start.strftime('%Y%m%dT%H%M%S.%fZ')}",
+            batcher_config=rr.ChunkBatcherConfig(flush_tick=tick) if tick is not None else None,
+        )
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+        try:
+            stream.set_sinks(sink, default_blueprint=blueprint(Layout(wall=self._wall)))
+            # The server comes up in a thread of its own; only a flush shows its failure.
+            stream.flush(timeout_sec=FLUSH_SECONDS)
+        except (RuntimeError, ValueError) as error:
+            disconnect(stream, DISCONNECT_SECONDS)
+            raise TimelineError(
+                f"timeline: can't write to {where} ({error}); make room there, or choose another"
+            ) from error
+        stream.send_recording_name(f"{self._fleet}, {start:%Y-%m-%d %H:%M:%S} UTC")
+        stream.send_recording_start_time_nanos(round(start.timestamp() * 1e9))
+        self.streams.append(stream)
+        return stream
+
+    def start_clock(self, epoch: float) -> None:
+        """Second 0 is `epoch`, as `time.time()` has it. Nothing where the timeline has durations."""
+        if self._wall:
+            self.epoch = epoch
+            for stream in self.streams:
+                stream.send_recording_start_time_nanos(round(epoch * 1e9))
+
+    def roll(self, at: float, path: Path) -> Job | None:
+        """Goes on in another file, which begins with what is shown now; returns what there is to finish, if the file
+        before it could be written. Raises TimelineError where the new one can't be: then all stays as it is."""
+        before, old, layout = self._file, self._path, self.layout(live=False)
+        if before is None or old is None or self.closed:
+            return None
+        self._file = self._open_file(path)
+        self.restate(self._file, at)
+        self._file.send_blueprint(blueprint(self.layout(live=True)))
+        self.streams.remove(before)
+        self.begin = self.end = at
+        self._contended = {entity: since for entity, since in self._contended.items() if at - since <= CONTENDED}
+        return Job(old, layout) if disconnect(before, DISCONNECT_SECONDS) else None
+
+    def holders(self, at: float, rc: str, holders: Sequence[HolderRow], absent: str = "") -> None:
+        """From `at` on, the RC (`kind/name`) is held by exactly these ARCs; by nobody if empty. `absent` says in words
+        that it is not there.
 
         Several holders get a row each. A row reads the ARC's name, with `OPERATOR_MARK` for an operator's."""
-        shown: dict[str, tuple[str, int]] = {}
+        entity = self._rc_lanes.entity(rc)
+        (self._absent.add if absent else self._absent.discard)(entity)
+        shown: dict[str, tuple[str, int]] = {absent: (clean_text(absent), ABSENT)} if absent and not holders else {}
         for holder in holders:
             name = clean_text(holder.arc) + (OPERATOR_MARK if holder.operator else "")
             shown[name] = name, OPERATOR if holder.operator else self._colour(at, holder.arc)
         self._rc_lanes.show(at, rc, shown)
 
-    def arc(self, at: float, arc: str, state: str, detail: str = "") -> None:
+    def contended(self, at: float, rcs: Iterable[str]) -> None:
+        """Somebody waits for these RCs: they are shown first."""
+        for entity in map(self._rc_lanes.entity, rcs):
+            if entity in self._contended or len(self._contended) < MAX_RCS:
+                self._contended[entity] = at
+
+    def regroup(self, at: float) -> None:
+        """What time alone brings: call it now and then."""
+        if at - self._grouped >= REGROUP:
+            self._grouped = at
+            self._groups = self._grouped_rcs(at - CONTENDED)
+            self.arrange()
+
+    def _grouped_rcs(self, since: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Entities of RCs that somebody has waited for since then, and of those that are not there."""
+        there = self._rc_lanes.entities.keys() - self._absent
+        contended = (entity for entity, at in self._contended.items() if at >= since and entity in there)
+        return tuple(sorted(contended)), tuple(sorted(self._absent))
+
+    def arc(self, at: float, arc: str, state: str, detail: str = "", *, operator: bool = False) -> None:
         """From `at` on, the ARC is in `state`: "waiting", "running", "preempted", "done" or another word.
 
-        `detail` says more in the same bar, as why it waits. An empty `state` ends the lane."""
+        `detail` says more in the same bar, as why it waits. An empty `state` ends the lane. What an `operator` runs has
+        an operator's colour."""
         self._colour(at, arc)
         if arc in self._arcs:
             text = with_detail(state, detail)
-            self._arc_lanes.show(at, arc, {text: (text, STATES.get(state, OTHER))})
+            colour = OPERATOR if operator and state == "running" else STATES.get(state, OTHER)
+            self._arc_lanes.show(at, arc, {text: (text, colour)})
 
     def close(self) -> None:
         """Ends file and server, within seconds. The file then opens on the whole run.
@@ -116,17 +199,30 @@ class Timeline(Drawing):
         if self.closed:
             return
         self.closed = True
-        if self.end >= self.begin:
-            self.recording.send_blueprint(self._layout(live=False))
+        layout = self.layout(live=False)
+        if layout.span is not None:
+            for stream in self.streams:
+                stream.send_blueprint(blueprint(layout))
+        ended = False
         try:
-            self.recording.flush(timeout_sec=FLUSH_SECONDS)
+            self.flush(FLUSH_SECONDS)
         except (RuntimeError, ValueError) as error:
             raise TimelineError(
                 f"timeline: the end of the recording {self._path or self.url} may be missing ({error}); "
                 "is there room on the disk?"
             ) from error
         finally:
-            self.disconnect(DISCONNECT_SECONDS)
+            ended = self._end()
+        if ended and self._path is not None and self._path.is_file():
+            try:
+                finish(self._path, layout)
+            except (OSError, RuntimeError, ValueError) as error:
+                log.warning("the recording %s stays as it was written, and opens slowly: %s", self._path, error)
+
+    def _end(self) -> bool:
+        """Whether the file was written to its end; a viewer that hangs holds up the server alone."""
+        ended = {id(stream): disconnect(stream, DISCONNECT_SECONDS) for stream in reversed(self.streams)}
+        return ended.get(id(self._file), False)
 
     def __enter__(self) -> Timeline:
         return self
@@ -139,21 +235,28 @@ class Timeline(Drawing):
         has no use for empty panes."""
         robots = self.robots.shown
         robots = robots._replace(behavior_rows=min(robots.behavior_rows, 1)) if robots.any else NO_ROBOTS
-        now = self.hosts.placing, robots
+        now = self.hosts.placing, robots, *self._groups
         if now != self._arranged and not self.closed:
             self._arranged = now
-            self.recording.send_blueprint(self._layout(live=True))
+            layout = blueprint(self.layout(live=True))
+            for stream in self.streams:
+                stream.send_blueprint(layout)
 
-    def _layout(self, *, live: bool) -> rrb.Blueprint:
+    def layout(self, *, live: bool) -> Layout:
         """Panes for what there is; those of a live view may fill yet."""
         robots = self.robots.shown
         rc_rows, arc_rows, host_rows = (lanes.rows for lanes in (self._rc_lanes, self._arc_lanes, self.hosts.lanes))
         if live:
             least = LIVE_ROWS if robots.any else 1
             rc_rows, arc_rows, host_rows = max(rc_rows, least), max(arc_rows, least), LIVE_HOST_ROWS
-        return blueprint(
-            None if live else (self.begin, self.end),
-            rc_rows=rc_rows,
+        rows, zero = self._rc_lanes.entities, self.epoch or 0.0
+        contended, absent = self._groups if live else self._grouped_rcs(self.begin)
+        return Layout(
+            span=None if live or self.end < self.begin else (zero + self.begin, zero + self.end),
+            wall=self._wall,
+            rc_rows=self._rc_lanes.rows if contended or absent else rc_rows,
+            contended={entity: rows[entity] for entity in contended},
+            absent={entity: rows[entity] for entity in absent if entity in rows},
             arc_rows=arc_rows,
             host_rows=host_rows if self.hosts.placing else 0,
             robots=robots,

@@ -1,0 +1,121 @@
+"""Times of day beside spans, and whose a hold is and until when, as people read them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from datetime import datetime, tzinfo
+from decimal import Decimal
+
+import pytest
+
+from zscout import terminal
+from zscout.cli.requests.waiting import hold_text, reason_text, whose
+from zscout.messages import HoldView, ReasonInfo, ReasonParty, Who
+from zscout.terminal import clock
+from zscout.types import Grant, Place, Term
+
+NOW = datetime(2026, 3, 9, 14, 2, 30, 500_000)  # noqa: DTZ001 - this host's own clock
+TERM = Term(1, "rcm")
+DAY = 86_400
+
+
+class Stopped(datetime):
+    """A clock that stands."""
+
+    @classmethod
+    def now(cls, tz: tzinfo | None = None) -> Stopped:
+        return cls.fromtimestamp(NOW.timestamp(), tz)
+
+
+@pytest.fixture(autouse=True)
+def stopped(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with monkeypatch.context() as patch:
+        patch.setenv("TZ", "Europe/Berlin")
+        time.tzset()
+        patch.setattr(terminal, "datetime", Stopped)
+        yield
+    time.tzset()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text", "at_latest"),
+    [
+        (0, "14:02:30", "14:02:31"),
+        (-30, "14:02:00", "14:02:01"),
+        (119, "14:04:29", "14:04:30"),
+        (1800, "14:32", "14:33"),
+        (-600, "13:52", "13:53"),
+        (29.5 + 120, "14:05", "14:05"),
+        (DAY, "Mar 10 14:02", "Mar 10 14:03"),
+        (-DAY * 30, "Feb 7 14:02", "Feb 7 14:03"),
+        (DAY * 300, "2027-01-03 14:02", "2027-01-03 14:03"),
+        # In between the clocks are put forward.
+        (DAY * 30, "Apr 8 15:02", "Apr 8 15:03"),
+        (float("inf"), "2057-11-15 15:49", "2057-11-15 15:50"),
+    ],
+)
+def test_a_time_of_day_by_the_readers_clock(seconds: float, text: str, at_latest: str) -> None:
+    assert (clock(seconds), clock(seconds, at_latest=True)) == (text, at_latest)
+
+
+def hold(*, keep: bool, remaining: float, priority: int = 1, who: Who | None = None) -> HoldView:
+    grant, place = Grant(TERM, 1), Place(TERM, 1)
+    return HoldView(
+        "a1", "survey", "ws1/c1", priority, grant, place, {"robot/a": {}}, Decimal(60), 600, remaining, keep, who=who
+    )
+
+
+ALICE = Who("alice", "", "survey.py", "night\x1b run")
+
+
+@pytest.mark.parametrize(
+    ("view", "priority", "text"),
+    [
+        (
+            hold(keep=False, remaining=1800, who=ALICE),
+            0,
+            "alice@ws1 (survey.py), priority 1, since 13:52 (10 min), until 14:33 (30 min) at the latest: night  run",
+        ),
+        (
+            hold(keep=True, remaining=1800),
+            1,
+            "ws1/c1 (survey), priority 1, since 13:52 (10 min), until 14:33 (30 min) at the latest",
+        ),
+        (
+            hold(keep=True, remaining=1800),
+            0,
+            (
+                "ws1/c1 (survey), priority 1, since 13:52 (10 min), until 14:33 (30 min) at least, "
+                "and kept for as long as it wants"
+            ),
+        ),
+        (
+            hold(keep=True, remaining=-5),
+            0,
+            "ws1/c1 (survey), priority 1, since 13:52 (10 min), kept for as long as it wants",
+        ),
+        (
+            hold(keep=True, remaining=-5),
+            2,
+            "ws1/c1 (survey), priority 1, since 13:52 (10 min), its minimum runtime is over",
+        ),
+    ],
+)
+def test_whose_a_hold_is_since_and_until_when(view: HoldView, priority: int, text: str) -> None:
+    assert hold_text(view, priority) == text
+
+
+def test_a_reason_is_told_with_times_of_day_where_the_rcm_gave_durations() -> None:
+    party = ReasonParty("a1", "survey", "ws1/c1", 1, ALICE, 1830)
+    why = ReasonInfo("held", ["framegrabber/fg1"], [party], count=1)
+    assert whose(party) == "alice@ws1 (survey.py)"
+    assert reason_text("in words", why, age=30) == (
+        "waits for alice@ws1 (survey.py): framegrabber/fg1, until 14:33 at the latest"
+    )
+    # An RCM that tells less, or more than is known here.
+    assert reason_text("in words", None) == "in words"
+    assert reason_text("in words", ReasonInfo("another", ["robot/a"])) == "in words"
+    assert reason_text("in words", ReasonInfo("held", ["robot/a", "robot/b"], [party])) == (
+        "waits for alice@ws1 (survey.py): robot/a, until 14:34 at the latest"
+    )

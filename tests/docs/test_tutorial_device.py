@@ -1,0 +1,100 @@
+"""docs/tutorial-device.md, followed to the letter: its files, its commands, and what they are said to print."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.cli import tools
+from tests.hang import HANG
+from tests.live.lab import Lab
+from tests.live.test_recorder import ended, free_port, recorded, recording, until
+from tests.services.recorder.paper_run import lanes, rows
+
+PAGE = (Path(__file__).parents[2] / "docs" / "tutorial-device.md").read_text()
+MOST_LINES = 50
+
+
+def blocks(kind: str) -> list[str]:
+    found = re.findall(r"^```(\w*)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    return [text for of, text in found if of == kind]
+
+
+def files() -> dict[str, str]:
+    """What the page has its reader write, by name: it stands in the first line."""
+    found = {}
+    for text in (*blocks("toml"), *blocks("python")):
+        name, _, rest = text.partition("\n")
+        found[name.removeprefix("# ")] = rest
+    return found
+
+
+def commands() -> list[str]:
+    return [line for block in blocks("") for line in block.splitlines()]
+
+
+def test_it_takes_at_most_50_lines_of_python() -> None:
+    lines = [line for name, text in files().items() if name.endswith(".py") for line in text.splitlines() if line]
+    assert len(lines) <= MOST_LINES
+
+
+@pytest.mark.live
+def test_a_device_of_ones_own_is_held_commanded_and_on_the_timeline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, text in files().items():
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text(text)
+    install, touch, node, request, blink, view = commands()
+    assert (install, touch, node, blink) == (
+        "pip install ./lamp", "touch brightness", "zscout-node node.toml", "python blink.py"
+    )  # fmt: skip
+    assert view.startswith("zscout view")
+    # Into a folder of its own, without the index: this environment belongs to others, and has what it needs.
+    pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", "site")
+    subprocess.run([*pip, "./lamp"], check=True, timeout=HANG)
+    lamp = tmp_path / "brightness"
+    lamp.touch()
+    text = files()["node.toml"].replace("[node]\n", '[node]\nfleet = "fleet.toml"\n')
+    Path("node.toml").write_text(f"{text}port = {free_port()}\n")
+
+    def bright(path: Path) -> set[float]:
+        return {value for _, _, values in rows(path, "/device/**", "Scalars:scalars") for value in values}
+
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.env |= {"PYTHONPATH": ":".join([str(tmp_path / "site"), *sys.path])}
+            lab.nodes["anvil"] = lab.spawn([sys.executable, "-m", "zscout.node", "node.toml"], log="anvil.log")
+            client = await lab.client("crew")
+            await lab.ready(client, "lamp/desk")
+            await recording(lab)
+            program, _, rest = request.partition(" --name ")
+            assert (program, rest.split()[:2]) == ("zscout request lamp/desk", ["reading", "--"])
+            script = rest.partition("sh -c ")[2].strip("'")
+            held = await tools.zscout_soon(
+                "request", "lamp/desk", "--name", "reading", "--", "sh", "-c", script, env=lab.env
+            )
+            assert (held.returncode, held.stdout.splitlines()[-1:]) == (0, ["I hold lamp/desk"]), held.stderr
+
+            blinked = await asyncio.to_thread(
+                subprocess.run, [sys.executable, "blink.py"], env=lab.env, capture_output=True, text=True, timeout=HANG
+            )
+            assert blinked.returncode == 0, blinked.stderr
+            assert blinked.stdout == blocks("text")[0]
+            await lab.held_by(client, "lamp/desk")
+            await until(lambda: lamp.read_text() == "0\n")
+            status = await tools.zscout_soon("status", env=lab.env)
+            assert "lamp/desk" in status.stdout
+            await recorded(
+                tmp_path / "runs",
+                lambda path: {50.0, 200.0, 0.0} <= bright(path) and "blink" in str(lanes(path, "/rc/**")),
+            )
+            await ended(lab, "anvil")
+
+    asyncio.run(story())

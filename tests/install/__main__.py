@@ -1,0 +1,269 @@
+"""`python -m tests.install`: the wheel of this tree in clean environments, with pip, pipx and uv, and the light
+installation of it. Each has to run a node and a request; prints how long it took and what it takes on disk.
+
+Packages come from the index that pip is configured with. Where pipx and uv can't be had they are skipped."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from tests.hang import HANG
+from zscout.keyexpr import new_instance
+
+ROOT: Final = Path(__file__).parents[2]
+REQUIREMENTS: Final = ROOT / "requirements"
+LIGHT_MB: Final = 150
+LEFT_OUT: Final = ("numpy", "cv2", "rerun")
+INSTALL: Final = 1_200.0
+"""Seconds for one installation."""
+CLEAN: Final = {
+    name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV", "ZSCOUT"))
+}
+
+
+class CheckFailed(Exception):
+    """An installation does not do what it should."""
+
+
+def run(
+    *command: object, cwd: Path, env: Mapping[str, str] = CLEAN, timeout: float = HANG, check: bool = True
+) -> subprocess.CompletedProcess[str]:
+    """Runs a program to its end. Raises CheckFailed, with its output, where it fails."""
+    words = [str(word) for word in command]
+    try:
+        done = subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, timeout=timeout, check=False)
+    except subprocess.TimeoutExpired:
+        raise CheckFailed(f"{' '.join(words)} did not end within {timeout:g} s") from None
+    if check and done.returncode:
+        raise CheckFailed(f"{' '.join(words)} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
+    return done
+
+
+def expect(found: bool, what: str) -> None:
+    if not found:
+        raise CheckFailed(what)
+
+
+def megabytes(folder: Path) -> float:
+    """What it takes on disk, in 10^6 bytes."""
+    return sum(path.lstat().st_blocks for path in folder.rglob("*")) * 512 / 1e6
+
+
+def make_environment(folder: Path) -> None:
+    run(sys.executable, "-m", "venv", folder, cwd=folder.parent, timeout=INSTALL)
+
+
+# Ways to install; each returns the folder that has the programs
+
+
+def by_pip(wheel: Path, folder: Path) -> Path:
+    make_environment(folder)
+    run(folder / "bin/python", "-m", "pip", "install", "--quiet", wheel, cwd=folder, timeout=INSTALL)
+    return folder / "bin"
+
+
+def by_pipx(tools: Path, wheel: Path, folder: Path) -> Path:
+    homes = {"PIPX_HOME": str(folder), "PIPX_BIN_DIR": str(folder / "bin"), "PIPX_MAN_DIR": str(folder / "man")}
+    folder.mkdir()
+    run(tools / "pipx", "install", "--python", sys.executable, wheel, cwd=folder, env=CLEAN | homes, timeout=INSTALL)
+    return folder / "bin"
+
+
+def by_uv(tools: Path, wheel: Path, folder: Path) -> Path:
+    homes = {"UV_TOOL_DIR": str(folder), "UV_TOOL_BIN_DIR": str(folder / "bin"), "UV_LINK_MODE": "copy"}
+    index = run(sys.executable, "-m", "pip", "config", "get", "global.index-url", cwd=folder.parent, check=False)
+    if index.returncode == 0 and "UV_DEFAULT_INDEX" not in CLEAN:  # uv does not read what pip is told
+        homes["UV_DEFAULT_INDEX"] = index.stdout.strip()
+    folder.mkdir()
+    command = (tools / "uv", "tool", "install", "--quiet", "--python", sys.executable, wheel)
+    run(*command, cwd=folder, env=CLEAN | homes, timeout=INSTALL)
+    return folder / "bin"
+
+
+def light(wheel: Path, folder: Path) -> Path:
+    make_environment(folder)
+    pip = (folder / "bin/python", "-m", "pip", "install", "--quiet")
+    run(*pip, "--require-hashes", "-r", REQUIREMENTS / "light.txt", cwd=folder, timeout=INSTALL)
+    run(*pip, "--no-deps", wheel, cwd=folder, timeout=INSTALL)
+    return folder / "bin"
+
+
+# What each has to do
+
+
+class Fleet:
+    """A fleet of one node, apart from every other on this machine."""
+
+    def __init__(self, programs: Path, folder: Path) -> None:
+        self.programs, self.folder = programs, folder
+        folder.mkdir()
+        port = 20_000 + os.getpid() % 40_000
+        (folder / "fleet.toml").write_text(
+            f'[fleet]\nname = "install-{new_instance()}"\n'
+            f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\ninterface = "lo"\n'
+        )
+
+    def file(self, rcs: str) -> Path:
+        path = self.folder / "node.toml"
+        path.write_text(f'[node]\nhost = "small"\nfleet = "fleet.toml"\n{rcs}')
+        return path
+
+    def zscout(self, *args: object, check: bool = True) -> subprocess.CompletedProcess[str]:
+        env = CLEAN | {"ZSCOUT_FLEET": str(self.folder / "fleet.toml")}
+        return run(self.programs / "zscout", *args, cwd=self.folder, env=env, check=check)
+
+    def refused(self, rcs: str) -> str:
+        """What a node says that does not begin."""
+        done = run(self.programs / "zscout-node", self.file(rcs), cwd=self.folder, check=False)
+        expect(done.returncode == 2, f"zscout-node ended with {done.returncode}: {done.stderr}")
+        return done.stderr
+
+    @contextmanager
+    def node(self, rcs: str) -> Iterator[None]:
+        """A node in peace: it ends with 0."""
+        log = self.folder / "node.log"
+        with log.open("wb") as out:
+            command = [str(self.programs / "zscout-node"), str(self.file(rcs))]
+            node = subprocess.Popen(command, cwd=self.folder, env=CLEAN, stdout=out, stderr=out)
+        try:
+            yield
+            node.terminate()
+            expect(node.wait(HANG) == 0, f"the node ended with {node.returncode}:\n{log.read_text()}")
+        finally:
+            node.kill()
+            node.wait()
+
+    def request(self, *args: str) -> subprocess.CompletedProcess[str]:
+        """Asks until the node is there and serves it."""
+        deadline = time.monotonic() + HANG
+        while (done := self.zscout("request", *args, check=False)).returncode:
+            log = (self.folder / "node.log").read_text()
+            expect(time.monotonic() < deadline, f"request {args}: {done.returncode} {done.stderr}\n{log}")
+        return done
+
+
+@contextmanager
+def serial_line() -> Iterator[str]:
+    """A port whose other end takes what is written."""
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+
+    def take() -> None:
+        while True:
+            try:
+                os.read(ours, 4_096)
+            except OSError:
+                return
+
+    threading.Thread(target=take, daemon=True).start()
+    yield os.ttyname(theirs)
+    os.close(theirs)
+
+
+def check_whole(programs: Path, folder: Path) -> None:
+    fleet = Fleet(programs, folder)
+    expect("zscout" in fleet.zscout("--version").stdout, "zscout --version says nothing")
+    # The script's first line names its interpreter.
+    python = (programs / "zscout").read_text().splitlines()[0].removeprefix("#!")
+    run(python, "-c", f"import {', '.join(LEFT_OUT)}", cwd=folder)
+    with fleet.node('[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'):
+        fleet.request("robot/a", "--", "true")
+    fleet.zscout("replay", ROOT / "examples/workload.toml", "--json")
+
+
+def check_light(programs: Path, folder: Path) -> None:
+    fleet = Fleet(programs, folder)
+    for module in LEFT_OUT:
+        found = run(programs / "python", "-c", f"import {module}", cwd=folder, check=False)
+        expect(found.returncode != 0, f"{module} is there")
+    tell = '["sh", "-c", "echo $ZSCOUT_DO >> told"]'
+    with (
+        serial_line() as port,
+        fleet.node(
+            f'[[rc]]\nname = "psu/bench"\ndriver = "command"\nstart = {tell}\nstop = {tell}\nsafe = {tell}\n'
+            f'[[rc]]\nname = "radio/rf0"\ndriver = "radio"\nport = "{port}"\n'
+            '[[rc]]\nname = "link/a"\ndriver = "capacity"\ncapacity = { rate = 10 }\n'
+            '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
+        ),
+    ):
+        rcs = ("psu/bench", "radio/rf0:command_rate=5", "link/a:rate=2", "robot/a")
+        held = fleet.request(*rcs, "--", "sh", "-c", "echo I hold $ZSCOUT_RCS")
+        expect("psu/bench" in held.stdout, f"the command did not run: {held.stdout}")
+        client = (
+            "import zscout\n"
+            "with zscout.connect() as lab, lab.hold('py', {'robot/a': {}}, min_runtime=60) as held:\n"
+            "    print(held.command('robot/a', {'name': 'echo', 'value': 'hello'}))\n"
+        )
+        env = CLEAN | {"ZSCOUT_FLEET": str(folder / "fleet.toml")}
+        said = run(programs / "python", "-c", client, cwd=folder, env=env)
+        expect(said.stdout == "hello\n", f"the client got {said.stdout!r}")
+        expect("psu/bench" in fleet.zscout("status").stdout, "status does not show it")
+    told = (folder / "told").read_text().split()
+    expect(told[:4] == ["safe", "start", "stop", "safe"], f"the commands were run as {told}")
+    # What is missing is named, with the command that brings it.
+    line = fleet.refused('[[rc]]\nname = "framegrabber/f"\ndriver = "framegrabber"\nsource = "/dev/video0"\n')
+    expect(len(line.splitlines()) == 1 and "pip install" in line, f"a framegrabber is refused with {line}")
+    for args, package in ((("watch", "--source", "x.avi"), "opencv-python-headless"), (("view", "--web"), "rerun-sdk")):
+        done = fleet.zscout(*args, check=False)
+        last = (done.stderr.splitlines() or [""])[-1]
+        expect(done.returncode != 0 and package in last and "pip install" in last, f"{args}: {done.stderr}")
+
+
+def main() -> int:
+    failed = 0
+    rows: list[tuple[str, str, str]] = []
+    with tempfile.TemporaryDirectory(prefix="zscout-install-") as name:
+        folder = Path(name)
+        build = (sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation")
+        run(*build, "--wheel-dir", folder, ROOT, cwd=folder, timeout=INSTALL)
+        (wheel,) = folder.glob("zscout-*.whl")
+        tools = folder / "tools"
+        ways: dict[str, Callable[[Path, Path], Path]] = {
+            "light": light,
+            "pip": by_pip,
+            "pipx": lambda wheel, home: by_pipx(tools / "bin", wheel, home),
+            "uv": lambda wheel, home: by_uv(tools / "bin", wheel, home),
+        }
+        wanted = [way for way in sys.argv[1:] if way in ways] or list(ways)
+        if {"pipx", "uv"} & set(wanted):
+            try:
+                make_environment(tools)
+                pip = (tools / "bin/python", "-m", "pip", "install", "--quiet", "--require-hashes")
+                run(*pip, "-r", REQUIREMENTS / "installers.txt", cwd=folder, timeout=INSTALL)
+            except CheckFailed as error:
+                print(f"pipx and uv are skipped, they can't be had here: {error}", flush=True)
+                wanted = [way for way in wanted if way not in ("pipx", "uv")]
+        for way in wanted:
+            print(f"{way} ...", flush=True)
+            try:
+                began = time.monotonic()
+                programs = ways[way](wheel, folder / way)
+                seconds, size = time.monotonic() - began, megabytes(folder / way)
+                rows.append((way, f"{seconds:.0f}", f"{size:.0f}"))
+                if way == "light":
+                    expect(size < LIGHT_MB, f"it takes {size:.0f} MB, more than {LIGHT_MB}")
+                (check_light if way == "light" else check_whole)(programs, folder / f"{way}-fleet")
+            except (CheckFailed, subprocess.TimeoutExpired) as error:
+                failed += 1
+                print(f"{way} FAILED: {error}", flush=True)
+    _print_table([("installed", "seconds", "MB"), *rows])
+    return 1 if failed else 0
+
+
+def _print_table(rows: Sequence[tuple[str, str, str]]) -> None:
+    for way, seconds, size in rows:
+        print(f"{way:<10} {seconds:>8} {size:>8}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

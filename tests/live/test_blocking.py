@@ -1,0 +1,302 @@
+"""The synchronous API in plain scripts of their own: what interrupts them, and what does not."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.cli.cli_fleet import CliFleet, fleet_of
+from tests.cli.tools import by, end, named, out_of, read_until
+from tests.hang import HANG
+from tests.live.lab import Lab
+
+pytestmark = pytest.mark.live
+
+LONGER = 10 * HANG
+"""Seconds: what a script waits for in vain."""
+OPENING = f"""
+import signal, sys, threading, time
+import zscout
+LONGER = {LONGER}
+
+def say(*words):
+    print(*words, flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+    with fleet_of(tmp_path_factory.mktemp("blocking"), "robot/a", "robot/b") as fleet:
+        yield fleet
+
+
+def script(lab: Lab, text: str) -> subprocess.Popen[str]:
+    """Runs a script. On stderr a process says that it stood still, and why it failed: pytest shows that."""
+    return subprocess.Popen(
+        [sys.executable, "-c", OPENING + textwrap.dedent(text)],
+        env=lab.env,
+        stdout=subprocess.PIPE,
+        text=True,
+        bufsize=1,
+    )
+
+
+def rest_of(process: subprocess.Popen[str]) -> list[str]:
+    """What it still says, to an end in order."""
+    with out_of(process) as out:
+        lines = out.read().splitlines()
+    assert process.wait(HANG) == 0, lines
+    return lines
+
+
+def take(fleet: CliFleet, rc: str, *options: str) -> None:
+    done = fleet.zscout("request", rc, "--name", "taker", *options, "--", "true")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> None:
+    text = """
+        before = signal.getsignal(signal.SIGURG)
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {"robot/a": {}}) as held:
+                    say("entered", held.rcs, held.active)
+                    time.sleep(LONGER)
+            except zscout.Revoked as revoked:
+                say(revoked.outcome, held.active, "|", revoked)
+            say("restored", signal.getsignal(signal.SIGURG) is before)
+    """
+    survey = script(fleet.lab, text)
+    assert read_until(survey, "entered")[-1] == "entered ['robot/a'] True"
+    take(fleet, "robot/a", "--priority", "5")
+    told, restored = rest_of(survey)
+    assert told.startswith("preempted False | ")
+    assert by("true") in told
+    assert restored == "restored True"
+    assert fleet.idle("robot/a")
+
+
+@pytest.mark.parametrize(("how", "waits"), [("min_runtime=0.3", True), ("min_runtime=0.3, keep=False", False)])
+def test_a_body_whose_time_is_over_is_interrupted(fleet: CliFleet, how: str, *, waits: bool) -> None:
+    text = f"""
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {{"robot/a": {{}}}}, {how}) as held:
+                    say("entered")
+                    threading.Event().wait(LONGER)
+            except zscout.Revoked as revoked:
+                say(revoked.outcome, held.completed, "|", revoked)
+    """
+    survey = script(fleet.lab, text)
+    read_until(survey, "entered")
+    if waits:
+        take(fleet, "robot/a")
+    (told,) = rest_of(survey)
+    assert told.startswith("completed True | its minimum runtime is over")
+    assert (by("true") in told) == waits
+
+
+def test_what_is_kept_goes_on_past_its_minimum_runtime(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab, lab.hold("survey", {"robot/a": {}}, min_runtime=0.1) as held:
+            while held.remaining > -1:
+                assert not held.wait(0.1)
+            say("still", held.active, held.command("robot/a", {"name": "echo", "value": 5}))
+    """
+    assert rest_of(script(fleet.lab, text)) == ["still True 5"]
+
+
+def test_the_end_of_an_inner_hold_leaves_the_outer_one(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab, lab.hold("outer", {"robot/a": {}}) as outer:
+            try:
+                with lab.hold("inner", {"robot/b": {}}):
+                    say("entered")
+                    time.sleep(LONGER)
+            except zscout.Revoked as revoked:
+                say("inner", revoked.outcome, outer.active)
+            say(outer.command("robot/a", {"name": "echo", "value": 5}))
+    """
+    nested = script(fleet.lab, text)
+    read_until(nested, "entered")
+    take(fleet, "robot/b", "--priority", "5")
+    assert rest_of(nested) == ["inner preempted True", "5"]
+    assert fleet.idle("robot/a", "robot/b")
+
+
+def test_the_end_of_the_outer_hold_interrupts_the_wait_for_an_inner_one(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("outer", {"robot/a": {}}):
+                    say("entered")
+                    with lab.hold("inner", {"robot/b": {}}):
+                        say("never")
+            except zscout.Revoked as revoked:
+                say("outer", revoked.outcome)
+            say("on")
+            time.sleep(0.1)
+    """
+    blocker = fleet.holder("blocker", "robot/b")
+    nested = script(fleet.lab, text)
+    read_until(nested, "entered")
+    fleet.state(lambda state: [wait.arc for wait in state.queue] == ["inner"])
+    take(fleet, "robot/a", "--priority", "5")
+    assert rest_of(nested) == ["outer preempted", "on"]
+    fleet.state(lambda state: not state.queue)
+    end(blocker)
+
+
+def test_ctrl_c_is_ctrl_c(fleet: CliFleet) -> None:
+    text = """
+        try:
+            with zscout.connect() as lab, lab.hold("survey", {"robot/a": {}}):
+                say("entered")
+                time.sleep(LONGER)
+        except KeyboardInterrupt:
+            say("interrupted")
+    """
+    survey = script(fleet.lab, text)
+    read_until(survey, "entered")
+    survey.send_signal(signal.SIGINT)
+    assert rest_of(survey) == ["interrupted"]
+    assert fleet.idle("robot/a")
+
+
+def test_ctrl_c_ends_the_wait(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {"robot/a": {}}):
+                    say("never")
+            except KeyboardInterrupt:
+                say("interrupted", signal.getsignal(signal.SIGURG) == signal.SIG_DFL)
+    """
+    blocker = fleet.holder("blocker", "robot/a")
+    survey = script(fleet.lab, text)
+    fleet.state(lambda state: [wait.arc for wait in state.queue] == ["survey"])
+    survey.send_signal(signal.SIGINT)
+    assert rest_of(survey) == ["interrupted True"]
+    fleet.state(lambda state: not state.queue)
+    end(blocker)
+
+
+def test_a_handler_of_ones_own_gets_its_signals_and_is_put_back(fleet: CliFleet) -> None:
+    text = """
+        def mine(number, frame):
+            say("mine")
+
+        signal.signal(signal.SIGURG, mine)
+        with zscout.connect() as lab:
+            with lab.hold("survey", {"robot/a": {}}):
+                signal.raise_signal(signal.SIGURG)
+            say("back", signal.getsignal(signal.SIGURG) is mine)
+    """
+    assert rest_of(script(fleet.lab, text)) == ["mine", "back True"]
+
+
+@pytest.mark.parametrize("where", ["thread", "main"])
+def test_where_nothing_interrupts_a_body_looks_itself(fleet: CliFleet, where: str) -> None:
+    text = f"""
+        def body(interrupt):
+            try:
+                with lab.hold("survey", {{"robot/a": {{}}}}, interrupt=interrupt) as held:
+                    say("entered")
+                    say(held.wait(LONGER), held.active)
+                    time.sleep(0.3)
+                    held.check()
+            except zscout.Revoked as revoked:
+                say("told", revoked.outcome)
+
+        with zscout.connect() as lab:
+            if {where == "thread"}:
+                thread = threading.Thread(target=body, args=(True,))
+                thread.start()
+                thread.join()
+            else:
+                body(False)
+    """
+    survey = script(fleet.lab, text)
+    read_until(survey, "entered")
+    take(fleet, "robot/a", "--priority", "5")
+    assert rest_of(survey) == ["True False", "told preempted"]
+
+
+def test_a_wait_for_the_end_is_told_by_its_answer_and_by_nothing_else(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab, lab.hold("survey", {"robot/a": {}}) as held:
+            say("entered")
+            say(held.wait())
+            time.sleep(0.5)  # the signal is sent every 0.1 s
+            say("in peace")
+    """
+    survey = script(fleet.lab, text)
+    read_until(survey, "entered")
+    take(fleet, "robot/a", "--priority", "5")
+    assert rest_of(survey) == ["True", "in peace"]
+
+
+def test_who_was_not_told_is_told_at_the_end(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {"robot/a": {}}, interrupt=False) as held:
+                    say("entered")
+                    while held.active:
+                        time.sleep(0.01)
+            except zscout.Revoked as revoked:
+                say("told", revoked.outcome)
+    """
+    survey = script(fleet.lab, text)
+    read_until(survey, "entered")
+    take(fleet, "robot/a", "--priority", "5")
+    assert rest_of(survey) == ["told preempted"]
+
+
+def test_a_wait_for_the_grant_ends_with_its_timeout_and_says_why(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {"robot/a": {}}, timeout=10):
+                    say("never")
+            except TimeoutError as late:
+                say(late)
+    """
+    blocker = fleet.holder("blocker", "robot/a")
+    (told,) = rest_of(script(fleet.lab, text))
+    assert told.startswith("survey was not granted within 10 s: ")
+    assert named("blocker") in told
+    fleet.state(lambda state: not state.queue)
+    end(blocker)
+
+
+def test_without_an_rcm_it_says_so_and_what_to_do(tmp_path: Path) -> None:
+    text = """
+        with zscout.connect() as lab:
+            began = time.monotonic()
+            try:
+                with lab.hold("survey", {"robot/a": {}}):
+                    say("never")
+            except zscout.NoRcm as nobody:
+                say(f"{time.monotonic() - began:.1f}", nobody)
+    """
+    lab = Lab(tmp_path)
+    (line,) = rest_of(script(lab, text))
+    seconds, _, told = line.partition(" ")
+    assert float(seconds) >= 3
+    assert told.startswith(
+        f"no RCM is on the mesh of fleet {lab.fleet.name} (no other program either); start zscout-node"
+    )
+
+
+def test_all_names_are_listed_and_there() -> None:
+    import zscout
+
+    assert set(zscout.__all__) <= set(dir(zscout))
+    assert all(getattr(zscout, name) is not None for name in zscout.__all__)

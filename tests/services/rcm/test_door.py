@@ -1,0 +1,131 @@
+"""What is refused at once because it can never start."""
+
+from __future__ import annotations
+
+import asyncio
+from decimal import Decimal
+
+import pytest
+
+from tests.mesh.kit import run
+from tests.services.rcm.kit import FakeFleet, Refusal, grant_of, request
+from zscout.mesh import Refused
+from zscout.messages import Amounts, Foresee, Foresight, Parameter, Parameters
+from zscout.services.rcm.door import check_door
+from zscout.types import SECOND
+
+RADIO = [
+    Parameter("command_rate", "packets/s", Decimal(10), Decimal(5), unless=["packet_size"]),
+    Parameter("packet_size", "bytes", default=Decimal(10)),
+]
+KNOWN: dict[str, Parameters | None] = {
+    "radio/rf0": RADIO,
+    "radio/rf1": [Parameter("command_rate", bound=Decimal(100))],
+    "robot/arm1": [],
+    "gpu/old": None,
+}
+
+
+def refusal(need: str, *, waits: bool = False, **params: float) -> str:
+    """The code and the text; empty where it is let in."""
+    amounts: Amounts = {name: Decimal(str(value)) for name, value in params.items()}
+    try:
+        check_door({need: amounts}, KNOWN, KNOWN.get, waits=waits)
+    except Refused as refused:
+        return f"{refused.problem.code}: {refused.problem.message}"
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("need", "params"),
+    [
+        ("radio/rf0", {}),
+        ("radio/rf0", {"command_rate": 10}),
+        # Shorter packets: the RC itself has to say.
+        ("radio/rf0", {"command_rate": 14, "packet_size": 7}),
+        # Who does not say what it knows is asked as before.
+        ("gpu/old", {"speed": 1e9}),
+        # One of them takes it.
+        ("radio/*", {"command_rate": 50}),
+        ("*/arm1", {}),
+    ],
+)
+def test_what_may_start_is_let_in(need: str, params: dict[str, float]) -> None:
+    assert refusal(need, **params) == ""
+
+
+@pytest.mark.parametrize(
+    ("need", "params", "words"),
+    [
+        ("robot/arn1", {}, "unknown_device: nobody knows robot/arn1; did you mean robot/arm1? to wait until it comes"),
+        ("tank/*", {}, "unknown_device: nobody knows an RC that meets tank/*; to wait"),
+        ("radio/rf0", {"command_rate": 50}, "too_much: can never start: command_rate 50 of 10 packets/s at radio/rf0"),
+        ("radio/*", {"command_rate": 101}, "too_much: can never start: command_rate 101 of 10"),
+        ("radio/rf0", {"comand_rate": 5}, "unknown_parameter: radio/rf0 knows no parameter comand_rate; did you mean"),
+        (
+            "radio/rf0",
+            {"x": 5},
+            "unknown_parameter: radio/rf0 knows no parameter x; it knows command_rate, packet_size",
+        ),
+        ("robot/arm1", {"speed": 1}, "unknown_parameter: robot/arm1 knows no parameter speed; it takes none"),
+    ],
+)
+def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: dict[str, float], words: str) -> None:
+    assert refusal(need, **params).startswith(words)
+
+
+def test_who_waits_for_a_device_is_still_told_of_bad_parameters() -> None:
+    assert refusal("robot/nowhere", waits=True) == ""
+    assert refusal("radio/rf0", waits=True, command_rate=11).startswith("too_much")
+
+
+def test_the_leader_refuses_what_it_knows_only_to_who_asks_for_that() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        await fleet.joined(fleet.rc("radio/rf0", parameters=RADIO), fleet.rc("robot/arm1"))
+        client = fleet.client("one")
+        with pytest.raises(Refusal, match="too_much: can never start: command_rate 50 of 10"):
+            await client.ask("much", "radio/rf0:50", check=True)
+        # A foreign client is queued, as ever: by a veto here.
+        assert (await client.ask("foreign", "radio/rf0:50")).state == "running"
+        # So soon it may not know all devices yet.
+        assert (await client.ask("early", "robot/arn1", check=True)).state == "queued"
+        await asyncio.sleep(fleet.fleet.timing.hold_lease / SECOND)
+        with pytest.raises(Refusal, match="unknown_device: nobody knows robot/arn2; did you mean robot/arm1"):
+            await client.ask("typo", "robot/arn2", check=True)
+        assert (await client.ask("patient", "robot/arn2", check=True, wait_for_device=True)).state == "queued"
+        again = await client.ask("patient", "robot/arn2", check=True)
+        assert again.state == "queued", "an open request is only told how it stands"
+        # What carries a place was let in by an RCM before.
+        placed = request("placed", "robot/arn3", check=True, place=again.place)
+        assert (await client.do(placed)).state == "queued"
+        assert grant_of(await client.ask("arm", "robot/arm1", check=True)).seq
+
+        asked = Foresee("f", "dry", {"robot/arn2": {}}, 0, Decimal(1), check=True)
+        key, mesh = client.mesh.keys.schedule(client.mesh.me), client.mesh
+        reply = await mesh.ask_one(key, asked, Foresight, timeout=1)
+        assert reply is not None
+        assert reply.problem is not None
+        assert reply.problem.code == "unknown_device"
+
+    run(story())
+
+
+def test_a_device_that_went_is_waited_for() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        rc = fleet.rc("robot/arm1")
+        await fleet.joined(rc)
+        client = fleet.client("one")
+        await asyncio.sleep(fleet.fleet.timing.hold_lease / SECOND)
+        fleet.network.kill(rc.mesh)
+        await asyncio.sleep(2)
+        notice = await client.ask("patient", "robot/arm1", check=True)
+        assert (notice.state, notice.reason) == ("queued", "robot/arm1 is lost: devices is gone")
+        (view,) = (await fleet.state()).rcs
+        assert (view.rc, view.present, view.host, view.reason) == ("robot/arm1", False, "devices", "devices is gone")
+        assert view.gone == pytest.approx(2, abs=0.1)
+
+    run(story())

@@ -1,0 +1,47 @@
+"""Who this program is, as people are told: user, host and command. Nobody relies on it."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import sys
+from pathlib import Path
+
+from zscout.messages import MAX_COMMENT, MAX_WHO, Who
+from zscout.types import clean
+
+_MAIN = ("__main__", "__init__")
+
+
+def this_program(host: str) -> Who:
+    """Who runs this process on `host`, and its program's name, without arguments: these may hold secrets."""
+    return Who(bounded(_user()), bounded(host), bounded(_program()))
+
+
+def bounded(text: str, most: int = MAX_WHO) -> str:
+    """On one line and not too long for the mesh; what is cut off is replaced by a `…`."""
+    text = " ".join(clean(text).split())
+    return text if len(text) <= most else text[: most - 1].rstrip() + "…"
+
+
+def checked_comment(text: str) -> str:
+    """A comment as it is sent. Raises ValueError where it is too long."""
+    text = " ".join(clean(text).split())
+    if len(text) > MAX_COMMENT:
+        raise ValueError(f"a comment of {len(text)} characters; at most {MAX_COMMENT} are shown, write a shorter one")
+    return text
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # an id without a name, as in containers
+        return str(os.getuid())
+
+
+def _program() -> str:
+    called = sys.argv[0] if getattr(sys, "argv", None) else ""
+    if called in ("", "-c", "-m"):
+        return "python"
+    path = Path(called)
+    return path.parent.name if path.stem in _MAIN else path.name

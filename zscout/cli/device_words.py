@@ -1,0 +1,25 @@
+"""What is to be said of a device, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from zscout.messages import RcView
+from zscout.terminal import clock
+
+
+def absence(view: RcView) -> str:
+    """Why it is not there, as far as that is known."""
+    if view.present or not view.reason:
+        return ""
+    return view.reason if view.gone is None else f"{view.reason} since {clock(-view.gone)}"
+
+
+def remarks(view: RcView) -> Iterator[str]:
+    """Why it is not there, and which other hosts offer it, or did so."""
+    if words := absence(view):
+        yield words
+    for host in view.duplicates:
+        yield f"at {host}: duplicate of {view.rc} at {view.host}"
+    for host, ago in view.unseen.items():
+        yield f"its other host {host} is not seen since {clock(-ago)}"

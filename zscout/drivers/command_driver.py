@@ -1,0 +1,260 @@
+"""A device that is switched by commands of one's own: what `start`, `stop`, `safe` and `health` of its table say.
+
+They run on the node, as its user, one at a time, each for at most `timeout`; whatever one has started in its process
+group is killed when it has ended. A device that can't be started or made safe, or is not well, counts as lost, and is
+tried again."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Final
+
+from zscout.config.devices import CommandRc, Words
+from zscout.drivers.driver import Driver, RcHandle
+from zscout.mesh.supervision import done_within
+from zscout.messages import Figures, Holder
+from zscout.types import SECOND
+
+log = logging.getLogger(__name__)
+
+KEPT_OUTPUT: Final = 4_096
+"""Bytes: the last of what a command writes."""
+PAUSE: Final = 0.02
+"""Seconds between two readings of KEPT_OUTPUT bytes: who writes more waits."""
+LINGER: Final = 0.2
+"""Seconds for what a command has written last to be read."""
+MAX_REASON: Final = 160
+"""Characters of its last line that are told on the mesh."""
+AT_ONCE: Final = 0.5
+"""Seconds for which a holder waits for `start`: its client takes an RC that says nothing for a second for gone."""
+OPENING: Final = 1.0
+"""Seconds that a node waits for the first `safe` and `health` before it offers the RC as lost."""
+AGAIN: Final = (1.0, 60.0)
+"""Seconds until a device that failed is tried again: the first time, and the longest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How a command ended."""
+
+    problem: str
+    """Empty if it did what it should; else in words, with the last line that it wrote."""
+    seconds: float
+    gave_way: bool = False
+    """It was ended for another: nothing is known."""
+
+
+class CommandDriver(Driver):
+    """An exclusive device. Its commands are told in their environment what it is about: ZSCOUT_DO (start, stop, safe or
+    health) and ZSCOUT_RC; `start` and `stop` ZSCOUT_ARC, ZSCOUT_CLIENT and ZSCOUT_PARAMETERS (JSON) as well."""
+
+    Options = CommandRc
+
+    def __init__(self, rc: CommandRc) -> None:
+        super().__init__(rc)
+        self.activation = rc.activation / SECOND
+        self._told = rc
+        self._holder: Holder | None = None
+        """Who holds it."""
+        self._started: Holder | None = None
+        """For whom it was started and not stopped since."""
+        self._starting: asyncio.Task[None] | None = None
+        self._unsure = "it was not made safe yet"
+        """Why its state is not known; empty once `safe` has succeeded."""
+        self._lost = ""
+        """Why it can't be held."""
+        self._failed_starts = 0
+        """In a row."""
+        self._looked = asyncio.Event()
+        self._news = asyncio.Event()
+        """It was lost."""
+        self._give_way = asyncio.Event()
+        """Something waits that is more urgent than to look at its health."""
+        self._one_at_a_time = asyncio.Lock()
+        self._counts = Counter(starts=0, failures=0)
+        self._start_seconds = 0.0
+
+    async def open(self, rc: RcHandle) -> None:
+        self._rc = rc
+        rc.supervisor.spawn(self._keep_well())
+        if not await done_within(OPENING, self._looked.wait()):
+            self._lose(self._unsure or "its health is not known yet")
+
+    async def begin(self, holder: Holder) -> None:
+        handed_over = self._holder is not None
+        self._holder = holder
+        if handed_over:
+            return
+        self._counts["starts"] += 1
+        self._started = holder
+        self._starting = self._rc.supervisor.spawn(self._start(holder))
+        # The RC answers nobody meanwhile: what takes longer goes on beside its holder.
+        await asyncio.wait({self._starting}, timeout=AT_ONCE)
+
+    async def _start(self, holder: Holder) -> None:
+        ended = await self._run("start", self._told.start, holder)
+        self._start_seconds = ended.seconds
+        if ended.problem:
+            self._failed_starts += 1
+            self._unsure = ended.problem
+            self._lose(ended.problem)
+        else:
+            self._failed_starts = 0
+
+    async def end(self, holder: Holder) -> None:
+        self._holder = None
+
+    async def safe(self) -> None:
+        """Stops it first, where it was started: that may take its time as well."""
+        self._holder, started, self._started = None, self._started, None
+        self._unsure, before = "it is being made safe", self._unsure
+        try:
+            if self._starting is not None and not self._starting.done():
+                self._starting.cancel()
+                await asyncio.wait({self._starting})
+            if started is not None and (why := (await self._run("stop", self._told.stop, started)).problem):
+                log.warning("%s: %s", self._rc.name, why)
+            self._unsure = (await self._run("safe", self._told.safe)).problem
+        except asyncio.CancelledError:  # its RC does not wait any longer
+            self._lose(before or "it was not made safe in time")
+            raise
+        if self._unsure:
+            self._lose(self._unsure)
+
+    def figures(self) -> Figures:
+        return {**self._counts, "start_seconds": round(self._start_seconds, 3)}
+
+    def _lose(self, why: str) -> None:
+        if why != self._lost:
+            log.warning("%s is lost: %s", self._rc.name, why)
+            self._lost = why
+            self._rc.fail(why)
+        self._news.set()
+
+    async def _keep_well(self) -> None:
+        """Looks at it every now and then; at one that was lost until it is well, at growing intervals."""
+        every = self._told.every / SECOND if self._told.health else None
+        tries = 0
+        while True:
+            await self._look()
+            self._looked.set()
+            if not self._lost:
+                tries = 0
+                self._news.clear()
+                if not await done_within(every, self._news.wait()):
+                    continue
+            again = min(AGAIN[0] * 2.0 ** min(max(tries, self._failed_starts - 1), 16), AGAIN[1])
+            tries += 1
+            await asyncio.sleep(again if every is None or self._unsure else min(again, every))
+
+    async def _look(self) -> None:
+        """Makes it safe where its state is not known, and looks whether it is well."""
+        if self._unsure and self._holder is None:
+            self._unsure = (await self._run("safe", self._told.safe)).problem
+        why = self._unsure
+        if not why:
+            ended = await self._run("health", self._told.health)
+            if ended.gave_way:
+                return
+            why = self._unsure or ended.problem  # a start may have failed before it
+        if why:
+            self._lose(why)
+        elif self._lost:
+            log.info("%s is well again", self._rc.name)
+            self._lost = ""
+            self._rc.recover()
+
+    async def _run(self, do: str, words: Words, holder: Holder | None = None) -> Ended:
+        if not words:
+            return Ended("", 0.0)
+        env = os.environ | {"ZSCOUT_DO": do, "ZSCOUT_RC": self._rc.name}
+        if holder is not None:
+            params = {name: float(amount) for name, amount in holder.params.items()}
+            env |= {"ZSCOUT_ARC": holder.arc, "ZSCOUT_CLIENT": holder.client, "ZSCOUT_PARAMETERS": json.dumps(params)}
+        if do != "health":
+            self._give_way.set()
+        async with self._one_at_a_time:
+            if do != "health":
+                self._give_way.clear()
+            give_way = self._give_way if do == "health" else asyncio.Event()  # else for nothing
+            ended = await run_bounded(words, env, self._told.timeout / SECOND, give_way)
+        if ended.problem:
+            self._counts["failures"] += 1
+        return replace(ended, problem=ended.problem and f"{do} {ended.problem}")
+
+
+async def run_bounded(words: Words, env: Mapping[str, str], timeout: float, give_way: asyncio.Event) -> Ended:
+    """Runs a program in a session of its own, for `timeout` seconds at most, and less if something is to go before it.
+    With it ends all that is in its process group, also where this is cancelled."""
+    began = time.monotonic()
+    reading, writing = os.pipe()
+    reader = asyncio.StreamReader(limit=KEPT_OUTPUT)
+    protocol = asyncio.StreamReaderProtocol(reader)
+    pipe, _ = await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, os.fdopen(reading, "rb", 0))
+    output = OutputTail(reader)
+    draining = asyncio.ensure_future(output.drain())
+    try:
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *words, stdin=subprocess.DEVNULL, stdout=writing, stderr=writing, env=env, start_new_session=True
+            )
+        except OSError as error:
+            return Ended(f"can't be run: {words[0]}: {error.strerror or error}", 0.0)
+        finally:
+            os.close(writing)
+        waiting, yielding = asyncio.ensure_future(process.wait()), asyncio.ensure_future(give_way.wait())
+        try:
+            await asyncio.wait({waiting, yielding}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+            done = waiting.done()
+        finally:
+            yielding.cancel()
+            # Its number stays its group's as long as anything is left of that.
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
+            # One that hangs in its device's driver can't be killed: it is not waited for.
+            await asyncio.wait({waiting}, timeout=LINGER)
+        await asyncio.wait({draining}, timeout=LINGER)
+        seconds = time.monotonic() - began
+        if not done:
+            if give_way.is_set():
+                return Ended("", seconds, gave_way=True)
+            return Ended(f"was killed: it took longer than {timeout:g} s{output.said}", seconds)
+        code = waiting.result()
+        if not code:
+            return Ended("", seconds)
+        how = f"ended with exit code {code}" if code > 0 else f"ended by signal {-code}"
+        return Ended(how + output.said, seconds)
+    finally:
+        draining.cancel()
+        pipe.close()
+
+
+class OutputTail:
+    """The end of what a command writes."""
+
+    def __init__(self, reader: asyncio.StreamReader) -> None:
+        self._reader = reader
+        self._kept = b""
+
+    async def drain(self) -> None:
+        while some := await self._reader.read(KEPT_OUTPUT):
+            self._kept = (self._kept + some)[-KEPT_OUTPUT:]
+            await asyncio.sleep(PAUSE)
+
+    @property
+    def said(self) -> str:
+        """Its last line, to stand behind how it ended."""
+        lines = self._kept.decode(errors="replace").split("\n")
+        shown = ("".join(char if char.isprintable() else " " for char in line).strip() for line in reversed(lines))
+        last = next(filter(None, shown), "")
+        return f": {last[:MAX_REASON]}" if last else ""

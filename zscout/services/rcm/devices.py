@@ -1,0 +1,242 @@
+"""Which devices a fleet expects: those that its file names, and those that were seen within a day. Pure.
+
+An RC has a *home* at each host that offers it, or did so. One that goes is remembered with when, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, KeysView, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import msgspec
+
+from zscout.keyexpr import BadName, Token, check_name, check_rc
+from zscout.messages import Elapsed, Parameters, RcState, RcView
+from zscout.types import SECOND, HostName, Ns, RcName
+
+REMEMBERED: Final[Ns] = 24 * 3600 * SECOND
+MAX_HOMES: Final = 20_000
+
+
+class SeenHome(msgspec.Struct, frozen=True, omit_defaults=True):
+    """That an RC was seen at a host, `ago` seconds before this was said. `why` it went, if that is known."""
+
+    rc: str
+    host: str
+    ago: Elapsed = 0.0
+    why: str = ""
+    stopped: bool = False
+    sharable: bool = False
+    parameters: Parameters | None = None
+
+
+def homes_in(views: Iterable[RcView]) -> Iterator[SeenHome]:
+    """What a leader's list of devices says."""
+    for view in views:
+        seen = dict.fromkeys(view.duplicates, 0.0) | view.unseen
+        if view.host and (view.present or view.gone is not None):
+            seen[view.host] = view.gone or 0.0
+        for host, ago in seen.items():
+            why = view.reason if host == view.host and not view.present else ""
+            yield SeenHome(view.rc, host, ago, why, sharable=view.sharable, parameters=view.parameters)
+
+
+@dataclass(slots=True)
+class Home:
+    """A host at which an RC is, was, or should be."""
+
+    declared: bool = False
+    instances: set[str] = field(default_factory=set)
+    """Those that live."""
+    seen: Ns | None = None
+    """When the last of them went; None: there was none yet, or one lives."""
+    why: str = ""
+    """Why it went, if that is known better than that it did."""
+    stopped: bool = False
+    """It left in order."""
+
+
+@dataclass(slots=True)
+class _Device:
+    homes: dict[HostName, Home] = field(default_factory=dict)
+    sharable: bool = False
+    parameters: Parameters | None = None
+    """As it said last."""
+
+
+class ExpectedDevices:
+    """What one host knows of the devices of its fleet. Times are its own clock's."""
+
+    def __init__(self, declared: Mapping[HostName, Collection[RcName]]) -> None:
+        self._devices: dict[RcName, _Device] = {}
+        self._living: dict[HostName, set[Token]] = {}
+        self.version = 0
+        """Grows with whatever is worth remembering."""
+        for host, rcs in declared.items():
+            for rc in rcs:
+                self._devices.setdefault(rc, _Device()).homes[host] = Home(declared=True)
+
+    # In
+
+    def came(self, token: Token) -> None:
+        home = self._home(token.name, token.host)
+        if home is not None:
+            home.instances.add(token.instance)
+            home.seen, home.why, home.stopped = None, "", False
+            self._living.setdefault(token.host, set()).add(token)
+            self.version += 1
+
+    def went(self, token: Token, now: Ns) -> None:
+        if living := self._living.get(token.host):
+            living.discard(token)
+            if not living:
+                del self._living[token.host]
+        device = self._devices.get(token.name)
+        if device is not None and (home := device.homes.get(token.host)) is not None:
+            home.instances.discard(token.instance)
+            if not home.instances:
+                home.seen = now
+                self.version += 1
+
+    def said(self, state: RcState) -> None:
+        """What an RC reports of itself."""
+        if self._home(state.rc, state.host) is not None:
+            device = self._devices[state.rc]
+            device.sharable, device.parameters = state.sharable, state.parameters
+
+    def stopped(self, rc: RcName, host: HostName) -> None:
+        """Its last word: it left in order."""
+        if (home := self._home(rc, host)) is not None:
+            home.why, home.stopped = f"it is stopped at {host}", True
+            self.version += 1
+
+    def lost_sight(self, now: Ns) -> None:
+        """No token is followed any more."""
+        for device in self._devices.values():
+            for home in device.homes.values():
+                if home.instances:
+                    home.instances.clear()
+                    home.seen = now
+        self._living.clear()
+
+    def remember(self, homes: Iterable[SeenHome], now: Ns) -> None:
+        """What another host knows, or this one knew before it started anew. What is seen here is known better."""
+        for told in homes:
+            seen = now - round(told.ago * SECOND)
+            if now - seen > REMEMBERED or not _is_name(told.rc, told.host):
+                continue
+            home = self._home(told.rc, told.host)
+            if home is None or home.instances or (home.seen is not None and home.seen >= seen):
+                continue
+            home.seen, home.why, home.stopped = seen, told.why, told.stopped
+            self.version += 1
+            device = self._devices[told.rc]
+            if device.parameters is None:
+                device.sharable, device.parameters = told.sharable, told.parameters
+
+    def _home(self, rc: RcName, host: HostName) -> Home | None:
+        """Made known where it was not; None: there are too many."""
+        device = self._devices.get(rc)
+        home = device.homes.get(host) if device is not None else None
+        if home is None and sum(len(one.homes) for one in self._devices.values()) < MAX_HOMES:
+            home = Home()
+            self._devices.setdefault(rc, _Device()).homes[host] = home
+        return home
+
+    def forget_old(self, now: Ns) -> None:
+        """What nobody expects any more."""
+        for rc, device in list(self._devices.items()):
+            for host, home in list(device.homes.items()):
+                old = home.seen is None or now - home.seen > REMEMBERED
+                moved = home.stopped and any(one.instances for one in device.homes.values())
+                if not home.instances and not home.declared and (old or moved):
+                    del device.homes[host]
+            if not device.homes:
+                del self._devices[rc]
+
+    # Out
+
+    def homes(self, now: Ns) -> list[SeenHome]:
+        """All that were seen, to be remembered."""
+        return [
+            SeenHome(rc, host, _ago(home, now), home.why, home.stopped, device.sharable, device.parameters)
+            for rc, device in sorted(self._devices.items())
+            for host, home in sorted(device.homes.items())
+            if home.instances or home.seen is not None
+        ]
+
+    @property
+    def names(self) -> KeysView[RcName]:
+        """All RCs that are there or expected."""
+        return self._devices.keys()
+
+    def latest_home(self, rc: RcName) -> HostName | None:
+        """Where it was seen last; else where it should be."""
+        gone = self._devices[rc].homes if rc in self._devices else {}
+        return min(gone, key=lambda one: (gone[one].seen is None, -(gone[one].seen or 0), one), default=None)
+
+    def home_of(self, rc: RcName) -> HostName | None:
+        """The host at which the fleet file has it."""
+        device = self._devices.get(rc)
+        declared = (host for host, home in device.homes.items() if home.declared) if device is not None else ()
+        return next(iter(declared), None)
+
+    def parameters(self, rc: RcName) -> Parameters | None:
+        device = self._devices.get(rc)
+        return device.parameters if device is not None else None
+
+    def why_gone(self, rc: RcName, host: HostName) -> str:
+        """Why no instance of it is at `host`, in words."""
+        home = self._devices[rc].homes.get(host) if rc in self._devices else None
+        if home is not None and home.why:
+            return home.why
+        if home is not None and home.seen is None:
+            return f"it has not been seen at {host} yet"
+        return f"it is gone from {host}" if host in self._living else f"{host} is gone"
+
+    def view(self, known: RcView, now: Ns, named: HostName | None) -> RcView:
+        """An RC as people see it. `known` is what scheduling and the RC itself say of it, and `named` the host of the
+        instance that is meant."""
+        device = self._devices.get(known.rc, _Device())
+        living = sorted(host for host, home in device.homes.items() if home.instances)
+        gone = {host: home for host, home in device.homes.items() if not home.instances}
+        if named in living:
+            host = named
+        elif living:
+            host = living[0]
+        else:
+            host = self.latest_home(known.rc) or ""
+        reason, since = known.reason, None
+        if host in gone and not known.present:
+            reason, since = self.why_gone(known.rc, host), None if gone[host].seen is None else _ago(gone[host], now)
+        unseen = {
+            one: _ago(home, now)
+            for one, home in sorted(gone.items())
+            if one != host and home.seen is not None and not home.stopped
+        }
+        return RcView(
+            known.rc,
+            known.present,
+            known.sharable if known.present or known.parameters is not None else device.sharable,
+            known.holders,
+            host=host,
+            reason="" if known.present else reason,
+            gone=since,
+            duplicates=[one for one in living if one != host],
+            unseen=unseen,
+            parameters=known.parameters if known.parameters is not None else device.parameters,
+        )
+
+
+def _ago(home: Home, now: Ns) -> float:
+    """Seconds since it was seen."""
+    return 0.0 if home.instances or home.seen is None else max(0, now - home.seen) / SECOND
+
+
+def _is_name(rc: str, host: str) -> bool:
+    try:
+        check_rc(rc)
+        check_name(host, "host")
+    except BadName:
+        return False
+    return True

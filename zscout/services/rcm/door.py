@@ -1,0 +1,67 @@
+"""What is refused at once because it can never start, by what the leader knows. Pure.
+
+Only who asks for it is refused so (`Ask.check`): others are queued, whatever they need."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Collection, Mapping
+from decimal import Decimal
+
+from zscout.keyexpr import is_pattern, matcher
+from zscout.mesh import Refused
+from zscout.messages import Amounts, Parameters
+from zscout.types import Need, RcName
+
+MAX_NAMED = 8
+"""Parameters that a refusal lists."""
+
+
+def check_door(
+    needs: Mapping[Need, Amounts],
+    known: Collection[RcName],
+    parameters_of: Callable[[RcName], Parameters | None],
+    *,
+    waits: bool,
+) -> None:
+    """Raises Refused. `known` are all RCs that are there or expected; with `waits`, others are waited for."""
+    for need, params in needs.items():
+        matching = sorted(filter(matcher(need), known)) if is_pattern(need) else [need] if need in known else []
+        if not matching and not waits:
+            raise _unknown(need, known)
+        refusals = [_objection(rc, params, parameters_of(rc)) for rc in matching]
+        # One that takes it is enough.
+        if refusals and all(refusals):
+            raise next(filter(None, refusals))
+
+
+def _unknown(need: Need, known: Collection[RcName]) -> Refused:
+    near = difflib.get_close_matches(need, known, n=3)
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    what = f"an RC that meets {need}" if is_pattern(need) else need
+    return Refused("unknown_device", f"nobody knows {what}; {hint}to wait until it comes, say so (--wait-for-device)")
+
+
+def _objection(rc: RcName, params: Amounts, parameters: Parameters | None) -> Refused | None:
+    """Why this RC can never carry that."""
+    if parameters is None:
+        return None
+    bounds = {one.name: one for one in parameters}
+    for name, value in params.items():
+        if name not in bounds:
+            names = sorted(bounds)
+            near = difflib.get_close_matches(name, names, n=1)
+            more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+            takes = f"it knows {', '.join(names[:MAX_NAMED])}{more}" if names else "it takes none"
+            hint = f"did you mean {near[0]}?" if near else takes
+            return Refused("unknown_parameter", f"{rc} knows no parameter {name}; {hint}")
+        one = bounds[name]
+        if one.bound is not None and value > one.bound and not any(other in params for other in one.unless):
+            unit = f" {one.unit}" if one.unit else ""
+            asked = f"{name} {_text(value)} of {_text(one.bound)}{unit} at {rc}"
+            return Refused("too_much", f"can never start: {asked}; ask for less")
+    return None
+
+
+def _text(value: Decimal) -> str:
+    return f"{float(value):.12g}"
