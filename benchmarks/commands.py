@@ -89,11 +89,11 @@ def in_turn(commands: dict[str, tuple[list[str], list[str]]], env: dict[str, str
                 if number >= 0:
                     found.add(took)
     rows = []
-    for name, (command, bare) in samples.items():
+    for name, (whole, bare) in samples.items():
         rows.append(Row(f"bare query of {name}, start to exit", bare.median, "s", bare.p99, rounds=rounds))
-        ratio = f"{command.median / bare.median:.1f} x its bare query"
+        ratio = f"{whole.median / bare.median:.1f} x its bare query"
         aim = STATUS_AIM if name == "status" else None
-        rows.append(Row(f"zscout {name} ({ratio})", command.median, "s", command.p99, aim=aim, rounds=rounds))
+        rows.append(Row(f"zscout {name} ({ratio})", whole.median, "s", whole.p99, aim=aim, rounds=rounds))
     return rows
 
 

@@ -23,7 +23,7 @@ from tests.services.recorder import robot_run
 from zscout.cli.fleet.view import free_port, open_viewer
 from zscout.config.fleet import MeshConfig, default_fleet
 from zscout.config.node import RecorderConfig
-from zscout.services.recorder import timeline as module
+from zscout.services.recorder.blueprint import Layout
 from zscout.services.recorder.drawing import Drawing
 from zscout.services.recorder.process import RecorderJob, Recording, encode_job
 from zscout.services.recorder.robots import RobotTracker
@@ -63,10 +63,30 @@ class Repeated(Timeline):
         Drawing.log(self, None if at is None else at + self.shift, entity, *what)  # type: ignore[arg-type]
 
 
-def record(path: Path, megabytes: float) -> None:
+class Measured(Timeline):
+    """Tells what finishing took."""
+
+    written = seconds = 0.0
+    """MB before, and how long it took."""
+
+    def _finish(self, path: Path, layout: Layout) -> None:
+        self.written = path.stat().st_size / MEGA
+        start = time.monotonic()
+        super()._finish(path, layout)
+        self.seconds = time.monotonic() - start
+
+
+class Unfinished(Repeated):
+    """Stays as it was written."""
+
+    def _finish(self, path: Path, layout: Layout) -> None:
+        pass
+
+
+def record(path: Path, megabytes: float, kind: type[Repeated] = Repeated) -> None:
     """A recording of four robots at work, with cameras, floor, loads and events, of about this size; with 0 megabytes
     the first instant of it: all panes, and nothing in them."""
-    with Repeated("lab", path=path) as timeline:
+    with kind("lab", path=path) as timeline:
         while True:
             timeline.robots = RobotTracker(timeline)
             robot_run.play(timeline, robot_run.SECONDS if megabytes else 0)
@@ -107,9 +127,7 @@ async def browser(program: str, folder: Path, megabytes: float, rounds: int, pic
     empty, whole, written = (folder / f"{name}.rrd" for name in ("empty", "whole", "written"))
     record(empty, 0)
     record(whole, megabytes)
-    finish, module.finish = module.finish, lambda *_: None
-    record(written, megabytes)
-    module.finish = finish
+    record(written, megabytes, Unfinished)
     took: dict[Path, list[float]] = {empty: [], whole: []}
     for number in range(rounds):
         for path, times in took.items():
@@ -167,30 +185,16 @@ def hour(folder: Path) -> list[Row]:
     """Four cameras for an hour: what is written, and what is kept of it."""
     written = folder / "cameras.rrd"
     pictures = [_sized(robot_run.jpeg(number / 7, "scout33", None)) for number in range(100)]
-    sizes: list[float] = []
-    finish = module.finish
-
-    def measured(*args: object) -> None:
-        sizes.append(written.stat().st_size / MEGA)
-        start = time.monotonic()
-        finish(*args)  # type: ignore[arg-type]
-        sizes.append(time.monotonic() - start)
-
-    module.finish = measured
-    try:
-        with Timeline("lab", path=written) as timeline:
-            for number in range(round(3600 * RATE)):
-                for camera in range(CAMERAS):
-                    picture = pictures[(number + 7 * camera) % len(pictures)]
-                    name = f"framegrabber/fgrab{camera}"
-                    timeline.robots.frame(number / RATE, name, robot_run.head(number), picture)
-    finally:
-        module.finish = finish
+    with Measured("lab", path=written) as timeline:
+        for number in range(round(3600 * RATE)):
+            for camera in range(CAMERAS):
+                picture = pictures[(number + 7 * camera) % len(pictures)]
+                timeline.robots.frame(number / RATE, f"framegrabber/fgrab{camera}", robot_run.head(number), picture)
     kept = written.stat().st_size / MEGA
     return [
-        Row("an hour of 4 cameras, as it is written", sizes[0], "MB"),
+        Row("an hour of 4 cameras, as it is written", timeline.written, "MB"),
         Row("an hour of 4 cameras, kept", kept, "MB", aim=100.0),
-        Row("finishing that hour", sizes[1], "s"),
+        Row("finishing that hour", timeline.seconds, "s"),
     ]
 
 

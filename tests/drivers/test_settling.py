@@ -316,7 +316,7 @@ class Arm(Device):
         self.seconds = seconds
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
-        return do["name"] == "stop"
+        return bool(do["name"] == "stop")
 
     async def safe(self) -> None:
         await super().safe()

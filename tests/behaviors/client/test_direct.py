@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
 
@@ -179,7 +178,7 @@ def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_runtime
             state = await two.state()
             assert state is not None
             (hold,) = state.holds
-            assert (hold.arc, hold.min_runtime) == ("second", 2)
+            assert (hold.arc, hold.min_runtime) == ("second", Decimal(2))
 
     run(test())
 
@@ -228,16 +227,20 @@ def test_a_foreign_rc_is_confirmed_and_told_nothing_else() -> None:
     async def test() -> None:
         said = list[tuple[str, str]]()
 
-        async def command(rc: str, _grant: Grant, do: Mapping[str, Any], *, timeout: float) -> Done:
+        async def command(rc: str, grant: Grant, do: dict[str, Any], *, timeout: float) -> Done:
+            assert grant == Grant(NO_TERM, 1)
             said.append((rc, do["name"]))
             if do["name"] != "confirm" and rc == OTHER:
                 raise CommandRefused(rc, Problem("unknown_command", "no such thing"))
             return Done(settle=None if rc == OTHER else 2.0)
 
         loop = asyncio.get_running_loop()
+
+        def now() -> Ns:
+            return round(loop.time() * SECOND)
+
         arc = OpenArc("id", "first", amounts({RC: {}, OTHER: {}}), 0, Decimal(600), keep=True, direct=True)
         arc.rcs = [RC, OTHER]
-        now = lambda: round(loop.time() * SECOND)  # noqa: E731
         held = DirectHold(
             arc, Grant(NO_TERM, 1), command, now, lambda coro: asyncio.create_task(coro), hold_lease=3 * SECOND
         )

@@ -75,8 +75,8 @@ def test_an_rc_with_who_holds_it_and_who_waits_for_it() -> None:
 
 
 def test_an_arc_with_its_rcs_and_who_holds_them() -> None:
-    expected = (["robot/a", "fg/1"], ["survey"], ["next"], [])
-    assert chosen("next") == chosen("id-next") == chosen("desk/p3/id-next") == expected
+    for name in ("next", "id-next", "desk/p3/id-next"):
+        assert chosen(name) == (["robot/a", "fg/1"], ["survey"], ["next"], [])
 
 
 def test_a_host_with_its_rcs_and_programs() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from decimal import Decimal
 
 import pytest
@@ -26,9 +27,9 @@ KNOWN: dict[str, Parameters | None] = {
 }
 
 
-def refusal(need: str, *, waits: bool = False, **params: float) -> str:
+def refusal(need: str, *, waits: bool = False, params: Mapping[str, float] | None = None) -> str:
     """The code and the text; empty where it is let in."""
-    amounts: Amounts = {name: Decimal(str(value)) for name, value in params.items()}
+    amounts: Amounts = {name: Decimal(str(value)) for name, value in (params or {}).items()}
     try:
         check_door({need: amounts}, KNOWN, KNOWN.get, waits=waits)
     except Refused as refused:
@@ -51,7 +52,7 @@ def refusal(need: str, *, waits: bool = False, **params: float) -> str:
     ],
 )
 def test_what_may_start_is_let_in(need: str, params: dict[str, float]) -> None:
-    assert refusal(need, **params) == ""
+    assert refusal(need, params=params) == ""
 
 
 @pytest.mark.parametrize(
@@ -71,12 +72,12 @@ def test_what_may_start_is_let_in(need: str, params: dict[str, float]) -> None:
     ],
 )
 def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: dict[str, float], words: str) -> None:
-    assert refusal(need, **params).startswith(words)
+    assert refusal(need, params=params).startswith(words)
 
 
 def test_who_waits_for_a_device_is_still_told_of_bad_parameters() -> None:
     assert refusal("robot/nowhere", waits=True) == ""
-    assert refusal("radio/rf0", waits=True, command_rate=11).startswith("too_much")
+    assert refusal("radio/rf0", waits=True, params={"command_rate": 11}).startswith("too_much")
 
 
 def test_the_leader_refuses_what_it_knows_only_to_who_asks_for_that() -> None:

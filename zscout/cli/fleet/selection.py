@@ -36,7 +36,8 @@ class Selection:
         there = [view.rc for view in whole.rcs] if whole is not None else list(self.homes)
         hosts = {host for host in self.hosts if self._means(host)}
         rcs = {rc for rc in there if self._means(rc)} | {rc for rc in there if self.homes.get(rc) in hosts}
-        arcs = [view for view in (*holds, *queue) if self._names_arc(view) or view.client.partition("/")[0] in hosts]
+        arcs: list[HoldView | WaitView] = [*holds, *queue]
+        arcs = [view for view in arcs if self._names_arc(view) or view.client.partition("/")[0] in hosts]
         needed = {rc for view in arcs for rc in there if _needs(view, rc)}
         self._rcs = rcs | needed
         shown = {_id(view) for view in arcs}

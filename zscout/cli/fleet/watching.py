@@ -134,7 +134,8 @@ async def show(
     in place at a terminal, in a pipe as a block where something has changed that is not a load or a span of time."""
     stop = asyncio.Event()
     printed: Any = None
-    scrolled, drawn = Scrolled(), None
+    scrolled = Scrolled()
+    drawn: Overview | None = None
 
     def end() -> None:
         stop.set()

@@ -8,7 +8,7 @@ import socket
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import rerun as rr
 
@@ -215,16 +215,20 @@ class Timeline(Drawing):
             ended = self._end()
         if ended and self._path is not None and self._path.is_file():
             try:
-                finish(self._path, layout)
+                self._finish(self._path, layout)
             except (OSError, RuntimeError, ValueError) as error:
                 log.warning("the recording %s stays as it was written, and opens slowly: %s", self._path, error)
+
+    def _finish(self, path: Path, layout: Layout) -> None:
+        """What is done with a file that is over."""
+        finish(path, layout)
 
     def _end(self) -> bool:
         """Whether the file was written to its end; a viewer that hangs holds up the server alone."""
         ended = {id(stream): disconnect(stream, DISCONNECT_SECONDS) for stream in reversed(self.streams)}
         return ended.get(id(self._file), False)
 
-    def __enter__(self) -> Timeline:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
