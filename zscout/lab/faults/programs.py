@@ -112,7 +112,8 @@ class Work:
             # One that is killed sees to nothing: its guardian does.
             if process is not None and not process.dead:
                 try:
-                    await asyncio.sleep(RANDOM.get().choice(CLEARS_UP))
+                    # What ends of its own accord has nobody to wait for it.
+                    await asyncio.sleep(RANDOM.get().choice(CLEARS_UP) if direct.over else 0)
                 finally:
                     if not process.dead:
                         program.end()

@@ -172,9 +172,14 @@ class Promises:
             granted = _written(arc.grant)
             self._granted[full] = granted, arc.rcs
         self._follow_hand_over(name, arc, held, touched=touched)
-        lost = (arc.outcome in LOSSES or granted not in ("", held[0])) and self._stood(*held)
-        if (lost or arc.outcome == "client_lost") and arc.unconfirmed is None and arc.unserved is None and not touched:
-            how = f"was granted anew {granted}" if granted else arc.outcome
+        set_aside = arc.state == "queued" and arc.outcome is None
+        lost = (arc.outcome in LOSSES or granted not in ("", held[0]) or set_aside) and self._stood(*held)
+        # A direct program that has left does not come back: its client gives such a grant back.
+        given_back = arc.unconfirmed is not None or (
+            arc.direct and arc.why is not None and arc.why.code == ReasonCode.UNCONFIRMED
+        )
+        if (lost or arc.outcome == "client_lost") and not given_back and arc.unserved is None and not touched:
+            how = f"was granted anew {granted}" if granted else arc.outcome or "is told to wait"
             self._broken(f"{name} {arc.name} {how}, though no fault touched it: {arc.reason}")
         if arc.place is not None:
             before = self._places.setdefault((name, arc.id), arc.place)

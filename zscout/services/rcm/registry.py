@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict, deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from msgspec.structs import replace
@@ -84,6 +84,8 @@ class RequestRegistry:
         """How the last hold of each queued ARC ended here."""
         self._estimated: set[ArcId] = set()
         """ARCs whose notices say when they will start."""
+        self.may_be_held: Callable[[ArcId], bool] = lambda _: False
+        """Whether a queued ARC's client believes in a hold that RCs may yet report: it is not told to wait before."""
         self._changed: dict[ArcId, None] = {}
         """Queued ARCs whose reason to wait has changed and has not been published yet."""
         self._starts: Mapping[ArcId, Ns] = {}
@@ -199,9 +201,7 @@ class RequestRegistry:
                     if isinstance(effect, Dropped) or arc not in given_up:
                         self._put(notice)
                 case Queued(arc=arc, settled=True) if self._core.is_queued(arc):
-                    if not self._changed:
-                        self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
-                    self._changed[arc] = None
+                    self._change(arc)
 
     def publish(self, arcs: Iterable[ArcId]) -> None:
         """Publishes the present state of these ARCs, as far as they are open."""
@@ -210,10 +210,19 @@ class RequestRegistry:
                 self._changed.pop(arc, None)
                 self._put(self.notice(arc))
 
+    def _change(self, arc: ArcId) -> None:
+        if not self._changed:
+            self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
+        self._changed[arc] = None
+
     def _publish_reasons(self) -> None:
-        changed = [arc for arc in self._changed if self._core.is_queued(arc)]
+        undecided = [arc for arc in self._changed if self.may_be_held(arc)]
+        changed = [arc for arc in self._changed if arc not in undecided and self._core.is_queued(arc)]
+        self._changed = dict.fromkeys(changed)
         self._record_reasons()
         self.publish(changed)
+        for arc in undecided:
+            self._change(arc)
 
     def _put(self, notice: Notice) -> None:
         try:

@@ -95,6 +95,7 @@ class RequestHandler:
         """Of what waited as the lead was taken: the RCs that its client believed to hold."""
         self._lease = fleet.mesh.lease
         membership.on_settled = self._resume
+        registry.may_be_held = self._may_be_held
         self._moving: dict[Query, None] = {}
         """Hand-overs that wait until it is known whether their new client is there."""
 
