@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.cli import tools
-from tests.live.lab import Lab
+from tests.live.lab import PATIENT, Lab
 from zscout.behaviors.client.blocking import connect
 from zscout.messages import RcmState
 
@@ -17,8 +17,9 @@ from zscout.messages import RcmState
 class CliFleet:
     """One node with RCs, and `zscout` processes that use it."""
 
-    def __init__(self, folder: Path) -> None:
-        self.lab = Lab(folder)
+    def __init__(self, folder: Path, hold_lease: float | None = None) -> None:
+        timing = "" if hold_lease is None else f"[timing]\nhold_lease = {hold_lease}"
+        self.lab = Lab(folder, lease=PATIENT, extra=timing)
         self.folder = folder
         self._started: list[subprocess.Popen[str]] = []
         self._eye = connect("eye", fleet=self.lab.fleet, host="test")
@@ -73,9 +74,12 @@ class CliFleet:
 
 
 @contextmanager
-def fleet_of(folder: Path, *rcs: str, env: Mapping[str, str] | None = None) -> Iterator[CliFleet]:
-    """A fleet of one node with these RCs, ready; `env` beside the environment of this process."""
-    fleet = CliFleet(folder)
+def fleet_of(
+    folder: Path, *rcs: str, env: Mapping[str, str] | None = None, hold_lease: float | None = None
+) -> Iterator[CliFleet]:
+    """A fleet of one node with these RCs, ready; `env` beside the environment of this process, `hold_lease` in
+    seconds."""
+    fleet = CliFleet(folder, hold_lease)
     fleet.lab.env |= env or {}
     try:
         fleet.lab.node("anvil", *rcs)

@@ -16,7 +16,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.thorough import times
-from zscout.drivers.airtime import MAX_RATE, Bucket, Share, line_rate, longest_wait, objection, share_of, urgent_burst
+from zscout.drivers.airtime import (
+    DEFAULT_RATE,
+    MAX_RATE,
+    Bucket,
+    Share,
+    line_rate,
+    longest_wait,
+    objection,
+    share_of,
+    urgent_burst,
+)
 from zscout.drivers.commands import RadioCamera, RadioDrive
 from zscout.drivers.packets import (
     MAX_PACKET,
@@ -67,9 +77,9 @@ def fill(queue: TransmitQueue, holders: int) -> None:
 def test_what_a_holder_must_say() -> None:
     assert share_of({"command_rate": Decimal(5)}) == Share(Fraction(5), Fraction(MAX_PACKET))
     assert share_of({"command_rate": Decimal("0.1"), "packet_size": Decimal(8)}).bytes_per_second == Fraction(4, 5)
+    assert share_of({}) == Share(DEFAULT_RATE, Fraction(MAX_PACKET))
+    assert share_of({}, Fraction(7)) == Share(Fraction(7), Fraction(MAX_PACKET))
     for params, word in (
-        ({}, "command_rate is missing"),
-        ({"packet_size": Decimal(10)}, "command_rate is missing"),
         ({"command_rate": Decimal(5), "packet_size": Decimal(6)}, "packet_size is 6"),
         ({"command_rate": Decimal("NaN")}, "command_rate must be a number"),
         ({"command_rate": Decimal(-1)}, "must not be negative"),

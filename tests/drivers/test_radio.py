@@ -114,9 +114,17 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             slow = {"radio/rf0": {"command_rate": 5}}
             many = [await held(client, f"s{number}", slow) for number in range(12)]
             for name, params, word in (
-                ("late", {"command_rate": 1}, "radio/rf0 refuses: a packet could wait 0.267 s, the bound is 0.25 s"),
-                ("fast", {"command_rate": 50}, "refuses: its holders would send 110 of 86.4 packets/s of 10 bytes"),
-                ("vague", {}, "radio/rf0 refuses: a packet could wait 0.267 s"),
+                (
+                    "late",
+                    {"command_rate": 1},
+                    "and 11 more: radio/rf0 refuses more: a packet could wait 0.267 s, the bound is 0.25 s",
+                ),
+                (
+                    "fast",
+                    {"command_rate": 50},
+                    "refuses more: its holders would send 110 of 86.4 packets/s of 10 bytes",
+                ),
+                ("vague", {}, "radio/rf0 refuses more: a packet could wait 0.267 s"),
             ):
                 asked = await client.request(name, {"radio/rf0": params}, min_runtime=600)
                 await comes_to(asked, "queued", word)

@@ -222,10 +222,11 @@ def test_frames_are_published_while_somebody_holds_and_somebody_looks(
 
     async def story() -> None:
         async with scene(tmp_path) as at:
-            # Free: somebody looks, and nothing is opened.
+            # Whether it has a picture was tried as it began. Free: somebody looks, and nothing is opened.
+            tried = at.one.accepted, at.two.accepted
             watch = at.watch()
             await until(lambda: at.driver._publisher.watched)
-            assert at.one.accepted + at.two.accepted == 0
+            assert (at.one.accepted, at.two.accepted) == tried == (1, 0)
 
             first, grant = await running(at.client, "first", GRABBER, "video/ch1")
             frames = [await frame_of(watch) for _ in range(6)]
@@ -325,7 +326,7 @@ def test_tuning_by_hand(tmp_path: Path) -> None:
             told = await at.ask(grant, "snapshot")
             assert told["source"] is None
             assert told["health"] == "no video RC is in its gang; tune it to one of video/ch1, video/ch2"
-            assert at.one.accepted + at.two.accepted == 0
+            assert (at.one.accepted, at.two.accepted) == (1, 0)
 
             def tune(**how: Any) -> Any:
                 return answer(at.client.command(GRABBER, at_grant, {"name": "tune"} | how))

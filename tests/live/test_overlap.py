@@ -62,6 +62,18 @@ def test_a_preempted_program_that_ignores_sigterm_is_gone_before_the_next_one_be
     end(former)
 
 
+def test_the_guardian_of_a_client_that_was_killed_tells_that_its_program_is_gone(tmp_path: Path) -> None:
+    """Without its word the next one would wait for the hold lease."""
+    with fleet_of(tmp_path, "robot/x", hold_lease=2 * HANG) as fleet:
+        chain = Chain(fleet, tmp_path)
+        former = chain.request("--grace", "200ms")
+        assert chain.runs_alone()
+        following = chain.request("--priority", "1")
+        former.kill()
+        assert chain.runs_alone()
+        end(following)
+
+
 @pytest.mark.parametrize(
     "strike", [lambda process: process.kill(), lambda process: process.send_signal(signal.SIGSTOP)], ids=["-9", "STOP"]
 )

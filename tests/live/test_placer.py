@@ -101,7 +101,7 @@ async def _elsewhere(tmp_path: Path) -> None:
         assert (spun.state, spun.host) == ("running", "h2")
 
         nowhere = await placing.place("nowhere", "no-such-kind")
-        assert nowhere.state == "given_up"
+        assert nowhere.state == "waiting"
         assert "no-such-kind" in nowhere.reason
         labelled = await placing.place("labelled", "counter", labels=["gpu", "lidar"])
         assert labelled.state == "waiting"

@@ -13,7 +13,8 @@ before the guardian starts), `end NS` (the grace counts from then), `kill` (with
 `started PID`, `stopped SIGNAL`, `ending WHY` (`deadline`, `client`, `signal`: sent to the guardian), `exited CODE` (of
 COMMAND alone; negative: by that signal), `stuck PID` (it runs as another user, and can't be ended), `gone`.
 
-It imports nothing of zscout, to start quickly.
+Where the client can't, being gone or frozen, the guardian becomes the program that tells the RCs that all of it is gone.
+It imports nothing of zscout itself, to start quickly.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 NOT_EXECUTABLE, NOT_FOUND = 126, 127
 GUARD = (sys.executable, "-I", "-S", __file__)
 """What stands before CHANNEL."""
+LEFT = (sys.executable, "-P", "-m", "zscout.behaviors.client.left")
 ROUND, SLOWEST = 20_000_000, 500_000_000
 """ns between two rounds of SIGKILL: at first, and at last."""
 LOOK = 250_000_000
@@ -84,7 +86,7 @@ class Ending:
         return self._until if self._kill is None else self._kill
 
 
-class Process:
+class Descendant:
     """One in /proc, by its pid and start: the pid alone may pass to another. Raises OSError, ValueError."""
 
     def __init__(self, pid: int) -> None:
@@ -101,7 +103,7 @@ class Process:
         except OSError:
             return
         try:
-            if Process(self.pid).start == self.start:
+            if Descendant(self.pid).start == self.start:
                 signal.pidfd_send_signal(handle, number)
         except PermissionError:
             raise
@@ -111,17 +113,17 @@ class Process:
             os.close(handle)
 
 
-def descendants(root: int) -> list[Process]:
+def descendants(root: int) -> list[Descendant]:
     """All that live, parents before their children."""
-    children: dict[int, list[Process]] = {}
+    children: dict[int, list[Descendant]] = {}
     for name in os.listdir("/proc"):  # noqa: PTH208
         if name.isdigit():
             try:
-                one = Process(int(name))
+                one = Descendant(int(name))
             except (OSError, ValueError):
                 continue
             children.setdefault(one.parent, []).append(one)
-    found: list[Process] = []
+    found: list[Descendant] = []
     pids = [root]
     for pid in pids:
         found += children.get(pid, ())
@@ -207,6 +209,11 @@ class Guardian:
             self._watch()
         self._group.close()
         self._say("gone")
+
+    @property
+    def speaks(self) -> bool:
+        """Whether the client does not say that all is gone."""
+        return self._channel is None or self._why == "deadline"
 
     # The start
 
@@ -385,7 +392,10 @@ def main() -> None:
     os.set_inheritable(channel, False)
     connection = socket.socket(fileno=channel)
     connection.setblocking(False)
-    Guardian(connection, grace).run(tty, command)
+    guardian = Guardian(connection, grace)
+    guardian.run(tty, command)
+    if guardian.speaks:
+        os.execv(LEFT[0], LEFT)  # noqa: S606 - an interpreter of our own
 
 
 if __name__ == "__main__":

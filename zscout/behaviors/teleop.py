@@ -225,7 +225,8 @@ class Teleop:
             raise results[0]
 
     async def _drive(self) -> None:
-        how: dict[str, Any] = {"priority": self.priority, "min_runtime": AT_LEAST}
+        # A camera that is to come is waited for.
+        how: dict[str, Any] = {"priority": self.priority, "min_runtime": AT_LEAST, "wait_for_device": True}
         async with hold(self.client, self._name, self.needs.needs(), **how) as held:
             robot = self.robot = HeldRobot(held, self.needs)
             self.held = held

@@ -146,8 +146,10 @@ def _last(party: Party, until: Until | None) -> str:
 
 
 def _vetoed(reason: Reason, until: Until | None) -> str:
-    words, others = f": {reason.detail}" if reason.detail else "", reason.number - len(reason.by)
-    shown = [f"{party}{_last(party, until)}" for party in reason.by] + ([f"{others} more"] if others > 0 else [])
+    words = f": {reason.detail}" if reason.detail else ""
+    shown = list(dict.fromkeys(f"{party}{_last(party, until)}" for party in reason.by))
+    others = reason.number - len(shown)
+    shown += [f"{others} more"] if others > 0 else []
     if len(reason.rcs) > 1:
         return f"waits for one of {', '.join(_short(reason.rcs))}: {reason.rcs[0]} refuses{words}"
     rc = reason.rcs[0] + (f" for {reason.pattern}" if reason.pattern is not None else "")

@@ -123,7 +123,7 @@ def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
     assert fleet.zscout("migrate", "stayer", "--to", here).stdout == f"stayer is on {here} already\n"
     nowhere = fleet.zscout("migrate", "stayer", "--to", "nowhere")
     assert (nowhere.returncode, nowhere.stdout) == (2, "")
-    assert nowhere.stderr.startswith('zscout: --to: there is no host "nowhere"; there are anvil, bellows')
+    assert nowhere.stderr.startswith('zscout: --to: there is no host "nowhere"; there are: anvil, bellows')
     near = fleet.zscout("migrate", "stayer", "--to", "bellow")
     assert (near.returncode, near.stderr) == (2, 'zscout: --to: there is no host "bellow"; did you mean bellows?\n')
     nobody = fleet.zscout("migrate", "stayr")

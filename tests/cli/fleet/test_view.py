@@ -130,8 +130,8 @@ def test_as_json_it_says_once_where_all_is(recording: Path, tmp_path: Path) -> N
 
 def said_as_json(folder: Path, process: subprocess.Popen[bytes]) -> dict[str, Any]:
     log = folder / "view.log"
-    until(lambda: b"}" in log.read_bytes() or process.poll() is not None, "it said nothing")
-    said: dict[str, Any] = json.loads(log.read_text().splitlines()[0])
+    until(lambda: b"}\n" in log.read_bytes() or process.poll() is not None, "it said nothing")
+    said: dict[str, Any] = json.loads(next(line for line in log.read_text().splitlines() if line.startswith("{")))
     return said
 
 

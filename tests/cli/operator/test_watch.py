@@ -178,5 +178,5 @@ def test_at_a_terminal_there_is_a_live_line(video: Path) -> None:
 
 def test_help_has_examples() -> None:
     shown = CliRunner().invoke(command, ["--help"]).output
-    assert "zscout watch --source garden.avi" in shown
+    assert "zscout watch --source /dev/video0" in shown
     assert "--json" in shown

@@ -15,6 +15,7 @@ from zscout.behaviors.teleop import Pilot, Teleop
 pytestmark = pytest.mark.live
 
 RCS = ("robot/scout33", "radio/rf0", "video/ch1", "framegrabber/fgrab1")
+OFFERED = ("robot/scout33", "radio/rf0:command_rate=50", "video/ch1", "framegrabber/fgrab1")
 AFTER_A_SLOT = 2.5
 """Seconds: an operator's hold may be displaced by another's after one."""
 
@@ -44,7 +45,7 @@ class Operator:
 def test_the_later_operator_keeps_it_and_the_earlier_is_told(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path) as lab:
-            lab.node("a", *RCS)
+            lab.node("a", *OFFERED)
             one, two = Operator(lab), Operator(lab)
             async with one as first, two as second:
                 first.take()
@@ -66,7 +67,7 @@ def test_the_later_operator_keeps_it_and_the_earlier_is_told(tmp_path: Path) -> 
 def test_who_waits_is_told_for_what(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path) as lab:
-            lab.node("a", *RCS[:3])
+            lab.node("a", *OFFERED[:3])
             operator = Operator(lab)
             operator_rcs = RCS[:3]
             client = await lab.client()

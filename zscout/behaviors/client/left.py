@@ -1,0 +1,57 @@
+"""Tells the RCs of a direct hold that its program is gone, where its client is gone too, or frozen.
+
+    python -m zscout.behaviors.client.left
+
+A command's guardian becomes this program once nothing of the command is left. Which hold it was stands in the command's
+environment."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+
+import msgspec
+
+from zscout.behaviors.client.direct import DEFAULT_SETTLE, TELL_TIMEOUT, TRY_AGAIN_AFTER
+from zscout.config.fleet import fleet_from_env
+from zscout.config.strict import BadInput
+from zscout.keyexpr import BadName, check_rc, client_of
+from zscout.mesh import Mesh, MeshError, ZenohMesh
+from zscout.messages import Command, Done
+from zscout.types import SECOND, Grant
+
+AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
+
+
+async def tell(mesh: Mesh, rcs: list[str], grant: Grant, patience: float) -> None:
+    """Says `left` to each of them until it has answered, or `patience` seconds are over: then it has settled anyway."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(patience):
+            await asyncio.gather(*(_tell(mesh, rc, grant) for rc in rcs))
+
+
+async def _tell(mesh: Mesh, rc: str, grant: Grant) -> None:
+    left = Command(grant=grant, do={"name": "left"}, ttl=1.0)
+    while True:
+        reply = await mesh.ask_one(mesh.keys.command(rc, mesh.me), left, Done, timeout=TELL_TIMEOUT)
+        if reply is not None and (reply.problem is None or reply.problem.code not in AGAIN):
+            return
+        await asyncio.sleep(TRY_AGAIN_AFTER)
+
+
+async def _main(env: Mapping[str, str]) -> None:
+    fleet, me = fleet_from_env(), client_of(env["ZSCOUT_CLIENT"])
+    rcs = [check_rc(rc) for rc in env["ZSCOUT_RCS"].split()]
+    grant = msgspec.json.decode(env["ZSCOUT_GRANT"], type=Grant)
+    mesh = await ZenohMesh.open(fleet.name, me, fleet.mesh)
+    try:
+        await tell(mesh, rcs, grant, (fleet.timing.hold_lease + DEFAULT_SETTLE) / SECOND)
+    finally:
+        await mesh.close()
+
+
+if __name__ == "__main__":
+    with suppress(BadInput, BadName, KeyError, MeshError, msgspec.DecodeError):  # then they settle for their time
+        asyncio.run(_main(os.environ))
