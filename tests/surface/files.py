@@ -39,6 +39,7 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "candidates": Key("[]", ('["anvil"]',), ('["a/b"]', '["a", "a"]', '"anvil"', "[1]")),
         "strategy": Key('"adaptive"', ('"priority"', '"optimal"'), ('"best"', "1")),
         "operator_priority": _number("10", "0", "1_000_000_000", "-1", "1_000_000_001"),
+        "min_runtime": _number("60.0", "0.001", "31_622_400", "0", "31_622_401"),
         "preempt": Key('"always"', ('"after_min_runtime"',), ('"never"', "true")),
         "patience": _number("142.0", "0", "31_622_400", "-1", "31_622_401"),
         "promise": Key('"equals"', ('"all"',), ('"none"', "1")),
@@ -63,6 +64,7 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "max_requests_per_client": _number("256", "1", "100_000", "0", "100_001"),
         "max_payload": _number("65_536", "1_024", "16_777_216", "1_023", "16_777_217"),
         "max_running_per_host": _number("0", "1", "100_000", "-1", "100_001"),
+        "max_runtime": _number("0.0", "1", "31_622_400", "-1", "31_622_401"),
     },
     "timing": {
         "heartbeat": _number("0.5", "0.05", "1.4", "0.04", "11"),
@@ -89,6 +91,7 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
         "candidate": Key("true", ("false",), TRUTH),
         "load": Key("true", ("false", '"tree"'), ('"all"', "1")),
         "labels": Key("[]", ('["gpu", "camera"]',), ('["a b"]', '["a", "a"]', '"gpu"')),
+        "state": Key(None, ('"state"', '"/var/lib/zscout"'), ('""', "1")),
     },
     "mesh": {
         "listen": Key(None, ('["tcp/0.0.0.0:7447"]',), ('["tcp/7447"]',)),
@@ -101,6 +104,7 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
         "port": _number("9876", "1", "65_535", "0", "65_536"),
         "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
         "frames": _number("2.0", "0", "30", "-1", "31"),
+        "limit": _number("5000", "300", "1_000_000", "299", "1_000_001"),
     },
     "components": {
         "allow": Key("true", ("false",), TRUTH),
@@ -110,12 +114,27 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
 }
 CHANNELS: Final = '{ "video/ch1" = 1 }'
 SOURCES: Final = '{ "video/ch1" = "/dev/video0" }'
+SETTLE: Final = _number("5.0", "0.5", "60", "0.4", "61")
 RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
-    "exclusive": ('name = "robot/a"', {"activation": _number("0.0", "0.5", "3600", "-1", "3601")}),
+    "exclusive": ('name = "robot/a"', {"activation": _number("0.0", "0.5", "3600", "-1", "3601"), "settle": SETTLE}),
     "capacity": (
         'name = "radio/a"\ncapacity = { rate = 10 }',
         {
             "capacity": Key(None, ("{ rate = 0.1, width = 2 }",), ("{}", "{ rate = -1 }", '{ "a b" = 1 }', "10")),
+            "settle": SETTLE,
+            "activation": _number("0.0", "0.5", "3600", "-1", "3601"),
+        },
+    ),
+    "command": (
+        'name = "psu/a"\nsafe = ["psu", "off"]',
+        {
+            "start": Key("[]", ('["psu", "on"]',), ('"psu"', '[""]', "[1]")),
+            "stop": Key("[]", ('["psu", "save"]',), ('"psu"', '[""]')),
+            "safe": Key(None, ('["psu"]',), ('"psu"', '[""]', "[]")),
+            "health": Key("[]", ('["psu", "ping"]',), ('"psu"', '[""]')),
+            "every": _number("10.0", "0.5", "3600", "0.4", "3601"),
+            "timeout": _number("5.0", "0.1", "600", "0.09", "601"),
+            "settle": SETTLE,
             "activation": _number("0.0", "0.5", "3600", "-1", "3601"),
         },
     ),
@@ -124,6 +143,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
         {
             "port": Key(None, ('"loop://"',), ('""', "1")),
             "baud": _number("9600", "300", "1_000_000", "299", "1_000_001"),
+            "settle": SETTLE,
             "bound": _number("0.25", "0.01", "10", "0.009", "11"),
         },
     ),
@@ -135,17 +155,19 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "channels": Key(
                 "{}", (CHANNELS,), ('{ "robot/b" = 1 }', '{ "video/ch1" = 0 }', '{ "video/a" = 1, "video/b" = 1 }')
             ),
+            "settle": SETTLE,
             "warm_up": _number("2.0", "0", "60", "-1", "61"),
             "dead_man": _number("0.5", "0.05", "5", "0.04", "5.1"),
         },
     ),
-    "video": ('name = "video/a"', {}),
+    "video": ('name = "video/a"', {"settle": SETTLE}),
     "framegrabber": (
         'name = "framegrabber/a"\nsource = "/dev/video0"',
         {
             "source": Key(None, ('"/dev/video1"',), ('""', "1", f'"a"\nsources = {SOURCES}')),
             "sources": Key(None, (), ("{}", '{ "robot/a" = "b" }')),
             "rate": _number("10.0", "0.1", "60", "0.09", "61"),
+            "settle": SETTLE,
             "quality": _number("80", "1", "100", "0", "101"),
         },
     ),

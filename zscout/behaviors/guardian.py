@@ -13,8 +13,8 @@ before the guardian starts), `end NS` (the grace counts from then), `kill` (with
 `started PID`, `stopped SIGNAL`, `ending WHY` (`deadline`, `client`, `signal`: sent to the guardian), `exited CODE` (of
 COMMAND alone; negative: by that signal), `stuck PID` (it runs as another user, and can't be ended), `gone`.
 
-Where the client can't, being gone or frozen, the guardian becomes the program that tells the RCs that all of it is gone.
-It imports nothing of zscout itself, to start quickly.
+Where the client can't, being gone or frozen, the guardian becomes the program that tells the RCs that all is gone. It
+imports nothing of zscout itself, to start quickly.
 """
 
 from __future__ import annotations
