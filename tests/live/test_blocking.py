@@ -60,6 +60,29 @@ def take(fleet: CliFleet, rc: str, *options: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_a_direct_body_clears_up_before_the_next_program_begins(fleet: CliFleet, tmp_path: Path) -> None:
+    told = tmp_path / "told"
+    text = f"""
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {{"robot/a": {{}}}}, direct=True):
+                    say("entered")
+                    try:
+                        time.sleep(LONGER)
+                    finally:
+                        time.sleep(1)
+                        open({str(told)!r}, "a").write("left\\n")
+            except zscout.Revoked as revoked:
+                say(revoked.outcome)
+    """
+    survey = script(fleet.lab, text)
+    read_until(survey, "entered")
+    done = fleet.zscout("request", "robot/a", "--priority", "5", "--", "sh", "-c", f"echo next >> {told}")
+    assert done.returncode == 0, done.stderr
+    assert rest_of(survey) == ["preempted"]
+    assert told.read_text().split() == ["left", "next"]
+
+
 def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> None:
     text = """
         before = signal.getsignal(signal.SIGURG)

@@ -27,6 +27,7 @@ from zscout.behaviors.client.interruption import InterruptibleBody, interruptibl
 from zscout.behaviors.client.request import HoldEnd, Needs
 from zscout.config.fleet import Fleet
 from zscout.mesh.supervision import done_within
+from zscout.types import Grant
 
 T = TypeVar("T")
 
@@ -40,6 +41,10 @@ class BlockingHeld:
     def __init__(self, lab: Lab, held: Held) -> None:
         self._lab, self._held = lab, held
         self._body = InterruptibleBody(self._revoked)
+
+    @property
+    def grant(self) -> Grant:
+        return self._held.grant
 
     @property
     def active(self) -> bool:
@@ -153,9 +158,11 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         if self._entering is not None and not self._entering.done():
             # It was interrupted, and withdraws what it asked for.
             await asyncio.wait([self._entering])
-        arc = self._attempt.arc
+        arc, client = self._attempt.arc, self._lab.client
+        if self._held is not None and (direct := client.direct_hold(self._held.grant)) is not None:
+            direct.returned()
         if arc is not None and arc.open:
-            await self._lab.client.end(arc)
+            await client.end(arc)
 
 
 class Lab:
@@ -205,6 +212,7 @@ class Lab:
         priority: int = 0,
         min_runtime: float | None = None,
         keep: bool = True,
+        direct: bool = False,
         timeout: float | None = None,
         interrupt: bool = True,
         comment: str = "",
@@ -218,12 +226,15 @@ class Lab:
         taken away before, `Revoked` is raised in a body in the main thread, unless `interrupt` is false: its `outcome`
         is `completed` where it had its time.
 
+        A body that touches devices past their RCs says `direct`: they settle until it has been left, in at most nine
+        tenths of their `settle`; the next holder waits for that.
+
         What can never start is refused; with `wait_for_device`, not for a need that nobody knows.
 
         Entering raises TimeoutError, RequestRefused, Revoked where others ended the request, and NoRcm where none is
         seen within 3 s. Leaving raises Revoked where the hold was taken away and the body has not been told."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
-        how["comment"] = comment
+        how |= {"comment": comment, "direct": direct}
         how["wait_for_device"] = wait_for_device
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
