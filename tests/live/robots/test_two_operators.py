@@ -15,7 +15,7 @@ from zscout.behaviors.teleop import Pilot, Teleop
 pytestmark = pytest.mark.live
 
 RCS = ("robot/scout33", "radio/rf0", "video/ch1", "framegrabber/fgrab1")
-OFFERED = ("robot/scout33", "radio/rf0:command_rate=50", "video/ch1", "framegrabber/fgrab1")
+OFFERED = ("robot/scout33", "radio/rf0:command_rate = 50, packet_size = 1000", "video/ch1:transmitters = 1", RCS[3])
 AFTER_A_SLOT = 2.5
 """Seconds: an operator's hold may be displaced by another's after one."""
 
