@@ -157,3 +157,33 @@ def test_a_client_that_hears_nothing_ends_its_body_after_the_hold_lease() -> Non
             body.cancel()
 
     run(test())
+
+
+def test_a_leader_that_begins_as_a_body_clears_up_after_its_time_does_not_queue_it_again() -> None:
+    async def test() -> None:
+        async with small_fleet("one") as (fleet, (one,)):
+            told: list[str] = []
+            one.watch(lambda arc: told.append(f"{arc.state} {arc.outcome}"))
+
+            async def body() -> None:
+                async with hold(one, "work", {RC: {}}, min_runtime=3, keep=False, direct=True):
+                    try:
+                        await asyncio.sleep(3600)
+                    finally:
+                        await asyncio.sleep(PARKS)
+
+            task = asyncio.create_task(body())
+            await until(lambda: "running None" in told)
+            await asyncio.sleep(2.5)
+            await fleet.candidates.pop("h0").stop()
+            await asyncio.sleep(1)
+            fleet.candidate("h1")
+            await until(lambda: one.leader == "h1")
+            assert not task.done()
+            await task
+            state = await one.state()
+            assert state is not None
+            assert (state.queue, state.holds) == ([], [])
+            assert [one for one in told if one.startswith("queued")] == []
+
+    run(test())

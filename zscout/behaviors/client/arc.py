@@ -166,6 +166,9 @@ class Attempt:
         self._cancel(body)
         if direct is not None:
             direct.end()
+            if held.active:
+                # By our clock it had its time. An RCM that takes the lead as it clears up would queue it again.
+                self._client.expire(held.arc)
             await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
             log.warning(
                 "%s clears up for too long after its hold, and is interrupted: the next holder begins", held.arc.name

@@ -451,6 +451,11 @@ class Client(MovableClient):
     def complete(self, arc: OpenArc) -> None:
         """An ARC has had its time by this host's clock, and its body has returned; RCs and RCM end it by theirs."""
         self._program_is_gone(arc)
+        self.expire(arc)
+
+    def expire(self, arc: OpenArc) -> None:
+        """An ARC has had its time by this host's clock: it is not asked for any more, though a direct body may clear
+        up yet."""
         arc.finish("completed", "its minimum runtime is over", self.mesh.now())
         self._store.notify(arc)
         self._store.forget(arc)
