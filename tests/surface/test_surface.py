@@ -44,7 +44,7 @@ def test_a_lost_option_and_a_changed_text_are_seen(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(SECTIONS, "commands", lambda: now)
     found = [str(one) for one in differences.__wrapped__("commands")]
     assert [line.split(":")[0] for line in found] == [
-        "removed  commands > zscout request > options > --keep > help",
+        "removed  commands > zscout request > options > --keep > hidden",
         "removed  commands > zscout request > options > --keep > is_flag",
         "removed  commands > zscout request > options > --keep > names > --keep",
         "removed  commands > zscout request > options > --keep > takes",

@@ -219,10 +219,11 @@ class Guardian:
 
     def _start(self, tty: int, command: list[str]) -> None:
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD, *ENDS_US})
+        guardian = os.getpid()
         self._leader = os.fork()
         if self._leader == 0:
             try:
-                self._become(tty, command, mask)
+                self._become(guardian, tty, command, mask)
             except OSError as error:
                 os.write(2, f"zscout: {command[0]} can't be run: {error.strerror}; check the path\n".encode())
                 os._exit(NOT_FOUND if isinstance(error, FileNotFoundError) else NOT_EXECUTABLE)
@@ -249,10 +250,12 @@ class Guardian:
             os.close(tty)
         self._say(f"started {self._leader}")
 
-    def _become(self, tty: int, command: list[str], mask: set[int | signal.Signals]) -> None:
+    def _become(self, guardian: int, tty: int, command: list[str], mask: set[int | signal.Signals]) -> None:
         """The child becomes the command. Raises OSError."""
         os.setpgid(0, 0)
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        if os.getppid() != guardian:
+            os._exit(NOT_EXECUTABLE)  # it was killed before that could be asked for
         self._group.enter()
         # What Python changed at its start must not be inherited.
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)

@@ -322,8 +322,9 @@ class Simulation:
         process, mesh = self.running.get(name, (None, None))
         self.busy.pop(name, None)
         if process is not None and mesh is not None and not process.dead:
-            process.kill()
+            # In this order: nothing that would clean up says anything.
             self.network.kill(mesh, reached)
+            process.kill()
         if "." in name:  # a component's: no other has its name
             self.running.pop(name, None)
 
