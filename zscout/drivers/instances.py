@@ -2,7 +2,7 @@
 
 An instance that finds another one on the mesh, or that an RCM does not name, stands by: it holds nothing, answers
 nothing and keeps its token. When the one that serves has not been seen for the hold lease, and so has let go of
-everything, this one offers itself, and serves once an RCM names it."""
+everything, and then for as long as it settles, this one offers itself, and serves once an RCM names it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ class InstanceState(enum.Enum):
 
 
 class Instances:
-    """Follows the instances of `rc`, of which `instance` is this one. `hold_lease` is in seconds."""
+    """Follows the instances of `rc`, of which `instance` is this one. `patience`: the seconds from when another
+    one was seen last until nobody can use its device any more."""
 
     def __init__(
         self,
@@ -36,9 +37,9 @@ class Instances:
         supervisor: Supervisor,
         on_change: Callable[[], object],
         *,
-        hold_lease: float,
+        patience: float,
     ) -> None:
-        self._mesh, self._rc, self.instance, self._hold_lease = mesh, rc, instance, hold_lease
+        self._mesh, self._rc, self.instance, self._patience = mesh, rc, instance, patience
         self._supervisor, self._on_change = supervisor, on_change
         self.state = InstanceState.SERVES
         self._serves = instance
@@ -70,13 +71,19 @@ class Instances:
         if named == self.instance:
             self._become(InstanceState.SERVES)
         elif (self._others[named].host if named in self._others else host) != self._mesh.me.host:
-            before, other = self.duplicate_of, self._others.get(named)
-            self._serves, self._host = named, other.host if other is not None else host
-            if self.state is InstanceState.STANDS_BY and before != self.duplicate_of:
-                log.warning("%s stands by: duplicate of %s", self._rc, self.duplicate_of)
+            other = self._others.get(named)
+            self._serves = named
+            self._is_at(other.host if other is not None else host)
             if named not in self._others:
                 self._wait()
             self._become(InstanceState.STANDS_BY)
+
+    def _is_at(self, host: HostName | None) -> None:
+        """The one that serves is at that host."""
+        before, self._host = self._host, host
+        if self.state is InstanceState.STANDS_BY and before != host:
+            log.warning("%s stands by: duplicate of %s", self._rc, self.duplicate_of)
+            self._on_change()
 
     def _on_token(self, token: Token, alive: bool) -> None:
         if token.instance == self.instance:
@@ -84,7 +91,7 @@ class Instances:
         if alive:
             self._others[token.instance] = token
             if token.instance == self._serves:
-                self._host = token.host
+                self._is_at(token.host)
                 self._cancel()
         else:
             self._others.pop(token.instance, None)
@@ -93,7 +100,7 @@ class Instances:
 
     def _wait(self) -> None:
         self._cancel()
-        self._waiting = self._supervisor.call_later(self._hold_lease, self._offer)
+        self._waiting = self._supervisor.call_later(self._patience, self._offer)
 
     def _cancel(self) -> None:
         if self._waiting is not None:

@@ -139,7 +139,7 @@ class ResourceController:
         self.stall, self._on_failure = stall, on_failure
         self.supervisor = Supervisor(name, self._failed)
         self.instances = Instances(
-            mesh, name, self.instance, self.supervisor, self._on_instance_state, hold_lease=hold_lease
+            mesh, name, self.instance, self.supervisor, self._on_instance_state, patience=hold_lease + settle
         )
         self._leaders: set[Token] = set()
         self._asked: Term = NO_TERM

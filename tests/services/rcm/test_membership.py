@@ -13,9 +13,10 @@ from msgspec.structs import replace
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, FakeRc
+from zscout.config.fleet import default_fleet
 from zscout.lab.faults.link import Disturbance
 from zscout.mesh import IncomingQuery
-from zscout.messages import Holder, OpenRequest, RcAsk, RcState
+from zscout.messages import Holder, OpenRequest, RcAsk, RcmState, RcState, StateAsk
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined, Requested
 from zscout.scheduling.strategies import STRATEGIES
@@ -486,3 +487,57 @@ def test_what_an_rc_holds_for_a_client_that_has_handed_it_over_waits_for_no_seco
         assert rcm.core.waiting == 0
 
     run(story())
+
+
+def elsewhere(fleet: FakeFleet, host: str, instance: str) -> FakeRc:
+    rc = FakeRc(fleet.mesh(host), RC, instance=instance)
+    rc.start()
+    return rc
+
+
+async def seconds_until_used(fleet: FakeFleet, rc: FakeRc) -> float:
+    """From now until this instance has joined."""
+    began = fleet.watcher.now()
+    await until(lambda: any(one.instance == rc.instance for one in rc.asked))
+    return (fleet.watcher.now() - began) / SECOND
+
+
+@pytest.mark.parametrize("settle", [None, 2.0])
+def test_an_instance_elsewhere_is_taken_in_once_the_one_before_has_let_go_and_settled(settle: float | None) -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        first = elsewhere(fleet, "d1", "i1")
+        await fleet.joined(first)
+        first.publish(settle=settle)
+        second = elsewhere(fleet, "d2", "i2")
+        await asyncio.sleep(1)
+        fleet.network.kill(first.mesh)
+        lease = fleet.fleet.timing.hold_lease / SECOND
+        assert await seconds_until_used(fleet, second) == pytest.approx(lease + (settle or 0), abs=0.1)
+
+    run(story())
+
+
+def test_a_reign_that_never_saw_the_instance_at_home_waits_before_it_takes_in_another() -> None:
+    async def story(home: str, expected: float) -> None:
+        fleet = FakeFleet()
+        fleet.fleet = replace(fleet.fleet, devices={home: (RC,)})
+        elsewhere(fleet, "d2", "i2")
+        fleet.candidate("boss")
+        assert await seconds_until_present(fleet) == pytest.approx(expected, abs=1)
+
+    async def seconds_until_present(fleet: FakeFleet) -> float:
+        began = fleet.watcher.now()
+        async with asyncio.timeout(60):
+            while True:
+                mesh = fleet.watcher
+                reply = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=0.1)
+                views = reply.message.rcs if reply is not None and reply.message is not None else []
+                if any(view.present for view in views):
+                    return (fleet.watcher.now() - began) / SECOND
+                await asyncio.sleep(0.05)
+
+    lease = default_fleet().timing.hold_lease / SECOND
+    run(story("d2", 0.0))
+    run(story("d1", lease + 5))

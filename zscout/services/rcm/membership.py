@@ -14,6 +14,7 @@ from typing import Final
 
 from msgspec import Struct
 
+from zscout.config.devices import SETTLE
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, Mesh
@@ -110,7 +111,9 @@ class Membership:
         self._missed: set[RcName] = set()
         """Expected devices that this reign has not seen, and has said so."""
         self._departed: dict[RcName, RcState] = {}
-        """RCs that went less than a hold lease ago: they may still let their holders command."""
+        """RCs that went just now: for a hold lease they may still let their holders command, and then settle."""
+        self._may_be_at_home = mesh.now() + fleet.timing.hold_lease + SETTLE
+        """Until then an RC that this reign has not seen may still be used at the host that the fleet file names."""
 
     def join(self, rcs: dict[RcName, RcState], pending: Iterable[RcState], *, patient: bool) -> list[Event]:
         """The RCs that promised to obey before the term began; those that are `pending` join later. `patient`: for the
@@ -124,6 +127,7 @@ class Membership:
             self._hold_up(state, patient=patient or alone)
         # One that died before its token was watched would never be seen to go.
         self._supervisor.call_later(self._lease, self._drop_unseen)
+        self._supervisor.call_later((self._may_be_at_home - self.mesh.now()) / SECOND, self._join_all)
         return [_as_it_is(state) for state in rcs.values()]
 
     def watch(self) -> list[Declaration]:
@@ -378,7 +382,7 @@ class Membership:
     def _drop(self, name: RcName) -> None:
         gone = self._departed[name] = self._joined.pop(name)
         self._blinked.discard(gone.instance)
-        self._supervisor.call_later(self._hold_lease, self._free, gone)
+        self._supervisor.call_later(self._hold_lease + (gone.settle or 0), self._free, gone)
         self._seek(self.mesh.keys.rc_state(name), RcState, lambda: name in self._rc_tokens)
         self._emit(RcLost(name, why=self._devices.why_gone(name, gone.host)))
         if gone.leaving:
@@ -427,6 +431,11 @@ class Membership:
             if name not in self._missed and (home := self._devices.latest_home(name)) is not None:
                 self._missed.add(name)
                 self._emit(RcLost(name, why=self._devices.why_gone(name, home)))
+
+    def _join_all(self) -> None:
+        for tokens in self._rc_tokens.values():
+            for token in sorted(tokens.values()):
+                self._supervisor.spawn(self._join(token))
 
     async def _join(self, token: Token) -> None:
         """Asks a new RC for its promise to obey this term, until it has joined or is gone."""
@@ -509,7 +518,10 @@ class Membership:
         present = pending.state if pending is not None else self._joined.get(token.name)
         if present is not None:
             return present.host == token.host and present.instance != token.instance
-        return gone is None or gone.host == token.host
+        if gone is not None:
+            return gone.host == token.host
+        home = self._devices.home_of(token.name)
+        return home in (None, token.host) or token.name in self._named or self.mesh.now() >= self._may_be_at_home
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
         name = self.mesh.keys.rc_of(key)

@@ -55,7 +55,9 @@ def take_over(
     home_of: Callable[[RcName], HostName | None] = lambda _: None,
 ) -> RecoveredState:
     """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided.
-    `home_of`: the host at which the fleet file has an RC."""
+    `home_of`: the host at which the fleet file has an RC; one that is free elsewhere is taken in later, as its device
+    may still be used at home."""
+    states = [state for state in states if state.holders or home_of(state.rc) in (None, state.host)]
     # Of two instances of one RC the one with the newest hold is meant, else the one at home.
     by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
     by_host.sort(key=lambda state: state.host == home_of(state.rc))
