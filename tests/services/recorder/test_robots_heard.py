@@ -54,7 +54,7 @@ def test_who_takes_no_pictures_does_not_look(tmp_path: Path) -> None:
                 with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
                     heard, offered, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
                     timeline.robots.behavior = lambda *_: heard.set()  # type: ignore[method-assign]
-                    timeline.event = lambda _, text, *level: offered.set() if CAMERA in text else None  # type: ignore[method-assign]
+                    timeline.presence = lambda _, text, *level: offered.set() if CAMERA in text else None  # type: ignore[method-assign]
                     recorders = [asyncio.create_task(Recorder(ears, lab.fleet, timeline, 0).run(stop))]
                     token = speaker.alive(Token("cart", Role.RC, CAMERA, "i1"))
                     # What blind has asked for so far is known to the speaker once a question of it is.

@@ -15,7 +15,7 @@ from tests.services.recorder.paper_run import SCOUT33, events, lanes, rows
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import MemoryNetwork
-from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, ReasonParty, StateAsk, WaitView
+from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, ReasonParty, StateAsk, WaitView, Who
 from zscout.services.recorder.recorder import Recorder, RecorderFailed
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import Grant, Place, Term
@@ -119,6 +119,41 @@ def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goings(tmp
         "node cart is gone",
         f"{SCOUT33} is gone from cart",
     ]
+
+
+def test_a_bar_names_first_who_holds_what_would_do(tmp_path: Path) -> None:
+    """By the names of their lanes: which choices there are, and what their users run, is told at length elsewhere."""
+    path = tmp_path / "run.rrd"
+    net, crew = Sender("cart", "net"), Sender("dray", "request-7e3c")
+    by = [
+        ReasonParty("a1", "hide", str(net), priority=1, who=Who("root", "cart", "component place_sensor_net")),
+        ReasonParty("a2", "survey", str(crew), priority=1, who=Who("alice", "", "survey.py")),
+        ReasonParty("a2", "survey", str(crew), priority=1, who=Who("alice", "", "survey.py")),
+    ]
+    choices = ["framegrabber/fg1", "framegrabber/fg2"]
+    why = ReasonInfo("held", [*choices, SCOUT33], by, count=4, patterns=["framegrabber/*"] * 2 + [""])
+    queue = [
+        WaitView("a3", "watch", str(net), 1, PLACE, {}, Decimal(5), 0.0, "waits for one of many words", why=why),
+        WaitView("a4", "film", str(net), 1, PLACE, {}, Decimal(5), 0.0, "votes are out", why=ReasonInfo("voting")),
+    ]
+
+    async def play() -> None:
+        network, stop = MemoryNetwork(), asyncio.Event()
+        rcm = Leader(network, lambda: RcmState(TERM, 0, "anvil", queue=queue))
+        with Timeline("lab", path=path) as timeline:
+            recorder = Recorder(network.open("lab", Sender("basil", "recorder")), default_fleet(), timeline)
+            recording = asyncio.create_task(recorder.run(stop))
+            await rcm_sees(rcm, Role.RECORDER)
+            stop.set()
+            await recording
+
+    run(play())
+    blocked = f"for hide (root@cart), survey (alice@dray): {SCOUT33}; one of framegrabber/fg1, fg2 and 1 more"
+    assert {entity: [text for _, (text,) in lane] for entity, lane in lanes(path, "/arc/**").items()} == {
+        "/arc/watch": [f"waiting · {blocked}"],
+        "/arc/film": ["waiting · votes are out"],
+    }
+    assert events(path) == ["anvil leads", f"watch waits {blocked}", "film waits: votes are out"]
 
 
 def test_at_its_end_it_reads_what_was_published_and_missed(tmp_path: Path) -> None:

@@ -83,6 +83,18 @@ def test_an_arc_has_one_colour_and_the_operator_has_its_own(tmp_path: Path) -> N
             assert (colour == OPERATOR) == text.startswith("preempted")
 
 
+def test_only_what_an_operator_did_is_red_among_the_events(tmp_path: Path) -> None:
+    """The viewer gives a line without a colour that of the line before."""
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        timeline.event(0, "one")
+        timeline.warn(1, "two", operator=True)
+        timeline.event(2, "three")
+        timeline.warn(3, "four")
+    shown = [colour for _, _, (colour,) in rows(path, "/events", "TextLog:color")]
+    assert [colour == OPERATOR for colour in shown] == [False, True, False, False]
+
+
 def lab_of(rgba: int) -> tuple[float, float, float]:
     """CIE L*a*b* of an sRGB colour under D65."""
     red, green, blue = (

@@ -16,7 +16,7 @@ import numpy as np
 import rerun as rr
 
 from zscout.services.recorder.blueprint import TIME, WALL_TIME
-from zscout.services.recorder.colours import OPERATOR, OTHER
+from zscout.services.recorder.colours import OPERATOR, OTHER, PALE
 
 MAX_SECONDS: Final = 9e9
 """Rerun counts nanoseconds in 64 bits."""
@@ -97,7 +97,8 @@ class Drawing:
 
     def event(self, at: float, text: str, level: str = "INFO", *, operator: bool = False) -> None:
         """One line in words; `level` is one of Rerun's, `operator` whether an operator did it."""
-        colour = OPERATOR if operator else None
+        # Never none: the viewer would give the line the colour of the one before.
+        colour = OPERATOR if operator else PALE
         self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=level, color=colour))
 
     def warn(self, at: float, text: str, *, operator: bool = False) -> None:
