@@ -36,7 +36,7 @@ BAD_FLEETS = {
     "[flet]": "flet: unknown key; did you mean fleet?",
     "[fleet]\ncandiates = []": "fleet.candiates: unknown key; did you mean candidates?",
     "[limits]\nmax_needed = 1": "limits.max_needed: unknown key; did you mean max_needs or max_queued?",
-    "[fleet]\nzzz = 1": "fleet.zzz: unknown key; known here: candidates, name, operator_priority, "
+    "[fleet]\nzzz = 1": "fleet.zzz: unknown key; known here: candidates, min_runtime, name, operator_priority, "
     "patience, preempt, promise, strategy",
     '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: devices, fleet, limits, mesh, placement, timing',
     'fleet = "lab"': 'fleet: is the text "lab"; write a table, under [fleet]',
