@@ -63,6 +63,9 @@ class Repeated(Timeline):
     def log(self, at: float | None, entity: str, *what: object) -> None:
         Drawing.log(self, None if at is None else at + self.shift, entity, *what)  # type: ignore[arg-type]
 
+    def point(self, at: float, entity: str, value: float) -> None:
+        super().point(at + self.shift, entity, value)
+
 
 class Measured(Timeline):
     """Tells what finishing took."""
