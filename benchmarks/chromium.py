@@ -97,7 +97,16 @@ class Chromium:
                 return told["result"]
 
     def picture(self) -> Image.Image:
-        data = self.ask("Page.captureScreenshot", format="png", optimizeForSpeed=True)["data"]
+        deadline = time.monotonic() + ANSWER
+        while True:
+            try:
+                data = self.ask("Page.captureScreenshot", format="png", optimizeForSpeed=True)["data"]
+                break
+            except RuntimeError as error:
+                # A page that was just navigated to may be in another process, which has not answered yet.
+                if "active page" not in str(error) or time.monotonic() >= deadline:
+                    raise
+                time.sleep(0.1)
         return Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ import sys
 import pytest
 from msgspec import structs
 
-from tests.config.kit import RC_RULE, short, write
+from tests.config.kit import NAME_RULE, RC_RULE, short, write
 from zscout.config.devices import ExclusiveRc, FramegrabberRc, RadioRc, RcConfig, RobotRc, VideoRc
 from zscout.config.node import load_node
 from zscout.config.strict import BadInput
@@ -34,6 +34,10 @@ def robot(**keys: str) -> str:
 
 def radio(**keys: str) -> str:
     return table("radio/r", **({"port": '"/dev/ttyUSB0"'} | keys))
+
+
+def psu(**keys: str) -> str:
+    return table("psu/a", driver="command", **({"safe": '["psu"]'} | keys))
 
 
 BAD = {
@@ -84,6 +88,9 @@ BAD = {
     table("video/1", quality="1"): (
         'rc[0].quality (video/1): the driver "video" has none; remove it, or write driver = "framegrabber"'
     ),
+    psu(parameters="{ voltage = -1 }"): "rc[0].parameters.voltage (psu/a): is -1; write 0 or more",
+    psu(parameters='{ voltage = "12" }'): 'rc[0].parameters.voltage (psu/a): is the text "12"; write a number',
+    psu(parameters='{ "a b" = 1 }'): f'rc[0].parameters (psu/a): "a b" is not a name; {NAME_RULE}',
     table("framegrabber/f"): (
         'rc[0].source (framegrabber/f): is missing; add it, as in source = "/dev/video0", or a table sources'
     ),

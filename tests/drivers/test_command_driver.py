@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from decimal import Decimal
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -16,6 +18,7 @@ from zscout.config.devices import CommandRc
 from zscout.drivers import command_driver
 from zscout.drivers.command_driver import CommandDriver
 from zscout.mesh import Supervisor
+from zscout.messages import Parameter
 from zscout.types import SECOND
 
 TELL = 'echo "$ZSCOUT_DO" >> told; '
@@ -88,7 +91,12 @@ def _quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def play(
-    story: Callable[[CommandDriver, Rc], Awaitable[None]], *, timeout: float = HANG, every: float = 0.05, **scripts: str
+    story: Callable[[CommandDriver, Rc], Awaitable[None]],
+    *,
+    timeout: float = HANG,
+    every: float = 0.05,
+    parameters: Mapping[str, Decimal] = MappingProxyType({}),
+    **scripts: str,
 ) -> None:
     """Plays a story with a driver whose commands are these shell scripts."""
 
@@ -96,7 +104,7 @@ def play(
         rc = Rc()
         bounds: dict[str, Any] = {"timeout": round(timeout * SECOND), "every": round(every * SECOND)}
         words: dict[str, Any] = {name: ("sh", "-c", script) for name, script in scripts.items()}
-        driver = CommandDriver.configured(CommandRc(name=rc.name, **bounds, **words))
+        driver = CommandDriver.configured(CommandRc(name=rc.name, parameters=parameters, **bounds, **words))
         try:
             await driver.open(rc)  # type: ignore[arg-type]
             await story(driver, rc)
@@ -122,6 +130,33 @@ def test_each_is_run_in_its_turn_and_told_what_it_is_about() -> None:
 
     start = TELL + 'echo "$ZSCOUT_RC $ZSCOUT_ARC $ZSCOUT_CLIENT $ZSCOUT_PARAMETERS" > about'
     play(story, start=start, stop=TELL, safe=TELL)
+
+
+def test_a_start_that_has_ended_begins_no_longer() -> None:
+    async def story(driver: CommandDriver, _rc: Rc) -> None:
+        await driver.begin(holder(1))
+        put("go")
+        await until(lambda: driver.begins_for() == 0)
+        assert told() == ["start"]
+
+    play(story, start="until test -e go; do sleep 0.05; done; " + TELL)
+
+
+def test_it_takes_the_parameters_that_it_declares_and_no_others_reach_it() -> None:
+    async def story(driver: CommandDriver, _rc: Rc) -> None:
+        assert driver.parameters() == [Parameter("voltage", bound=Decimal(30)), Parameter("current", bound=Decimal(2))]
+        # As from a client that has its door not checked.
+        asked = {"voltage": Decimal("12.5"), "current": Decimal(3), "$(reboot)": Decimal(1)}
+        await driver.begin(structs.replace(holder(1), params=asked))
+        await until(lambda: bool(told("about")))
+        assert told("about") == ['{"voltage":', "12.5}"]
+
+    parameters = {"voltage": Decimal(30), "current": Decimal(2)}
+    play(story, parameters=parameters, start='echo "$ZSCOUT_PARAMETERS" > about')
+
+
+def test_without_any_it_takes_none() -> None:
+    assert CommandDriver(CommandRc(name="psu/bench")).parameters() == []
 
 
 def test_a_hold_that_goes_on_in_another_client_is_not_started_again() -> None:
@@ -235,11 +270,14 @@ def test_a_program_that_is_not_there_is_the_reason() -> None:
 
 def test_a_start_that_goes_on_holds_up_nobody_and_ends_with_its_hold() -> None:
     async def story(driver: CommandDriver, rc: Rc) -> None:
+        assert driver.begins_for() == 0
         await driver.begin(holder(1))
         await until(lambda: bool(told("pids")))
+        assert 0 < driver.begins_for() <= HANG
         assert rc.said == []
         await driver.end(holder(1))
         await driver.safe()
+        assert driver.begins_for() == 0
         assert told() == ["safe", "stop", "safe"]
         assert rc.said == []
 

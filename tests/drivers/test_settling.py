@@ -306,6 +306,36 @@ def test_a_next_holder_whose_time_is_over_by_then_is_left_out_at_the_device() ->
     play(story)
 
 
+class Oven(Device):
+    """Heats up for 4 s once somebody begins to hold it."""
+
+    warm_at = 0.0
+
+    async def begin(self, holder: Holder) -> None:
+        await super().begin(holder)
+        self.warm_at = asyncio.get_running_loop().time() + 4
+
+    def begins_for(self) -> float:
+        return max(0.0, self.warm_at - asyncio.get_running_loop().time())
+
+
+def test_whom_a_device_begins_for_does_not_enter_before_it_has_begun() -> None:
+    async def story(at: Place) -> None:
+        at.next_holder()
+        await until(lambda: "begin next" in at.device.calls)
+        refused = await at.refusal(2)
+        assert refused.code == "settling"
+        assert refused.left == pytest.approx(4, abs=0.1)
+        assert refused.message == "robot/x is being started, for 4.0 s at most"
+        assert await at.word(at.other, 2, ECHO) == "settling"
+        assert await at.word(at.other, 2, {"name": "stop"}) == "done"
+        assert await at.word(at.client, 1) == "ended"
+        assert await at.settled_after() == pytest.approx(4, abs=0.1)
+        assert await at.word(at.other, 2, ECHO) == "done"
+
+    play(story, device=Oven())
+
+
 class Arm(Device):
     """Parks itself for `seconds`."""
 

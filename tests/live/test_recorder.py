@@ -20,6 +20,7 @@ from typing import Any
 import msgspec
 import psutil
 import pytest
+from rerun.chunk import RrdReader
 
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -304,9 +305,9 @@ def test_a_recorder_that_dies_is_started_again(tmp_path: Path) -> None:
     asyncio.run(story())
 
 
-def run_recorder(lab: Lab, job: bytes) -> subprocess.Popen[bytes]:
+def run_recorder(lab: Lab, job: bytes, *program: str) -> subprocess.Popen[bytes]:
     process = subprocess.Popen(
-        [sys.executable, "-m", "zscout.services.recorder"],
+        [sys.executable, *(program or ("-m", "zscout.services.recorder"))],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -365,6 +366,66 @@ def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
                     assert line in error.decode()
                     assert len(error.decode().strip().splitlines()) == 1
         assert list((tmp_path / "runs").iterdir()) == []
+
+    asyncio.run(story())
+
+
+IN_A_HURRY = (
+    "import zscout.services.recorder.__main__ as program; program.PART, program.CHECK_EVERY = 2.0, 0.2; program.main()"
+)
+"""The recorder, with parts of seconds."""
+
+
+def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    runs.mkdir()
+
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+
+            def before(number: int, size: int) -> Path:
+                path = runs / f"{lab.fleet.name}-20200101-00000{number}.rrd"
+                path.touch()
+                os.truncate(path, size)
+                os.utime(path, (number, number))
+                return path
+
+            def parts() -> list[Path]:
+                made = [path for path in runs.glob("*.rrd") if "-20200101-" not in path.name]
+                return sorted(made)
+
+            # Far more than the parts come to, whatever time this takes; and no room on the disk.
+            old = [before(number, 20_000_000) for number in (1, 2, 3)]
+            lab.node("a", "robot/a")
+            client = await lab.client("crew")
+            await lab.ready(client, "robot/a")
+            job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, limit=50), lab.fleet, "b")
+            process = run_recorder(lab, encode_job(job), "-c", IN_A_HURRY)
+            await recording(lab)
+            assert [path.exists() for path in old] == [False, True, True]
+            arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
+            await lab.state(client, lambda state: len(state.holds) == 1)
+            first = len(parts())
+            await until(lambda: len(parts()) >= first + 2)
+            # What comes besides makes the oldest go, whenever it comes.
+            newer = before(4, 15_000_000)
+            await until(lambda: not old[1].exists())
+            await client.end(arc)
+            await lab.state(client, lambda state: not state.holds)
+            written = parts()
+            assert process.stdin is not None
+            process.stdin.close()
+            assert await asyncio.to_thread(process.wait, HANG) == 0
+            assert [path.exists() for path in (*old, newer)] == [False, False, True, True]
+            assert set(written) <= set(parts())
+
+        told: list[str] = []
+        for number, path in enumerate(parts()):
+            RrdReader(path).store()  # it has its footer: it was written anew
+            states = [held for (held,) in lane(path, "/rc/robot/a")]
+            assert number == 0 or states[0] == told[-1]
+            told += states
+        assert [held for held, _ in groupby(told)] == ["", "survey", ""]
 
     asyncio.run(story())
 

@@ -104,6 +104,10 @@ class CommandRc(RcTable, frozen=True, tag="command"):
     stop: Annotated[Words, key("When that ends.", example=["psu", "save"])] = ()
     safe: Annotated[Words, key("When nobody holds it, and as the node begins and ends.", example=["psu", "off"])] = ()
     health: Annotated[Words, key("Whether it works: exit code 0.", example=["psu", "ping"])] = ()
+    parameters: Annotated[
+        Mapping[str, Decimal],
+        key("The most that a holder may ask for of each.", most=MAX_PARAMETERS, example={"voltage": 30}),
+    ] = {}
     every: Annotated[Ns, seconds("0.5", "3600", "From the end of one `health` to the next.")] = 10 * SECOND
     timeout: Annotated[Ns, seconds("0.1", "600", "After which a command is killed, with all that it started.")] = (
         5 * SECOND
@@ -178,6 +182,9 @@ def _check_rc(rc: BuiltInRc, at: Where) -> None:
                 raise (at / "safe").bad("is missing, and every other command too", f"add one, as in {A_COMMAND}")
             for name in ("start", "stop", "safe", "health"):
                 _check_words(getattr(rc, name), at / name)
+            for parameter in rc.parameters:
+                check_name(parameter, at / "parameters")
+            amounts(rc.parameters, at / "parameters")
         case RadioRc():
             _check_source(rc.port, at / "port", A_PORT)
         case RobotRc():

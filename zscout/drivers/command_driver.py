@@ -22,7 +22,7 @@ from typing import Final
 from zscout.config.devices import CommandRc, Words
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.mesh.supervision import done_within
-from zscout.messages import Figures, Holder
+from zscout.messages import Figures, Holder, Parameter
 from zscout.types import SECOND
 
 log = logging.getLogger(__name__)
@@ -35,8 +35,8 @@ LINGER: Final = 0.2
 """Seconds for what a command has written last to be read."""
 MAX_REASON: Final = 160
 """Characters of its last line that are told on the mesh."""
-AT_ONCE: Final = 0.5
-"""Seconds for which a holder waits for `start`: its client takes an RC that says nothing for a second for gone."""
+AT_ONCE: Final = 0.1
+"""Seconds for which the RC waits for `start`, and answers nobody; then its holder is told to ask again."""
 OPENING: Final = 1.0
 """Seconds that a node waits for the first `safe` and `health` before it offers the RC as lost."""
 AGAIN: Final = (1.0, 60.0)
@@ -69,6 +69,8 @@ class CommandDriver(Driver):
         self._started: Holder | None = None
         """For whom it was started and not stopped since."""
         self._starting: asyncio.Task[None] | None = None
+        self._started_by = 0.0
+        """When that is over at the latest, by the loop's clock."""
         self._unsure = "it was not made safe yet"
         """Why its state is not known; empty once `safe` has succeeded."""
         self._lost = ""
@@ -97,9 +99,15 @@ class CommandDriver(Driver):
             return
         self._counts["starts"] += 1
         self._started = holder
+        commands = 2 if self._one_at_a_time.locked() else 1
+        self._started_by = asyncio.get_running_loop().time() + commands * self._told.timeout / SECOND
         self._starting = self._rc.supervisor.spawn(self._start(holder))
-        # The RC answers nobody meanwhile: what takes longer goes on beside its holder.
         await asyncio.wait({self._starting}, timeout=AT_ONCE)
+
+    def begins_for(self) -> float:
+        if self._starting is None or self._starting.done():
+            return 0.0
+        return max(LINGER, self._started_by - asyncio.get_running_loop().time())
 
     async def _start(self, holder: Holder) -> None:
         ended = await self._run("start", self._told.start, holder)
@@ -130,6 +138,9 @@ class CommandDriver(Driver):
             raise
         if self._unsure:
             self._lose(self._unsure)
+
+    def parameters(self) -> list[Parameter]:
+        return [Parameter(name, bound=bound) for name, bound in self._told.parameters.items()]
 
     def figures(self) -> Figures:
         return {**self._counts, "start_seconds": round(self._start_seconds, 3)}
@@ -179,7 +190,9 @@ class CommandDriver(Driver):
             return Ended("", 0.0)
         env = os.environ | {"ZSCOUT_DO": do, "ZSCOUT_RC": self._rc.name}
         if holder is not None:
-            params = {name: float(amount) for name, amount in holder.params.items()}
+            # Not all clients have the door check what they ask for.
+            bounds, asked = self._told.parameters, holder.params.items()
+            params = {name: float(amount) for name, amount in asked if name in bounds and amount <= bounds[name]}
             env |= {"ZSCOUT_ARC": holder.arc, "ZSCOUT_CLIENT": holder.client, "ZSCOUT_PARAMETERS": json.dumps(params)}
         if do != "health":
             self._give_way.set()

@@ -85,7 +85,12 @@ class Driver:
         """The RC has left the mesh, and `safe` has been called."""
 
     async def begin(self, holder: Holder) -> None:
-        """Somebody begins to hold the device."""
+        """Somebody begins to hold the device. What takes longer than an instant is spawned: see `begins_for`."""
+
+    def begins_for(self) -> float:
+        """Seconds, at most, that what `begin` has spawned still takes. Until 0 its holder does not enter, and what it
+        commands, other than `stop` and `halt`, is refused as `settling`."""
+        return 0.0
 
     async def end(self, holder: Holder) -> None:
         """Somebody ceases to hold the device; `safe` follows if nobody else does. Not called for a hold

@@ -439,6 +439,12 @@ class ResourceController:
             left = max(0.0, (until - self.mesh.now()) / SECOND)
             words = f"{self.name} settles: a former holder's program may still touch it; {left:.1f} s are left at most"
             return messages.Problem("settling", words, left=left)
+        if (
+            problem is None
+            and (left := self.driver.begins_for())
+            and query.message.do.get("name") not in NEVER_HELD_BACK
+        ):
+            return messages.Problem("settling", f"{self.name} is being started, for {left:.1f} s at most", left=left)
         return problem
 
     def _waited(self, query: CommandQuery) -> Ns:

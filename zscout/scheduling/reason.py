@@ -151,12 +151,12 @@ def _vetoed(reason: Reason, until: Until | None) -> str:
     others = reason.number - len(shown)
     shown += [f"{others} more"] if others > 0 else []
     if len(reason.rcs) > 1:
-        return f"waits for one of {', '.join(_short(reason.rcs))}: {reason.rcs[0]} refuses{words}"
+        return f"waits for one of {', '.join(short_names(reason.rcs))}: {reason.rcs[0]} refuses{words}"
     rc = reason.rcs[0] + (f" for {reason.pattern}" if reason.pattern is not None else "")
     return f"waits for {' and '.join(shown)}: {rc} refuses more{words}" if shown else f"{rc} refuses{words}"
 
 
-def _short(rcs: Iterable[RcName]) -> Iterator[RcName]:
+def short_names(rcs: Iterable[RcName]) -> Iterator[RcName]:
     """RCs in a row: a kind is not said twice."""
     last = ""
     for rc in rcs:
@@ -179,7 +179,7 @@ def _held(reason: Reason, until: Until | None) -> str:
             rc, party, _ = choices[0]
             parts.append(f"{party}: {rc} for {pattern}{_last(party, until)}")
             continue
-        names = _short(rc for rc, _, _ in choices)
+        names = short_names(rc for rc, _, _ in choices)
         shown = [f"{rc} (held by {one[1]}{_last(one[1], until)})" for rc, one in zip(names, choices, strict=True)]
         parts.append(f"one of {', '.join(shown)}")
     more = f" and {reason.number - len(held)} more" if reason.number > len(held) else ""

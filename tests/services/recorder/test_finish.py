@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import pytest
 from rerun.chunk import RrdReader
 
+from tests.hang import HANG
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.robot_run import head, jpeg, record
 from zscout.services.recorder import timeline as module
 from zscout.services.recorder.colours import ABSENT, OPERATOR
 from zscout.services.recorder.drawing import HolderRow
-from zscout.services.recorder.finish import APART, WHOLE, finish
+from zscout.services.recorder.finish import APART, WHOLE, Job, finish
 from zscout.services.recorder.process import new_recording, prune, writing
 from zscout.services.recorder.timeline import Timeline, TimelineError
 
@@ -62,6 +66,30 @@ def test_of_old_pictures_one_a_second_stays(tmp_path: Path) -> None:
     assert len(old) == 60
     assert len(shown) - len(old) == WHOLE * 4 + 1
     assert len(events(path)) == end * 4 + 1
+
+
+def test_a_process_of_its_own_thins_what_is_over_and_says_what_it_can_t(tmp_path: Path) -> None:
+    first, picture = tmp_path / "first.rrd", jpeg(0, "scout33", None)
+    with Timeline("lab", path=first) as timeline:
+        for number in range(4):
+            timeline.robots.frame(number / 4, CAMERA, head(number), picture)
+        timeline.event(WHOLE + 10, "much later")
+        job = timeline.roll(WHOLE + 11, tmp_path / "second.rrd")
+    assert job is not None
+
+    def done(job: Job) -> tuple[int, str]:
+        told = msgspec.json.encode(job, enc_hook=str)
+        command = [sys.executable, "-m", "zscout.services.recorder.finish"]
+        ended = subprocess.run(command, input=told, capture_output=True, timeout=HANG, check=False)
+        return ended.returncode, ended.stderr.decode()
+
+    assert len(_pictures(first, "/camera/**")) == 4
+    assert done(job) == (0, "")
+    assert _pictures(first, "/camera/**") == [0]
+    (tmp_path / "third.rrd").write_bytes(b"no recording")
+    code, words = done(Job(tmp_path / "third.rrd", job.layout))
+    assert (code, words.count("\n")) == (1, 1)
+    assert "third.rrd can't be written anew, and stays as it is" in words
 
 
 def test_what_can_t_be_written_anew_stays_as_it_is(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from tests.mesh.kit import run, until
 from tests.services.recorder.paper_run import SCOUT33, events, lanes, rows
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
-from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, ReasonParty, StateAsk
+from zscout.lab.faults.memory import MemoryNetwork
+from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, ReasonParty, StateAsk, WaitView, Who
 from zscout.services.recorder.recorder import Recorder, RecorderFailed
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import Grant, Place, Term
@@ -26,17 +26,23 @@ GRANT = Grant(TERM, 1)
 PLACE = Place(TERM, 1)
 
 
-def leader(network: MemoryNetwork, state: Callable[[], RcmState] = lambda: RcmState(TERM, 0, "anvil")) -> MemoryMesh:
+class Leader:
     """An RCM; without `state` one that has nothing yet."""
-    mesh = network.open("lab", Sender("anvil", "rcm"))
-    mesh.serve(mesh.keys.rcm_state, StateAsk, lambda query: query.answer(state()))
-    mesh.alive(Token("anvil", Role.RCM, "rcm", "i1"))
-    return mesh
+
+    def __init__(
+        self, network: MemoryNetwork, state: Callable[[], RcmState] = lambda: RcmState(TERM, 0, "anvil")
+    ) -> None:
+        mesh = self.mesh = network.open("lab", Sender("anvil", "rcm"))
+        # Who keeps no token has none.
+        self.declared = [
+            mesh.serve(mesh.keys.rcm_state, StateAsk, lambda query: query.answer(state())),
+            mesh.alive(Token("anvil", Role.RCM, "rcm", "i1")),
+        ]
 
 
-async def rcm_sees(rcm: MemoryMesh, role: str) -> None:
+async def rcm_sees(rcm: Leader, role: str) -> None:
     seen: list[Token] = []
-    rcm.watch(rcm.keys.alive_any(role), lambda token, _: seen.append(token))
+    rcm.mesh.watch(rcm.mesh.keys.alive_any(role), lambda token, _: seen.append(token))
     await until(lambda: seen)
 
 
@@ -49,18 +55,18 @@ def test_it_reads_the_state_and_follows_what_is_published(tmp_path: Path) -> Non
 
     async def play() -> None:
         network, stop = MemoryNetwork(), asyncio.Event()
-        rcm, here = leader(network), network.open("lab", Sender("basil", "recorder"))
+        rcm, here = Leader(network), network.open("lab", Sender("basil", "recorder"))
         with Timeline("lab", path=path) as timeline:
             recording = asyncio.create_task(Recorder(here, default_fleet(), timeline).run(stop))
             await rcm_sees(rcm, Role.RECORDER)
             me = Sender("cart", "net")
             notice = Notice("a1", "hide", str(me), "queued", TERM, 1, reason="robot/scout33 is held by drive")
-            rcm.put(rcm.keys.notice(me), notice)
+            rcm.mesh.put(rcm.mesh.keys.notice(me), notice)
             await asyncio.sleep(1)
             holder = Holder("a1", "hide", str(me), GRANT, PLACE, [SCOUT33], Decimal(5), 5, priority=1)
-            rcm.put(rcm.keys.grants, grants(1, holder))
+            rcm.mesh.put(rcm.mesh.keys.grants, grants(1, holder))
             await asyncio.sleep(1)
-            rcm.put(rcm.keys.grants, grants(2))
+            rcm.mesh.put(rcm.mesh.keys.grants, grants(2))
             await asyncio.sleep(1)
             stop.set()
             await recording
@@ -77,7 +83,9 @@ def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goings(tmp
 
     async def play() -> None:
         network, stop = MemoryNetwork(), asyncio.Event()
-        rcm, here = leader(network), network.open("lab", Sender("basil", "recorder"))
+        queue: list[WaitView] = []
+        rcm = Leader(network, lambda: RcmState(TERM, 0, "anvil", queue=queue))
+        here = network.open("lab", Sender("basil", "recorder"))
         with Timeline("lab", path=path) as timeline:
             recording = asyncio.create_task(Recorder(here, default_fleet(), timeline).run(stop))
             await rcm_sees(rcm, Role.RECORDER)
@@ -89,7 +97,9 @@ def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goings(tmp
             await asyncio.sleep(1)
             why = ReasonInfo("held", [SCOUT33], [ReasonParty("a0", "drive", "cart/teleop", priority=10)])
             me = Sender("cart", "net")
-            rcm.put(rcm.keys.notice(me), Notice("a1", "hide", str(me), "queued", TERM, 1, reason=REASON, why=why))
+            notice = Notice("a1", "hide", str(me), "queued", TERM, 1, reason=REASON, why=why)
+            queue.append(WaitView("a1", "hide", str(me), 1, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, REASON, why=why))
+            rcm.mesh.put(rcm.mesh.keys.notice(me), notice)
             await asyncio.sleep(1)
             assert list(timeline.layout(live=False).contended) == [f"/rc/{SCOUT33}"]
             for token in tokens:
@@ -100,19 +110,50 @@ def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goings(tmp
             await recording
 
     run(play())
-    # At its end it reads the state, in which this leader has nothing.
-    assert lanes(path, "/arc/hide")["/arc/hide"][0][1] == [f"waiting · for drive: {SCOUT33}"]
+    assert [state for _, (state,) in lanes(path, "/arc/hide")["/arc/hide"]] == [f"waiting · for drive: {SCOUT33}"]
     assert [state for _, (state,) in lanes(path, f"/rc/{SCOUT33}")[f"/rc/{SCOUT33}"]] == ["", "not there"]
-    assert [text for text in events(path) if "lead" not in text] == [
-        f"hide {REASON}",
-        "hide ended: while nobody listened",
-    ]
+    assert events(path) == ["anvil leads", f"hide {REASON}"]
     assert [text for _, _, (text,) in rows(path, "/presence", "TextLog:text")] == [
         "node cart is there",
         f"{SCOUT33} is offered by cart",
         "node cart is gone",
         f"{SCOUT33} is gone from cart",
     ]
+
+
+def test_a_bar_names_first_who_holds_what_would_do(tmp_path: Path) -> None:
+    """By the names of their lanes: which choices there are, and what their users run, is told at length elsewhere."""
+    path = tmp_path / "run.rrd"
+    net, crew = Sender("cart", "net"), Sender("dray", "request-7e3c")
+    by = [
+        ReasonParty("a1", "hide", str(net), priority=1, who=Who("root", "cart", "component place_sensor_net")),
+        ReasonParty("a2", "survey", str(crew), priority=1, who=Who("alice", "", "survey.py")),
+        ReasonParty("a2", "survey", str(crew), priority=1, who=Who("alice", "", "survey.py")),
+    ]
+    choices = ["framegrabber/fg1", "framegrabber/fg2"]
+    why = ReasonInfo("held", [*choices, SCOUT33], by, count=4, patterns=["framegrabber/*"] * 2 + [""])
+    queue = [
+        WaitView("a3", "watch", str(net), 1, PLACE, {}, Decimal(5), 0.0, "waits for one of many words", why=why),
+        WaitView("a4", "film", str(net), 1, PLACE, {}, Decimal(5), 0.0, "votes are out", why=ReasonInfo("voting")),
+    ]
+
+    async def play() -> None:
+        network, stop = MemoryNetwork(), asyncio.Event()
+        rcm = Leader(network, lambda: RcmState(TERM, 0, "anvil", queue=queue))
+        with Timeline("lab", path=path) as timeline:
+            recorder = Recorder(network.open("lab", Sender("basil", "recorder")), default_fleet(), timeline)
+            recording = asyncio.create_task(recorder.run(stop))
+            await rcm_sees(rcm, Role.RECORDER)
+            stop.set()
+            await recording
+
+    run(play())
+    blocked = f"for hide (root@cart), survey (alice@dray): {SCOUT33}; one of framegrabber/fg1, fg2 and 1 more"
+    assert {entity: [text for _, (text,) in lane] for entity, lane in lanes(path, "/arc/**").items()} == {
+        "/arc/watch": [f"waiting · {blocked}"],
+        "/arc/film": ["waiting · votes are out"],
+    }
+    assert events(path) == ["anvil leads", f"watch waits {blocked}", "film waits: votes are out"]
 
 
 def test_at_its_end_it_reads_what_was_published_and_missed(tmp_path: Path) -> None:
@@ -122,7 +163,7 @@ def test_at_its_end_it_reads_what_was_published_and_missed(tmp_path: Path) -> No
         network, stop = MemoryNetwork(), asyncio.Event()
         view = HoldView("a1", "hide", "cart/net", 1, GRANT, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, 5.0)
         holds: list[HoldView] = []
-        rcm = leader(network, lambda: RcmState(TERM, len(holds), "anvil", holds))
+        rcm = Leader(network, lambda: RcmState(TERM, len(holds), "anvil", holds))
         with Timeline("lab", path=path) as timeline:
             recorder = Recorder(network.open("lab", Sender("basil", "recorder")), default_fleet(), timeline)
             recording = asyncio.create_task(recorder.run(stop))
@@ -140,13 +181,13 @@ def test_a_part_that_raises_is_logged_and_ends_it(
 ) -> None:
     async def play() -> None:
         network = MemoryNetwork()
-        rcm, here = leader(network), network.open("lab", Sender("basil", "recorder"))
+        rcm, here = Leader(network), network.open("lab", Sender("basil", "recorder"))
         with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
             recorder = Recorder(here, default_fleet(), timeline)
             recording = asyncio.create_task(recorder.run(asyncio.Event()))
             await asyncio.sleep(1)
             monkeypatch.setattr(timeline, "holders", lambda *_: 1 / 0)
-            rcm.put(rcm.keys.grants, grants(1))
+            rcm.mesh.put(rcm.mesh.keys.grants, grants(1))
             async with asyncio.timeout(60):
                 await recording
 

@@ -13,6 +13,7 @@ from itertools import combinations
 from pathlib import Path
 
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 
 from tests.services.recorder.paper_run import (
@@ -29,8 +30,9 @@ from tests.services.recorder.paper_run import (
 )
 from zscout.services.recorder import drawing, hosts
 from zscout.services.recorder import timeline as module
+from zscout.services.recorder.blueprint import TIME, WALL_TIME
 from zscout.services.recorder.colours import LINES, OPERATOR, PALETTE, STATES
-from zscout.services.recorder.drawing import HolderRow
+from zscout.services.recorder.drawing import CURVE_TICK, Drawing, HolderRow
 from zscout.services.recorder.timeline import OPERATOR_MARK, Timeline, TimelineError
 
 
@@ -81,6 +83,45 @@ def test_an_arc_has_one_colour_and_the_operator_has_its_own(tmp_path: Path) -> N
         for text, colour in lane.items():
             assert colour == STATES[text.split(" · ")[0]]
             assert (colour == OPERATOR) == text.startswith("preempted")
+
+
+def test_only_what_an_operator_did_is_red_among_the_events(tmp_path: Path) -> None:
+    """The viewer gives a line without a colour that of the line before."""
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        timeline.event(0, "one")
+        timeline.warn(1, "two", operator=True)
+        timeline.event(2, "three")
+        timeline.warn(3, "four")
+    shown = [colour for _, _, (colour,) in rows(path, "/events", "TextLog:color")]
+    assert [colour == OPERATOR for colour in shown] == [False, True, False, False]
+
+
+@pytest.mark.parametrize("epoch", [None, 1.8e9])
+def test_points_of_curves_come_in_few_pieces_and_none_is_lost(tmp_path: Path, epoch: float | None) -> None:
+    path, each = tmp_path / "run.rrd", rr.ChunkBatcherConfig.ALWAYS_TEST_ONLY()
+    stream = rr.RecordingStream("zscout", batcher_config=each)
+    stream.save(path)
+    drawing = Drawing(stream)
+    drawing.epoch = epoch
+    told = [(float(second), second / 2) for second in range(23)]
+    for at, value in told:
+        drawing.point(at, "/load/anvil", value)
+    assert (drawing.begin, drawing.end) == (0, 22)
+    # What a host told last is not held back for ever.
+    drawing.pass_points(22 + CURVE_TICK)
+    drawing.point(99, "/load/anvil", 1.0)
+    drawing.flush(10)
+    stream.disconnect()
+    pieces, shown = [], []
+    for chunk in RrdReader(path).stream().filter(content="/load/**"):
+        batch = chunk.to_record_batch()
+        pieces.append(batch.num_rows)
+        times = batch.column(TIME if epoch is None else WALL_TIME).cast("int64").to_pylist()
+        values = [value for (value,) in batch.column("Scalars:scalars").to_pylist()]
+        shown += [(at / 1e9 - (epoch or 0), value) for at, value in zip(times, values, strict=True)]
+    assert sorted(pieces) == [1, 5, 6, 6, 6]
+    assert sorted(shown) == [*told, (99, 1.0)]
 
 
 def lab_of(rgba: int) -> tuple[float, float, float]:

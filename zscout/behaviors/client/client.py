@@ -41,7 +41,7 @@ UNREACHED = 10.0
 CONFIRM_TIMEOUT = 1.0
 """Seconds within which all RCs of a grant must have confirmed it."""
 SETTLING: Final = "settling"
-"""What an RC answers while the program of its last holder may still touch its device."""
+"""What an RC answers while the program of its last holder may still touch its device, or that is made ready."""
 LAST_WORD: Final = 0.5
 """Seconds at most for which a client that closes tells RCs that its programs are gone."""
 LOOK_AGAIN: Final = 0.1
@@ -348,8 +348,7 @@ class Client(MovableClient):
                 if refused.code == SETTLING:
                     # Neither a refusal nor silence.
                     if arc.settling != grant:
-                        most = "" if refused.left is None else f", for {refused.left:.1f} s at most"
-                        arc.settling, arc.reason = grant, f"a former holder's program may still touch {rc}{most}"
+                        arc.settling, arc.reason = grant, refused.message
                         self._store.notify(arc)
                     if not arc.keep and self.mesh.now() >= arc.end:
                         return refused

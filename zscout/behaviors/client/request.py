@@ -35,7 +35,7 @@ class CommandRefused(Exception):
 
     def __init__(self, rc: str, problem: Problem) -> None:
         super().__init__(f"{rc}: {problem.message}")
-        self.rc, self.code = rc, problem.code
+        self.rc, self.code, self.message = rc, problem.code, problem.message
         self.left = problem.left
         """With `settling`: the seconds for which the RC may go on to settle."""
 

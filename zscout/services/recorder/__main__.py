@@ -34,6 +34,8 @@ from zscout.services.recorder.process import (
 )
 
 try:
+    import rerun  # noqa: F401 - the first that is named where it is missing: it brings NumPy along
+
     from zscout.services.recorder.finish import Job
     from zscout.services.recorder.recorder import Recorder, RecorderFailed
     from zscout.services.recorder.timeline import Timeline

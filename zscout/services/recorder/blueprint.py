@@ -30,6 +30,10 @@ LIVE_ROWS: Final = 6
 LIVE_HOST_ROWS: Final = 10
 """Components that a live view has room for."""
 LIVE_BEHAVIOR_ROWS: Final = 9
+LOAD_SHARE: Final = 7
+"""Height of the loads in rows, at least: curves, axis and legend."""
+LOAD_PART: Final = 0.3
+"""And of the height of the panes above."""
 BESIDE: Final = 4
 """Cameras side by side; more of them have pages of as many."""
 
@@ -99,7 +103,8 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
     )
     if robots.any and host_rows:
         load = rrb.Tabs(load, lanes.pop("/host")[1])
-    shares = [*(share for share, _ in lanes.values()), 5 if robots.any else 7]
+    shares = [share for share, _ in lanes.values()]
+    shares.append(max(LOAD_SHARE, round(LOAD_PART * sum(shares))))
     panes = rrb.Vertical(*(view for _, view in lanes.values()), load, row_shares=shares)
     time = WALL_TIME if layout.wall else TIME
     beside = _beside(axis, host_rows > 0, robots, time)

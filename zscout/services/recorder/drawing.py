@@ -16,10 +16,12 @@ import numpy as np
 import rerun as rr
 
 from zscout.services.recorder.blueprint import TIME, WALL_TIME
-from zscout.services.recorder.colours import OPERATOR, OTHER
+from zscout.services.recorder.colours import OPERATOR, OTHER, PALE
 
 MAX_SECONDS: Final = 9e9
 """Rerun counts nanoseconds in 64 bits."""
+CURVE_TICK: Final = 5.0
+"""Seconds for which the points of curves gather: a viewer takes its time for each piece that it gets, however small."""
 MAX_SLOTS: Final = 8
 """Rows of one lane that shows several things; more of them are summed up in the last row."""
 MAX_STATE: Final = 120
@@ -48,19 +50,50 @@ class Drawing:
         self._shown: dict[str, tuple[Callable[..., rr.AsComponents], dict[str, Any]]] = {}
         """Shape and fields of what was shown last, by entity."""
         self._noted: set[str] = set()
+        self._points: dict[str, list[tuple[float, float]]] = {}
+        """Times and values that gather, by entity."""
+        self._gathered = math.inf
+        """When the oldest of them was told."""
 
     def log(self, at: float | None, entity: str, *what: rr.AsComponents) -> None:
         """Logs at a time, or for all times if that is None."""
         if self.closed:
             return
         if at is not None:
-            if not abs(at) < MAX_SECONDS:
-                raise ValueError(f"timeline: {at} is no time in seconds; give a number below {MAX_SECONDS:g}")
-            self.begin, self.end = min(self.begin, at), max(self.end, at)
+            self._reaches(at)
         else:
             self._static[entity] = what
         for stream in self.streams:
             self._write(stream, at, entity, *what)
+
+    def _reaches(self, at: float) -> None:
+        if not abs(at) < MAX_SECONDS:
+            raise ValueError(f"timeline: {at} is no time in seconds; give a number below {MAX_SECONDS:g}")
+        self.begin, self.end = min(self.begin, at), max(self.end, at)
+
+    def point(self, at: float, entity: str, value: float) -> None:
+        """One point of a curve; it may be written seconds later."""
+        if self.closed:
+            return
+        self._reaches(at)
+        self._points.setdefault(entity, []).append((at, value))
+        self._gathered = min(self._gathered, at)
+        self.pass_points(at)
+
+    def pass_points(self, at: float = math.inf) -> None:
+        """Writes the points that have gathered for long enough at this time."""
+        if at - self._gathered < CURVE_TICK:
+            return
+        for entity, points in self._points.items():
+            times = [at if self.epoch is None else self.epoch + at for at, _ in points]
+            index = (
+                rr.TimeColumn(TIME, duration=times) if self.epoch is None else rr.TimeColumn(WALL_TIME, timestamp=times)
+            )
+            columns = rr.Scalars.columns(scalars=[value for _, value in points])
+            for stream in self.streams:
+                stream.send_columns(entity, indexes=[index], columns=columns)
+        self._points.clear()
+        self._gathered = math.inf
 
     def restate(self, stream: rr.RecordingStream, at: float) -> None:
         """Writes to a stream that begins at `at` what was logged for all times, and what is shown now."""
@@ -97,7 +130,8 @@ class Drawing:
 
     def event(self, at: float, text: str, level: str = "INFO", *, operator: bool = False) -> None:
         """One line in words; `level` is one of Rerun's, `operator` whether an operator did it."""
-        colour = OPERATOR if operator else None
+        # Never none: the viewer would give the line the colour of the one before.
+        colour = OPERATOR if operator else PALE
         self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=level, color=colour))
 
     def warn(self, at: float, text: str, *, operator: bool = False) -> None:
@@ -126,6 +160,7 @@ class Drawing:
 
     def flush(self, seconds: float) -> None:
         """Returns when all is written. Raises RuntimeError and ValueError where it can't be."""
+        self.pass_points()
         for stream in self.streams:
             stream.flush(timeout_sec=seconds)
 

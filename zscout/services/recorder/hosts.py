@@ -111,7 +111,7 @@ class HostTracker:
         known.reported = at
         for entity, value in zip(entities, (load1, cpu), strict=True):
             if value is not None and math.isfinite(value):
-                self._drawing.log(at, entity, rr.Scalars(value))
+                self._drawing.point(at, entity, value)
         if math.isfinite(load1):
             known.load, self._peak = load1, max(self._peak, load1)
 
@@ -148,7 +148,7 @@ class HostTracker:
             weight = self._curves.get(key, now)
             self._curves[key] = weight + SMOOTHING * (now - weight)
             for entity, value in zip(_entities(key), (use.cpu, use.memory / 1e6), strict=True):
-                self._drawing.log(at, entity, rr.Scalars(value))
+                self._drawing.point(at, entity, value)
 
     def _make_room(self, at: float, key: tuple[str, str], weight: float) -> bool:
         """Whether a component may have curves from now on."""

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, Revocation, WaitView, absurd
-from zscout.scheduling.reason import ended, named, waits
+from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, Revocation, WaitView, Who, absurd
+from zscout.scheduling.reason import ReasonCode, ended, short_names, waits
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
-from zscout.types import NO_TERM, Grant, Term
+from zscout.types import NO_TERM, Grant, Term, clean
 
 MAX_OPEN: Final = 20_000
 """Requests followed at one time."""
@@ -26,7 +26,9 @@ class _Request:
     label: str
     """The ARC's name; of several that are open at one time, a numbered one."""
     who: str = ""
-    """Whose it is, where that was told."""
+    """Whose it is, where that was told: `alice@ws1`."""
+    command: str = ""
+    """What its user runs, likewise."""
     state: str = ""
     detail: str = ""
     grant: Grant | None = None
@@ -36,7 +38,7 @@ class _Request:
     def tell(self, told: Holder | HoldView | WaitView | Notice) -> None:
         """Takes whose it is from what the RCM says of it."""
         if told.who is not None and told.who.user:
-            self.who = named(told.who, told.client, told.arc)
+            self.who, self.command = _user(told.who, told.client), told.who.command
 
     @property
     def subject(self) -> str:
@@ -109,7 +111,7 @@ class RequestTracker:
             if request.grant is not None or not request.state:
                 request.grant = None
                 if wait.preemptions:
-                    self._set(at, request, "preempted", _blocked(wait.reason))
+                    self._set(at, request, "preempted", self._blocked(wait.reason, wait.why))
             if request.state != "preempted":
                 self._waits(at, request, wait.reason, wait.why)
         for key in [key for key in self._requests if key not in open_now]:
@@ -184,7 +186,8 @@ class RequestTracker:
         request.grant = hold.grant
         request.tell(hold)
         operator = hold.priority >= self.operator_priority
-        details = [f"priority {hold.priority}", f"min {float(hold.min_runtime):g} s", *filter(None, [request.who])]
+        who = f"{request.who} ({request.command})" if request.who and request.command else request.who
+        details = [f"priority {hold.priority}", f"min {float(hold.min_runtime):g} s", *filter(None, [who])]
         self._set(at, request, "running", " · ".join(details), operator)
         runs = f"{request.subject} runs on {', '.join(sorted(_rcs_of(hold)))}"
         self.timeline.event(at, runs, operator=operator)
@@ -192,10 +195,11 @@ class RequestTracker:
     def _waits(self, at: float, request: _Request, reason: str, why: ReasonInfo | None) -> None:
         if why is not None and why.by:
             self.timeline.contended(at, why.rcs)
-        detail = _blocked(reason)
+        detail = self._blocked(reason, why)
         if (request.state, request.detail) != ("waiting", detail):
             self._set(at, request, "waiting", detail)
-            self.timeline.event(at, f"{request.subject} {waits(reason)}")
+            words = f"waits {detail}" if detail.startswith("for ") else waits(reason)
+            self.timeline.event(at, f"{request.subject} {words}")
 
     def _ended(self, at: float, key: Key, outcome: str, reason: str) -> None:
         request = self._requests.pop(key, None)
@@ -222,6 +226,23 @@ class RequestTracker:
         request.state, request.detail = state, detail
         self.timeline.arc(at, request.label, state, detail, operator=operator)
 
+    def _blocked(self, reason: str, why: ReasonInfo | None) -> str:
+        """Who is in its way, by the names of their lanes: in a short bar only the beginning can be read."""
+        if why is None or why.code != ReasonCode.HELD or not why.by:
+            return reason.removeprefix("waits ")
+        others = dict.fromkeys(
+            self._label(party.client, party.id, party.arc)
+            + (f" ({_user(party.who, party.client)})" if party.who is not None and party.who.user else "")
+            for party in why.by
+        )
+        patterns = why.patterns or [""] * len(why.rcs)
+        wanted = [", ".join(short_names(rc for rc, pattern in zip(why.rcs, patterns, strict=False) if not pattern))]
+        for one in dict.fromkeys(filter(None, patterns)):
+            choices = [rc for rc, pattern in zip(why.rcs, patterns, strict=False) if pattern == one]
+            wanted.append(f"one of {', '.join(short_names(choices))}" if len(choices) > 1 else choices[0])
+        more = f" and {why.count - len(why.rcs)} more" if why.count > len(why.rcs) else ""
+        return f"for {', '.join(others)}: {'; '.join(filter(None, wanted))}{more}"
+
     def _label(self, client: str, number: str, arc: str) -> str:
         request = self._requests.get((client, number))
         return request.label if request is not None else arc
@@ -241,9 +262,8 @@ class RequestTracker:
         self.timeline.holders(at, rc, list(self._rcs[rc].values()), self._absent.get(rc, ""))
 
 
-def _blocked(reason: str) -> str:
-    """Who is in its way: in a short bar only the beginning can be read."""
-    return reason.removeprefix("waits ")
+def _user(who: Who, client: str) -> str:
+    return clean(f"{who.user}@{who.host or client.partition('/')[0]}")
 
 
 def _rcs_of(hold: Holder | HoldView) -> Iterable[str]:

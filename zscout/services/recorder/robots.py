@@ -343,7 +343,7 @@ class RobotTracker:
                 colour = LINES[len(self._figures) % len(LINES)]
                 self._drawing.curve(entity, f"{rc} {figure}", colour, 1.5, interpolation_mode=step)
             self._figures[key] = at, value
-            self._drawing.log(at, entity, rr.Scalars(value))
+            self._drawing.point(at, entity, value)
         self._drawing.arrange()
 
 

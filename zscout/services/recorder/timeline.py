@@ -39,6 +39,8 @@ REGROUP: Final = 5.0
 FILE_TICK: Final = 1.0
 """Seconds for which a file gathers what it writes: a file that is written to its end is made of few, large chunks
 only then, and one whose recorder was killed stays as it is."""
+LIVE_TICK: Final = 0.4
+"""The same for viewers that look on: for as long as nobody minds."""
 FLUSH_SECONDS: Final = 5.0
 DISCONNECT_SECONDS: Final = 8.0
 
@@ -84,7 +86,7 @@ class Timeline(Drawing):
             host = f"[{bind}]" if ":" in bind else bind
             self.url = f"rerun+http://{host}:{port}/proxy"
             server = rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=SERVER_MEMORY)
-            self._live = self._open(server, self.url)
+            self._live = self._open(server, self.url, LIVE_TICK)
         if path is not None:
             try:
                 self._file = self._open_file(path)
@@ -105,12 +107,12 @@ class Timeline(Drawing):
         self._path = path
         return stream
 
-    def _open(self, sink: rr.GrpcServerSink | rr.FileSink, where: str, tick: float | None = None) -> rr.RecordingStream:
+    def _open(self, sink: rr.GrpcServerSink | rr.FileSink, where: str, tick: float) -> rr.RecordingStream:
         start = datetime.now(UTC)
         stream = rr.RecordingStream(
             APPLICATION,
             recording_id=f"{self._fleet}-{start.strftime('%Y%m%dT%H%M%S.%fZ')}",
-            batcher_config=rr.ChunkBatcherConfig(flush_tick=tick) if tick is not None else None,
+            batcher_config=rr.ChunkBatcherConfig(flush_tick=tick),
         )
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
@@ -141,6 +143,7 @@ class Timeline(Drawing):
         before, old, layout = self._file, self._path, self.layout(live=False)
         if before is None or old is None or self.closed:
             return None
+        self.pass_points()
         self._file = self._open_file(path)
         self.restate(self._file, at)
         self._file.send_blueprint(blueprint(self.layout(live=True)))
@@ -170,6 +173,7 @@ class Timeline(Drawing):
 
     def regroup(self, at: float) -> None:
         """What time alone brings: call it now and then."""
+        self.pass_points(at)
         if at - self._grouped >= REGROUP:
             self._grouped = at
             self._groups = self._grouped_rcs(at - CONTENDED)

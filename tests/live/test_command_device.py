@@ -1,0 +1,47 @@
+"""A device that is switched by commands, on a real mesh: who holds it enters when it has been started."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from tests.cli import tools
+from tests.live.lab import Lab
+
+pytestmark = pytest.mark.live
+
+TABLE = """
+[[rc]]
+name = "psu/bench"
+driver = "command"
+start = ["sh", "-c", 'sleep 3; echo "$ZSCOUT_PARAMETERS" >> "%(told)s"']
+stop = ["sh", "-c", 'echo stop >> "%(told)s"']
+parameters = { voltage = 30.0 }
+timeout = 100
+"""
+
+
+def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path) -> None:
+    told = tmp_path / "told"
+
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("small", extra=TABLE % {"told": told})
+            await lab.ready(await lab.client("crew"), "psu/bench")
+            program = ("--", "sh", "-c", f"echo enter >> {told}")
+            held = await tools.zscout_soon("request", "psu/bench:voltage=12", *program, env=lab.env)
+            assert held.returncode == 0, held.stderr
+            assert told.read_text().splitlines()[:2] == ['{"voltage": 12.0}', "enter"]
+            assert "and waits: psu/bench is being started, for " in held.stderr
+            for asked, why in (
+                ("psu/bench:voltage=31", "can never start: voltage 31 of 30 at psu/bench"),
+                ("psu/bench:current=1", "psu/bench knows no parameter current; it knows voltage"),
+            ):
+                refused = await tools.zscout_soon("request", asked, *program, env=lab.env)
+                assert refused.returncode == 2
+                assert why in refused.stderr
+            assert told.read_text().split().count("enter") == 1
+
+    asyncio.run(story())
