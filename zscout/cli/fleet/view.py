@@ -46,6 +46,9 @@ GRACE: Final = 40.0
 """Seconds for a child to end by itself: the recorder finishes its file."""
 LOOK_FOR_RECORDER: Final = 1.0
 """Seconds in which a recorder tells where it records."""
+LOOKS_FOR_RECORDER: Final = 5
+LOOK_AGAIN: Final = 0.2
+"""Seconds between two of these."""
 CONNECT: Final = 1.0
 MAX_LINE: Final = 65_536
 KEPT: Final = 20
@@ -178,10 +181,15 @@ async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str
         except common.NobodyThere as error:
             alone = str(error)
         mesh = client.mesh
-        replies = await mesh.ask(mesh.keys.recorded_any, RecordedAsk(), Recorded, timeout=LOOK_FOR_RECORDER)
-    for reply in replies:
-        if reply.message is not None and (recording := await _reached(reply.message, bind)) is not None:
-            return recording, ""
+        for _ in range(LOOKS_FOR_RECORDER):
+            replies = await mesh.ask(mesh.keys.recorded_any, RecordedAsk(), Recorded, timeout=LOOK_FOR_RECORDER)
+            for reply in replies:
+                if reply.message is not None and (recording := await _reached(reply.message, bind)) is not None:
+                    return recording, ""
+            if alone:
+                break
+            # Links come one after the other: that to a recorder of this host may be the last.
+            await asyncio.sleep(LOOK_AGAIN)
     return None, alone
 
 
