@@ -1,4 +1,4 @@
-"""`make model`: what TLC says of `ownership.tla`. Each guard of the protocol is taken out in turn as well, and must
+"""`make model`: what TLC says of `ownership.tla` and `settling.tla`. Each guard of the protocol is taken out in turn as well, and must
 break something.
 
 `python -m formal traces FILE...` and `--simulated COUNT`: whether what a fleet did is a behaviour of the model."""
@@ -8,9 +8,12 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from formal.tlc import GUARDS, Instance, NoTlc, check, jar
+from formal.tlc import GUARDS, SETTLING, Instance, NoTlc, Outcome, check, check_settling, jar
 from formal.traces import Behaviour, accept
 from zscout import terminal
 from zscout.lab.faults.simulation import simulate
@@ -26,6 +29,28 @@ WITHOUT = tuple(
     for guard in GUARDS
 )
 
+HOLDS = 4
+"""Of one RC, in `settling.tla`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One question to TLC, and whether something is to break."""
+
+    name: str
+    bounds: str
+    ask: Callable[[], Outcome]
+    breaks: bool
+
+
+def checks() -> Iterator[Check]:
+    for instance in (*WITHOUT, *INSTANCES):
+        bounds = f"{instance.terms} terms of {instance.joins} steps"
+        yield Check(instance.name, bounds, partial(check, instance), instance in WITHOUT)
+    for without in (*SETTLING, ""):
+        name = f"settling without {without}" if without else "settling"
+        yield Check(name, f"{HOLDS} holds", partial(check_settling, without, holds=HOLDS), bool(without))
+
 
 def main(words: list[str]) -> int:
     try:
@@ -38,19 +63,18 @@ def main(words: list[str]) -> int:
 
 def model(names: list[str]) -> int:
     rows, failed = [], False
-    for instance in (*WITHOUT, *INSTANCES):
-        if names and instance.name not in names:
+    for one in checks():
+        if names and one.name not in names:
             continue
-        terminal.print_line(f"{instance.name} ...")
-        outcome = check(instance)
-        expected = instance in WITHOUT
-        failed |= (outcome.violated is not None) != expected
+        terminal.print_line(f"{one.name} ...")
+        outcome = one.ask()
+        unexpected = (outcome.violated is not None) != one.breaks
+        failed |= unexpected
         said = f"breaks {outcome.violated}" if outcome.violated else "holds"
-        bounds = f"{instance.terms} terms of {instance.joins} steps"
-        rows.append([instance.name, bounds, f"{outcome.states:,}", f"{outcome.took:.0f} s", said])
-        if (outcome.violated is not None) != expected:
+        rows.append([one.name, one.bounds, f"{outcome.states:,}", f"{outcome.took:.0f} s", said])
+        if unexpected:
             terminal.print_line(outcome.text)
-    terminal.print_table(["instance", "bounds", "states", "took", "outcome"], rows)
+    terminal.print_table(["model", "bounds", "states", "took", "outcome"], rows)
     return 1 if failed else 0
 
 

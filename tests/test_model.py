@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from formal.__main__ import WITHOUT
-from formal.tlc import Instance, NoTlc, check, jar
+from formal.tlc import SETTLING, Instance, NoTlc, check, check_settling, jar
 from formal.traces import Behaviour, accept
 from zscout.lab.faults.simulation import simulate
 
@@ -27,6 +27,13 @@ def test_two_reigns_keep_what_is_promised() -> None:
 @pytest.mark.parametrize("instance", WITHOUT, ids=lambda instance: instance.name)
 def test_without_a_guard_some_promise_breaks(instance: Instance) -> None:
     assert check(instance).violated is not None
+
+
+@pytest.mark.parametrize("without", ["", *SETTLING])
+def test_no_two_programs_are_at_an_rc_that_settles_unless_a_guard_is_taken_out(without: str) -> None:
+    outcome = check_settling(without, holds=2)
+    assert outcome.violated == ("Alone" if without else None)
+    assert outcome.states > 1_000
 
 
 @pytest.fixture(scope="module")

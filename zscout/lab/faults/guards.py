@@ -29,6 +29,7 @@ from zscout.services.rcm.election import Election
 from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.registry import RequestRegistry
+from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 ABSENT: Final = object()
@@ -195,6 +196,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
         "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),
+        "believed": Guard(
+            "who believes in a hold is not told to wait before its RCs could say so",
+            {(RequestHandler, "_may_be_held"): _no},
+        ),
         "settling": Guard("an RC settles before the next holder begins", {(HoldTable, "settles"): _nothing}),
         "confirmed": Guard("an RC settles from the last confirmation on", {(HoldTable, "confirmed"): _confirmed_once}),
         "deadline": Guard("a program is gone by its deadline", {(DirectHold, "gone_by"): _no_deadline}),
