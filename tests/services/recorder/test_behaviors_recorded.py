@@ -7,12 +7,14 @@ import random
 from pathlib import Path
 
 import pytest
+from rerun.blueprint.api import Container, View
 
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.robot_run import NET, say
 from zscout.keyexpr import Sender
 from zscout.messages import BehaviorSaid, RcState
 from zscout.services.recorder import robots
+from zscout.services.recorder.blueprint import LEGEND, Layout, RobotLayout, blueprint
 from zscout.services.recorder.colours import DOING, OTHER
 from zscout.services.recorder.robots import MAX_WAITING, RATE, RateLimiter
 from zscout.services.recorder.timeline import Timeline
@@ -123,6 +125,19 @@ def test_alerts_in_words(tmp_path: Path) -> None:
     assert colours(path, "/behavior/net/b")["/behavior/net/b"]["alert · blind · snow"] == DOING["alert"]
 
 
+def origins(part: Container | View) -> set[str]:
+    """The entities that the panes of a layout look at."""
+    if isinstance(part, View):
+        return {str(part.origin)}
+    return {origin for one in part.contents for origin in origins(one)}
+
+
+def test_without_figures_there_is_no_pane_for_devices() -> None:
+    assert "/device" not in origins(blueprint(Layout()).root_container)
+    few, many = (blueprint(Layout(robots=RobotLayout(devices=number))) for number in (1, LEGEND + 1))
+    assert "/device" in origins(few.root_container) & origins(many.root_container)
+
+
 def test_devices_figures_and_health(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robots, "MAX_SERIES", 3)
     monkeypatch.setattr(robots, "MAX_FOLLOWED", 2)
@@ -145,6 +160,7 @@ def test_devices_figures_and_health(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         for tick in (36.25, 36.5, 36.75):
             tracker.tick(tick)
         assert not timeline.robots.shown.any
+        assert "/device" in origins(blueprint(timeline.layout(live=False)).root_container)
     told_of_a = sorted((at, value) for _, at, value in rows(path, "/device/robot/a/rate", "Scalars:scalars"))
     assert {entity for entity, _, _ in rows(path, "/device/**", "Scalars:scalars")} == {
         "/device/robot/a/rate",
