@@ -173,8 +173,8 @@ def serial_line() -> Iterator[str]:
 def check_whole(programs: Path, folder: Path) -> None:
     fleet = Fleet(programs, folder)
     expect("zscout" in fleet.zscout("--version").stdout, "zscout --version says nothing")
-    # The script's first line names its interpreter.
-    python = (programs / "zscout").read_text().splitlines()[0].removeprefix("#!")
+    # The environment that the program is of, where that is a link.
+    python = (programs / "zscout").resolve().parent / "python"
     run(python, "-c", f"import {', '.join(LEFT_OUT)}", cwd=folder)
     with fleet.node('[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'):
         fleet.request("robot/a", "--", "true")
@@ -253,7 +253,7 @@ def main() -> int:
                 if way == "light":
                     expect(size < LIGHT_MB, f"it takes {size:.0f} MB, more than {LIGHT_MB}")
                 (check_light if way == "light" else check_whole)(programs, folder / f"{way}-fleet")
-            except (CheckFailed, subprocess.TimeoutExpired) as error:
+            except (CheckFailed, OSError, subprocess.TimeoutExpired) as error:
                 failed += 1
                 print(f"{way} FAILED: {error}", flush=True)
     _print_table([("installed", "seconds", "MB"), *rows])
