@@ -117,7 +117,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
 
 def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View]]:
     """Share of the height and view, by any name. Within a view lanes are sorted by their names: what is to stand above
-    them has a view of its own."""
+    them has a view of its own, and room to be seen whole."""
     apart = {**layout.contended, **layout.absent}
     rest = layout.rc_rows - sum(apart.values())
     panes: dict[str, tuple[int, rrb.View]] = {}
@@ -127,13 +127,13 @@ def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[
         panes[name] = _share(rows, least), view
 
     if layout.contended:
-        add("Resources that several want, and who holds them", sum(layout.contended.values()), 1, *layout.contended)
+        add("Resources that several want, and who holds them", 2 * sum(layout.contended.values()), 2, *layout.contended)
     if apart and rest > 0:
-        add("Who holds each other resource", rest, 1, "$origin/**", *(f"- {entity}" for entity in apart))
+        add("Who holds each other resource", rest, 2, "$origin/**", *(f"- {entity}" for entity in apart))
     elif not apart and (layout.rc_rows or not layout.host_rows):
         add("Who holds each resource", rest, 3)
     if layout.absent:
-        add("Resources that are not there", sum(layout.absent.values()), 1, *layout.absent)
+        add("Resources that are not there", sum(layout.absent.values()), 2, *layout.absent)
     return panes
 
 
