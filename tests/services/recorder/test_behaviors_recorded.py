@@ -5,8 +5,12 @@ from __future__ import annotations
 import math
 import random
 from pathlib import Path
+from typing import Any
 
 import pytest
+import rerun as rr
+import rerun.blueprint as rrb
+from msgspec.structs import replace
 from rerun.blueprint.api import Container, View
 
 from tests.services.recorder.paper_run import colours, events, lanes, rows
@@ -136,6 +140,31 @@ def test_without_figures_there_is_no_pane_for_devices() -> None:
     assert "/device" not in origins(blueprint(Layout()).root_container)
     few, many = (blueprint(Layout(robots=RobotLayout(devices=number))) for number in (1, LEGEND + 1))
     assert "/device" in origins(few.root_container) & origins(many.root_container)
+
+
+class Watched(rr.RecordingStream):
+    """Keeps which panes it was sent."""
+
+    def __init__(self) -> None:
+        super().__init__("test")
+        self.panes: list[set[str]] = []
+
+    def send_blueprint(self, blueprint: rrb.BlueprintLike, **_: Any) -> None:
+        assert isinstance(blueprint, rrb.Blueprint)
+        self.panes.append(origins(blueprint.root_container))
+
+
+def test_the_first_figure_of_a_device_lays_a_live_view_out_anew() -> None:
+    with Timeline("lab", path=None) as timeline:
+        stream = Watched()
+        timeline.streams.append(stream)
+        state = RcState("lamp/desk", "cart", "i", sharable=False)
+        timeline.robots.state(0, state)
+        assert stream.panes == []
+        timeline.robots.state(1, replace(state, figures={"level": 50.0}))
+        timeline.robots.state(2, replace(state, figures={"level": 60.0}))
+        (panes,) = stream.panes
+        assert "/device" in panes
 
 
 def test_devices_figures_and_health(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
