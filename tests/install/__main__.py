@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from tests.docs.test_tutorial_device import files
 from tests.hang import HANG
 from zscout.keyexpr import new_instance
 
@@ -81,9 +82,11 @@ def by_pipx(tools: Path, wheel: Path, folder: Path) -> Path:
 
 def by_uv(tools: Path, wheel: Path, folder: Path) -> Path:
     homes = {"UV_TOOL_DIR": str(folder), "UV_TOOL_BIN_DIR": str(folder / "bin"), "UV_LINK_MODE": "copy"}
-    index = run(sys.executable, "-m", "pip", "config", "get", "global.index-url", cwd=folder.parent, check=False)
-    if index.returncode == 0 and "UV_DEFAULT_INDEX" not in CLEAN:  # uv does not read what pip is told
-        homes["UV_DEFAULT_INDEX"] = index.stdout.strip()
+    # uv does not read what pip is told, by whichever of its files or by the environment, which comes first.
+    for line in run(sys.executable, "-m", "pip", "config", "list", cwd=folder.parent).stdout.splitlines():
+        name, _, value = line.partition("=")
+        if name.endswith(".index-url") and "UV_DEFAULT_INDEX" not in CLEAN:
+            homes.setdefault("UV_DEFAULT_INDEX", value.strip("'"))
     folder.mkdir()
     command = (tools / "uv", "tool", "install", "--quiet", "--python", sys.executable, wheel)
     run(*command, cwd=folder, env=CLEAN | homes, timeout=INSTALL)
@@ -173,8 +176,8 @@ def serial_line() -> Iterator[str]:
 def check_whole(programs: Path, folder: Path) -> None:
     fleet = Fleet(programs, folder)
     expect("zscout" in fleet.zscout("--version").stdout, "zscout --version says nothing")
-    # The script's first line names its interpreter.
-    python = (programs / "zscout").read_text().splitlines()[0].removeprefix("#!")
+    # The environment that the program is of, where that is a link.
+    python = (programs / "zscout").resolve().parent / "python"
     run(python, "-c", f"import {', '.join(LEFT_OUT)}", cwd=folder)
     with fleet.node('[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'):
         fleet.request("robot/a", "--", "true")
@@ -183,6 +186,12 @@ def check_whole(programs: Path, folder: Path) -> None:
 
 def check_light(programs: Path, folder: Path) -> None:
     fleet = Fleet(programs, folder)
+    # A driver as the tutorial has it.
+    for name, text in files().items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+    run(programs / "python", "-m", "pip", "install", "--quiet", "./lamp", cwd=folder, timeout=INSTALL)
+    (folder / "brightness").touch()
     for module in LEFT_OUT:
         found = run(programs / "python", "-c", f"import {module}", cwd=folder, check=False)
         expect(found.returncode != 0, f"{module} is there")
@@ -194,9 +203,10 @@ def check_light(programs: Path, folder: Path) -> None:
             f'[[rc]]\nname = "radio/rf0"\ndriver = "radio"\nport = "{port}"\n'
             '[[rc]]\nname = "link/a"\ndriver = "capacity"\ncapacity = { rate = 10 }\n'
             '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
+            '[[rc]]\nname = "lamp/desk"\ndriver = "lamp"\npath = "brightness"\n'
         ),
     ):
-        rcs = ("psu/bench", "radio/rf0:command_rate=5", "link/a:rate=2", "robot/a")
+        rcs = ("lamp/desk:level=200", "psu/bench", "radio/rf0:command_rate=5", "link/a:rate=2", "robot/a")
         held = fleet.request(*rcs, "--", "sh", "-c", "echo I hold $ZSCOUT_RCS")
         expect("psu/bench" in held.stdout, f"the command did not run: {held.stdout}")
         client = (
@@ -253,7 +263,7 @@ def main() -> int:
                 if way == "light":
                     expect(size < LIGHT_MB, f"it takes {size:.0f} MB, more than {LIGHT_MB}")
                 (check_light if way == "light" else check_whole)(programs, folder / f"{way}-fleet")
-            except (CheckFailed, subprocess.TimeoutExpired) as error:
+            except (CheckFailed, OSError, subprocess.TimeoutExpired) as error:
                 failed += 1
                 print(f"{way} FAILED: {error}", flush=True)
     _print_table([("installed", "seconds", "MB"), *rows])

@@ -5,14 +5,20 @@ from __future__ import annotations
 import math
 import random
 from pathlib import Path
+from typing import Any
 
 import pytest
+import rerun as rr
+import rerun.blueprint as rrb
+from msgspec.structs import replace
+from rerun.blueprint.api import Container, View
 
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.robot_run import NET, say
 from zscout.keyexpr import Sender
 from zscout.messages import BehaviorSaid, RcState
 from zscout.services.recorder import robots
+from zscout.services.recorder.blueprint import LEGEND, Layout, RobotLayout, blueprint
 from zscout.services.recorder.colours import DOING, OTHER
 from zscout.services.recorder.robots import MAX_WAITING, RATE, RateLimiter
 from zscout.services.recorder.timeline import Timeline
@@ -123,6 +129,44 @@ def test_alerts_in_words(tmp_path: Path) -> None:
     assert colours(path, "/behavior/net/b")["/behavior/net/b"]["alert · blind · snow"] == DOING["alert"]
 
 
+def origins(part: Container | View) -> set[str]:
+    """The entities that the panes of a layout look at."""
+    if isinstance(part, View):
+        return {str(part.origin)}
+    return {origin for one in part.contents for origin in origins(one)}
+
+
+def test_without_figures_there_is_no_pane_for_devices() -> None:
+    assert "/device" not in origins(blueprint(Layout()).root_container)
+    few, many = (blueprint(Layout(robots=RobotLayout(devices=number))) for number in (1, LEGEND + 1))
+    assert "/device" in origins(few.root_container) & origins(many.root_container)
+
+
+class Watched(rr.RecordingStream):
+    """Keeps which panes it was sent."""
+
+    def __init__(self) -> None:
+        super().__init__("test")
+        self.panes: list[set[str]] = []
+
+    def send_blueprint(self, blueprint: rrb.BlueprintLike, **_: Any) -> None:
+        assert isinstance(blueprint, rrb.Blueprint)
+        self.panes.append(origins(blueprint.root_container))
+
+
+def test_the_first_figure_of_a_device_lays_a_live_view_out_anew() -> None:
+    with Timeline("lab", path=None) as timeline:
+        stream = Watched()
+        timeline.streams.append(stream)
+        state = RcState("lamp/desk", "cart", "i", sharable=False)
+        timeline.robots.state(0, state)
+        assert stream.panes == []
+        timeline.robots.state(1, replace(state, figures={"level": 50.0}))
+        timeline.robots.state(2, replace(state, figures={"level": 60.0}))
+        (panes,) = stream.panes
+        assert "/device" in panes
+
+
 def test_devices_figures_and_health(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robots, "MAX_SERIES", 3)
     monkeypatch.setattr(robots, "MAX_FOLLOWED", 2)
@@ -145,6 +189,7 @@ def test_devices_figures_and_health(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         for tick in (36.25, 36.5, 36.75):
             tracker.tick(tick)
         assert not timeline.robots.shown.any
+        assert "/device" in origins(blueprint(timeline.layout(live=False)).root_container)
     told_of_a = sorted((at, value) for _, at, value in rows(path, "/device/robot/a/rate", "Scalars:scalars"))
     assert {entity for entity, _, _ in rows(path, "/device/**", "Scalars:scalars")} == {
         "/device/robot/a/rate",

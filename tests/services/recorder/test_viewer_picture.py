@@ -32,7 +32,8 @@ from tests.services.recorder.paper_run import (
     second_by_second,
 )
 from zscout.services.recorder.blueprint import LIVE_WINDOW, MARGIN, TIME
-from zscout.services.recorder.colours import LINES, OPERATOR, PALETTE, STATES
+from zscout.services.recorder.colours import ABSENT, LINES, OPERATOR, PALETTE, STATES
+from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
 
 SECONDS = 18
@@ -196,6 +197,32 @@ def test_the_paper_s_example_in_the_viewer(tmp_path: Path) -> None:
     pixels = {colour: count for count, colour in counts}
     for colour in LINES[: len(HOSTS)]:
         assert pixels.get(rgb(colour), 0) > 500
+
+
+def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Path) -> None:
+    with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
+        # By their names they would stand the other way round.
+        timeline.holders(0, "robot/a", [], "ws1 is gone")
+        timeline.holders(0, "robot/b", [HolderRow("survey")])
+        timeline.holders(0, "robot/c", [HolderRow("drive", operator=True)])
+        timeline.contended(1, ["robot/c"])
+        timeline.arc(1, "film", "waiting", "for drive: robot/c")
+        timeline.event(SECONDS, "the end")
+    with viewer(tmp_path / "run.rrd", tmp_path, panes=7) as client:
+        picture = settled_picture(client, tmp_path / "picture.png")
+        assert [report for view in client.get_state().views for report in view.reports] == []
+    bars = [round(height_of(picture, colour)) for colour in (OPERATOR, PALETTE[0], ABSENT)]
+    assert bars == sorted(bars)
+
+
+def height_of(picture: Image.Image, colour: int) -> float:
+    """The middle of the bar of this colour, in pixels from the top."""
+    wanted, rows = rgb(colour, DIMMED), []
+    for y in range(picture.height):
+        line = [picture.getpixel((x, y)) for x in range(0, round(WIDTH * PANES), 10)]
+        if sum(isinstance(pixel, tuple) and near((pixel[0], pixel[1], pixel[2]), wanted) for pixel in line) > 50:
+            rows.append(y)
+    return sum(rows) / len(rows)
 
 
 def test_a_recorder_that_was_killed_leaves_a_recording_that_opens(tmp_path: Path) -> None:

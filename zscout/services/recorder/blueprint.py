@@ -34,19 +34,22 @@ LOAD_SHARE: Final = 7
 """Height of the loads in rows, at least: curves, axis and legend."""
 LOAD_PART: Final = 0.3
 """And of the height of the panes above."""
+LEGEND: Final = 6
+"""Curves that a legend leaves room for."""
 BESIDE: Final = 4
 """Cameras side by side; more of them have pages of as many."""
 
 
 class RobotLayout(NamedTuple):
-    """What there is of robots: panes are made for these."""
+    """What there is of robots and other devices: panes are made for these."""
 
     cameras: tuple[tuple[str, str], ...] = ()
     """Entity and title of each."""
     floor: tuple[int, int] | None = None
     """Width and height of the plan's picture, in pixels."""
     behavior_rows: int = 0
-    devices: bool = False
+    devices: int = 0
+    """Curves of their figures; more than LEGEND are all the same."""
 
     @property
     def any(self) -> bool:
@@ -114,7 +117,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
 
 def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View]]:
     """Share of the height and view, by any name. Within a view lanes are sorted by their names: what is to stand above
-    them has a view of its own."""
+    them has a view of its own, and room to be seen whole."""
     apart = {**layout.contended, **layout.absent}
     rest = layout.rc_rows - sum(apart.values())
     panes: dict[str, tuple[int, rrb.View]] = {}
@@ -124,13 +127,13 @@ def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[
         panes[name] = _share(rows, least), view
 
     if layout.contended:
-        add("Resources that several want, and who holds them", sum(layout.contended.values()), 1, *layout.contended)
+        add("Resources that several want, and who holds them", 2 * sum(layout.contended.values()), 2, *layout.contended)
     if apart and rest > 0:
-        add("Who holds each other resource", rest, 1, "$origin/**", *(f"- {entity}" for entity in apart))
+        add("Who holds each other resource", rest, 2, "$origin/**", *(f"- {entity}" for entity in apart))
     elif not apart and (layout.rc_rows or not layout.host_rows):
         add("Who holds each resource", rest, 3)
     if layout.absent:
-        add("Resources that are not there", sum(layout.absent.values()), 1, *layout.absent)
+        add("Resources that are not there", sum(layout.absent.values()), 2, *layout.absent)
     return panes
 
 
@@ -151,9 +154,10 @@ def page(
 def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout, time: str) -> rrb.View | rrb.Container:
     """The panes at the right, from the top: the floor, the cameras, events and curves; as tabs if there are robots."""
 
-    def curves(origin: str, name: str) -> rrb.View:
+    def curves(origin: str, name: str, number: int = LEGEND + 1) -> rrb.View:
         # A legend of many would cover the curves.
-        return rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis, plot_legend=rrb.PlotLegend(visible=False))
+        legend = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=number <= LEGEND)
+        return rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis, plot_legend=legend)
 
     columns = rrb.archetypes.TextLogColumns(timeline_columns=[time], text_log_columns=["loglevel", "body"])
     events = rrb.TextLogView(origin="/events", name="Events", columns=columns)
@@ -164,10 +168,11 @@ def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout, time
         more = ("", "") if robots.any else (" of the heaviest components", ", in the colours of the lanes")
         below.append(curves("/use/cpu", f"CPU{more[0]} (cores){more[1]}"))
         below.append(curves("/use/memory", f"Memory{more[0]} (MB)"))
-    if not robots.any:
-        return rrb.Vertical(*below, row_shares=[5, 3, 3]) if uses else below[0]
     if robots.devices:
-        below.append(curves("/device", "Devices (point at a curve)"))
+        pointed = " (point at a curve)" if robots.devices > LEGEND else ""
+        below.append(curves("/device", f"Devices{pointed}", robots.devices))
+    if not robots.any:
+        return rrb.Vertical(*below, row_shares=[5, *[3] * (len(below) - 1)]) if len(below) > 1 else below[0]
     panes: list[tuple[int, rrb.View | rrb.Container]] = []
     if robots.floor is not None:
         width, height = robots.floor

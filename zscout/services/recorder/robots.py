@@ -15,7 +15,7 @@ from zscout.drivers.airtime import Bucket
 from zscout.drivers.image_size import jpeg_size
 from zscout.keyexpr import Sender
 from zscout.messages import BehaviorSaid, Box, FrameHead, RcState
-from zscout.services.recorder.blueprint import RobotLayout
+from zscout.services.recorder.blueprint import LEGEND, RobotLayout
 from zscout.services.recorder.colours import ALERT, DOING, LINES, OPERATOR, OTHER, PALE, bright
 from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_path, clean_text, with_detail
 from zscout.services.recorder.floor_plan import MAX_NAME, FloorPlan, Look
@@ -153,7 +153,7 @@ class RobotTracker:
     @property
     def shown(self) -> RobotLayout:
         cameras = [(one.entity, clean_text(one.name, MAX_CAPTION)) for one in self._with_pane()]
-        return RobotLayout(tuple(cameras), self.floor.size, self._behaviors.rows, bool(self._figures))
+        return RobotLayout(tuple(cameras), self.floor.size, self._behaviors.rows, min(len(self._figures), LEGEND + 1))
 
     def tick(self, at: float) -> None:
         """What time alone brings: call it some times a second."""

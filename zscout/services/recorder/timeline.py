@@ -239,10 +239,10 @@ class Timeline(Drawing):
         self.close()
 
     def arrange(self) -> None:
-        """Lays the viewer out anew if there is something new to show: a fleet without robots or components
+        """Lays the viewer out anew if there is something new to show: a fleet without robots, figures or components
         has no use for empty panes."""
         robots = self.robots.shown
-        robots = robots._replace(behavior_rows=min(robots.behavior_rows, 1)) if robots.any else NO_ROBOTS
+        robots = robots._replace(behavior_rows=min(robots.behavior_rows, 1))
         now = self.hosts.placing, robots, *self._groups
         if now != self._arranged and not self.closed:
             self._arranged = now
