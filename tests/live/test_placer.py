@@ -100,8 +100,8 @@ async def _elsewhere(tmp_path: Path) -> None:
         spun = await placing.place("spun", "spin")
         assert (spun.state, spun.host) == ("running", "h2")
 
-        nowhere = await placing.place("nowhere", "no-such-kind")
-        assert nowhere.state == "waiting"
+        await placing.place("nowhere", "no-such-kind")  # hosts are asked whether they have it by now
+        nowhere = await placing.until("nowhere", lambda placement: placement.state == "given_up")
         assert "no-such-kind" in nowhere.reason
         labelled = await placing.place("labelled", "counter", labels=["gpu", "lidar"])
         assert labelled.state == "waiting"
