@@ -175,6 +175,8 @@ def test_a_start_that_fails_loses_the_device_with_its_last_line_until_it_was_mad
     async def story(driver: CommandDriver, rc: Rc) -> None:
         await driver.begin(holder(1))
         await rc.until("start ended with exit code 3: no such [2J power")
+        await driver._look()
+        assert "ok" not in rc.said
         await driver.end(holder(1))
         await driver.safe()
         await rc.until("ok")
@@ -255,6 +257,19 @@ def test_a_command_that_writes_without_end_is_held_back_and_only_the_last_is_kep
         assert len(said) <= command_driver.MAX_REASON + 40
 
     play(story, start="head -c 300000 /dev/zero | tr '\\0' y; exit 5")
+
+
+def test_of_what_is_written_the_end_is_kept() -> None:
+    async def read() -> None:
+        reader = asyncio.StreamReader()
+        reader.feed_data(b"x" * 2 * command_driver.KEPT_OUTPUT + b"\nlast")
+        reader.feed_eof()
+        tail = command_driver.OutputTail(reader)
+        await tail.drain()
+        assert tail.said == ": last"
+        assert len(tail._kept) == command_driver.KEPT_OUTPUT
+
+    asyncio.run(read())
 
 
 def test_a_program_that_is_not_there_is_the_reason() -> None:

@@ -163,11 +163,10 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
     assert words(path, "later") == ["waiting", "running", "done"]
     assert words(path, "operator") == ["running", "done"]
     waiting = next(text for (text,) in lane(path, "/arc/later") if text.startswith("waiting"))
-    assert "robot/b" in waiting
-    assert re.match(r"waiting · for \S+@\S+ \(.+\): ", waiting)
+    assert re.fullmatch(r"waiting · for survey \([^\s@]+@\S+\): robot/b", waiting)
     assert any(", priority 1" in text for (text,) in lane(path, "/arc/survey") if text.startswith("preempted"))
 
-    owner = r" of \S+@\S+ \([^)]*\)"
+    owner = r" of [^\s@]+@\S+"
     assert any(re.fullmatch(rf"survey{owner} runs on .*", text) for text in events(path))
     told = [re.sub(owner, "", text) for text in events(path)]
     for text in ("survey runs on radio/a, robot/a, robot/b", "later completed: its minimum runtime is over"):
