@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import os
+import re
 import subprocess
 import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -17,9 +22,12 @@ from tests.cli.fleet.test_status import section
 from tests.cli.tools import COMMAND, zscout_soon
 from tests.hang import HANG
 from tests.live.lab import Lab
+from zscout import trace
 from zscout.behaviors.client.client import Client
+from zscout.config.fleet import default_fleet
+from zscout.mesh import clock
 from zscout.messages import Command, Done
-from zscout.types import Grant
+from zscout.types import Grant, Ns
 
 pytestmark = pytest.mark.live
 RC = "robot/arm"
@@ -160,3 +168,106 @@ def test_each_half_of_a_partition_says_that_the_other_owner_is_not_seen_and_afte
     finally:
         halves.processes.close()
         halves.net.close()
+
+
+HALVES = (("lead1", "ws1", "desk1"), ("lead2", "ws2", "desk2"))
+"""Each has a candidate, a node that offers the RC, and a program that commands it."""
+COMMANDS = 30
+"""That tell that it goes on."""
+PROGRAM = f"""
+import sys, time, zscout
+from zscout.config.fleet import load_fleet
+with zscout.connect("program", fleet=load_fleet(sys.argv[1]), host=sys.argv[2]) as lab:
+    while True:
+        try:
+            with lab.hold("work", {{"{RC}": {{}}}}, min_runtime=0.5, wait_for_device=True, interrupt=False) as held:
+                while held.active:
+                    held.command("{RC}", {{"name": "echo", "value": 1}})
+                    time.sleep(0.01)
+        except (zscout.Revoked, zscout.CommandRefused, zscout.RequestRefused, zscout.NoRcm):
+            time.sleep(0.05)
+"""
+
+
+class Obeyed(NamedTuple):
+    at: Ns
+    instance: str
+    term: tuple[Any, ...]
+
+
+def obeyed(folder: Path) -> list[Obeyed]:
+    """Every command that one of both has carried out, in the order of time."""
+    found = [
+        Obeyed(event["at"], event["instance"], tuple(event["term"]))
+        for host in ("ws1", "ws2")
+        for event in trace.lines((folder / f"{host}.log").read_text().splitlines())
+        if event["do"] == "command"
+    ]
+    return sorted(found)
+
+
+def test_of_two_nodes_with_one_rc_never_two_obey_one_reign(tmp_path: Path) -> None:
+    """Through a partition, a merge and two changes of leader, all the time under commands from both sides."""
+    try:
+        check()
+    except NoNamespaces as why:
+        pytest.skip(str(why))
+    net = Net([host for half in HALVES for host in half])
+    processes = Processes(net, tmp_path)
+
+    def until(what: str, holds: Callable[[list[Obeyed]], bool]) -> None:
+        deadline = time.monotonic() + HANG
+        while not holds(obeyed(tmp_path)):
+            assert time.monotonic() < deadline, what
+            time.sleep(0.2)
+
+    def goes_on(commands: list[Obeyed], since: Ns) -> bool:
+        return sum(one.at > since for one in commands) > COMMANDS
+
+    try:
+        net.open()
+        fleet = tmp_path / "fleet.toml"
+        fleet.write_text(f'[fleet]\nname = "{net.mark}"\ncandidates = ["lead1", "lead2"]\n[mesh]\ninterface = "eth0"\n')
+        for lead, device, desk in HALVES:
+            for host, more in ((lead, ""), (device, f'[[rc]]\nname = "{RC}"\ndriver = "exclusive"\n')):
+                file = tmp_path / f"{host}.toml"
+                file.write_text(f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n{more}')
+                processes.start(host, [sys.executable, "-m", "zscout.node", str(file), "--log-level", "debug"])
+            processes.start(desk, [sys.executable, "-c", PROGRAM, str(fleet), desk])
+        until("somebody commands it", lambda commands: goes_on(commands, 0))
+
+        net.cut([*itertools.product(*HALVES), *itertools.product(*reversed(HALVES))])
+        apart = clock.now()
+        until(
+            "both halves go on",
+            lambda commands: (
+                all(
+                    goes_on([one for one in commands if one.instance == instance], apart)
+                    for instance in {one.instance for one in commands}
+                )
+                and len({one.instance for one in commands}) == 2
+            ),
+        )
+        net.cut([])
+        alone = clock.now() + default_fleet().timing.hold_lease
+        until("it goes on after the merge", lambda commands: goes_on(commands, alone))
+
+        terms = {
+            lead: re.findall(r"leading in term (\d+)", (tmp_path / f"{lead}.log").read_text()) for lead, *_ in HALVES
+        }
+        leader = max(terms, key=lambda lead: int(terms[lead][-1]) if terms[lead] else 0)
+        before = max(one.term for one in obeyed(tmp_path))
+        processes.kill(leader)
+        until("it goes on with another leader", lambda commands: goes_on([c for c in commands if c.term > before], 0))
+    finally:
+        processes.close()
+        net.close()
+
+    reigns = defaultdict[tuple[Any, ...], dict[str, list[Ns]]](lambda: defaultdict(list))
+    for one in obeyed(tmp_path):
+        reigns[one.term][one.instance].append(one.at)
+    assert len(reigns) >= 3
+    for instances in reigns.values():
+        spans = sorted((min(times), max(times)) for times in instances.values())
+        assert all(first[1] < second[0] for first, second in itertools.pairwise(spans)), spans
+    assert len({one.instance for one in obeyed(tmp_path) if one.at > alone}) == 1
