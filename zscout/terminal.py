@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 NARROW: Final = 110
 """Columns of a terminal below which tables leave out what matters least."""
+CUT: Final = 0.3
+"""Of a terminal's width: what a column has at most whose texts are cut short."""
 NEAR: Final = 120.0
 """Seconds from now within which a time of day is told with its seconds."""
 MAX_CLOCK: Final = 1e9
@@ -97,13 +99,14 @@ def many(count: int, what: str) -> str:
 @dataclass(frozen=True, slots=True)
 class Table:
     """Rows of texts, made safe to print where they are. `styles` has Rich's style for each row, `spare` the
-    columns that a narrow terminal omits."""
+    columns that a narrow terminal omits, `cut` those whose texts are cut short at a terminal."""
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     styles: Sequence[str] = ()
     spare: Collection[str] = ()
+    cut: Collection[str] = ()
 
     def lines(self) -> list[str]:
         """Without colours: two spaces between columns."""
@@ -130,8 +133,12 @@ class Table:
         narrow = console().width < NARROW
         kept = [at for at, name in enumerate(self.columns) if not (narrow and name in self.spare)]
         for at in kept:
+            name = self.columns[at]
             # A name or key that is cut short can't be copied.
-            table.add_column(self.columns[at], overflow="fold")
+            if name in self.cut:
+                table.add_column(name, overflow="ellipsis", no_wrap=True, max_width=round(CUT * console().width))
+            else:
+                table.add_column(name, overflow="fold")
         for row, style in zip_longest(self.rows[:most], self.styles[:most], fillvalue=""):
             table.add_row(*(Text(clean(row[at])) for at in kept), style=style)
         return table

@@ -68,3 +68,11 @@ def test_what_has_become_short_is_shown_from_its_beginning(screen: Console) -> N
     lines(screen, scrolled, overview(30))
     scrolled.key(b"G")
     assert sum(line.startswith("robot/") for line in lines(screen, scrolled, overview(2))) == 2
+
+
+def test_a_long_command_leaves_room_for_the_other_columns(screen: Console) -> None:
+    who = "root@anvil (python3 -c 'import time; time.sleep(60) # a long command')"
+    table = Table("", ("ARC", "WHO", "RCS"), [("survey", who, "robot/arm1 " * 3)], cut={"WHO"})
+    head, row = lines(screen, Scrolled(), Overview("Fleet lab", [table]))[2:4]
+    assert row.split("…")[1].split() == ["robot/arm1"] * 3
+    assert row.index("robot/arm1") == head.index("RCS") < WIDTH / 2

@@ -124,7 +124,7 @@ class Standing:
             names = ", ".join(common.with_amounts(whose(hold), hold.needs[view.rc]) for hold in holders)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
             styles.append({"absent": "red", "lost": "red", "held": "yellow", "free": "green"}[words])
-        return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles)
+        return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles, cut={"HELD BY"})
 
     def _running(self, state: RcmState) -> Table:
         rows, styles = [], []
@@ -138,7 +138,7 @@ class Standing:
             operator = hold.priority >= self.fleet_view.client.fleet.operator_priority
             styles.append("bold red" if operator else "")
         columns = ("ARC", "WHO", "PRIORITY", "SINCE", "UNTIL", "RCS", "CLIENT")
-        return Table("Running", columns, rows, styles, {"CLIENT"})
+        return Table("Running", columns, rows, styles, {"CLIENT"}, cut={"WHO"})
 
     def _hosts(self, chosen: Selection) -> Table:
         rows, styles = [], []
@@ -240,7 +240,9 @@ def _waiting(state: RcmState, ranks: Mapping[str, int]) -> Table:
         )
     title = f"Waiting, and {state.more} more" if state.more else "Waiting"
     columns = ("#", "ARC", "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", "CLIENT")
-    return Table(title, columns, rows, spare={"RUNTIME", "PREEMPTED", "CLIENT"})
+    # The queue stands in rank order: priority and age say no more where there is little room.
+    spare = {"PRIORITY", "SINCE", "RUNTIME", "PREEMPTED", "CLIENT"}
+    return Table(title, columns, rows, spare=spare, cut={"WHO"})
 
 
 def _who(view: HoldView | WaitView) -> str:
