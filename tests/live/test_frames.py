@@ -205,6 +205,8 @@ async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
         await stand.rc("robot/a", Bench())
         client = await lab.client()
         await lab.ready(client, GRABBER, "video/ch1", "video/ch2", "video/ch9", "robot/a")
+        # That it has a picture was tried as it began: nobody is sent another, which would count.
+        await until(lambda: one.connected == two.connected == 0)
         yield Scene(lab, client, rc, driver, one, two)
 
 
@@ -222,7 +224,7 @@ def test_frames_are_published_while_somebody_holds_and_somebody_looks(
 
     async def story() -> None:
         async with scene(tmp_path) as at:
-            # Whether it has a picture was tried as it began. Free: somebody looks, and nothing is opened.
+            # Free: somebody looks, and nothing is opened.
             tried = at.one.accepted, at.two.accepted
             watch = at.watch()
             await until(lambda: at.driver._publisher.watched)
