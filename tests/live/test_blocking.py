@@ -125,6 +125,27 @@ def test_a_body_whose_time_is_over_is_interrupted(fleet: CliFleet, how: str, *, 
     assert (by("true") in told) == waits
 
 
+def test_a_hold_that_had_its_time_by_this_host_s_clock_is_completed_though_no_rcm_says_so_yet(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {"robot/a": {}}, min_runtime=2, keep=False) as held:
+                    say("entered")
+                    time.sleep(LONGER)
+            except zscout.Revoked as revoked:
+                say(revoked.outcome, held.completed)
+    """
+    survey, node = script(fleet.lab, text), fleet.lab.nodes["anvil"]
+    read_until(survey, "entered")
+    node.send_signal(signal.SIGSTOP)
+    try:
+        told = read_until(survey, "completed")[-1]
+    finally:
+        node.send_signal(signal.SIGCONT)
+    assert told == "completed True"
+    assert rest_of(survey) == []
+
+
 def test_what_is_kept_goes_on_past_its_minimum_runtime(fleet: CliFleet) -> None:
     text = """
         with zscout.connect() as lab, lab.hold("survey", {"robot/a": {}}, min_runtime=0.1) as held:

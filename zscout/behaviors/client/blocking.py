@@ -162,7 +162,10 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         if self._held is not None and (direct := client.direct_hold(self._held.grant)) is not None:
             direct.returned()
         if arc is not None and arc.open:
-            await client.end(arc)
+            if self._held is not None and self._held.completed:
+                client.complete(arc)
+            else:
+                await client.end(arc)
 
 
 class Lab:
