@@ -339,6 +339,45 @@ def test_without_an_rcm_it_says_so_and_what_to_do(tmp_path: Path) -> None:
     )
 
 
+def test_a_lab_that_was_closed_says_so(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            with lab.hold("survey", {"robot/a": {}}) as held:
+                pass
+        for use in (lab.hold("again", {"robot/a": {}}).__enter__, held.wait, lambda: held.command("robot/a", {})):
+            try:
+                use()
+            except RuntimeError as closed:
+                say(closed)
+    """
+    told = rest_of(script(fleet.lab, text))
+    assert told == ["this lab is closed; zscout.connect() gives a new one"] * 3
+
+
+def test_who_waits_in_another_thread_as_a_lab_is_closed_is_told(fleet: CliFleet) -> None:
+    text = """
+        import asyncio
+        begun = threading.Event()
+
+        async def work():
+            begun.set()
+            await asyncio.sleep(LONGER)
+
+        def wait():
+            try:
+                lab.run(work())
+            except RuntimeError as closed:
+                say(closed)
+
+        with zscout.connect() as lab:
+            thread = threading.Thread(target=wait, daemon=True)
+            thread.start()
+            begun.wait()
+        thread.join()
+    """
+    assert rest_of(script(fleet.lab, text)) == ["this lab is closed; zscout.connect() gives a new one"]
+
+
 def test_all_names_are_listed_and_there() -> None:
     import zscout
 
