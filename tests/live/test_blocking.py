@@ -83,6 +83,25 @@ def test_a_direct_body_clears_up_before_the_next_program_begins(fleet: CliFleet,
     assert told.read_text().split() == ["left", "next"]
 
 
+def test_a_direct_body_that_clears_up_for_too_long_is_interrupted_once_more(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {"robot/a": {}}, direct=True):
+                    say("entered")
+                    try:
+                        time.sleep(LONGER)
+                    finally:
+                        time.sleep(LONGER)
+            except zscout.Revoked as revoked:
+                say(revoked.outcome, isinstance(revoked.__context__, zscout.Revoked))
+    """
+    survey = script(fleet.lab, text)
+    read_until(survey, "entered")
+    take(fleet, "robot/a", "--priority", "5")
+    assert rest_of(survey) == ["preempted True"]
+
+
 def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> None:
     text = """
         before = signal.getsignal(signal.SIGURG)

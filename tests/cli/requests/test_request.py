@@ -342,3 +342,13 @@ def test_a_command_has_the_terminal(fleet: CliFleet) -> None:
         terminal.press("\n")
         terminal.until("gave back")
         assert terminal.code() == 9
+
+
+def test_a_hold_without_a_command_is_not_suspended_either(fleet: CliFleet) -> None:
+    with fleet.terminal("request", "robot/a") as terminal:
+        terminal.until("Ctrl-C gives back")
+        terminal.press("\x1a")
+        terminal.until("not suspended")
+        terminal.press("\x03")
+        terminal.until("gave back")
+        assert terminal.code() == 130

@@ -13,6 +13,7 @@ RC obeys nothing under a hold that is over, whatever the body does.
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import Coroutine, Mapping
 from concurrent import futures
@@ -28,9 +29,11 @@ from zscout.behaviors.client.interruption import InterruptibleBody, interruptibl
 from zscout.behaviors.client.request import HoldEnd, Needs
 from zscout.config.fleet import Fleet
 from zscout.mesh.supervision import done_within
-from zscout.types import Grant
+from zscout.types import SECOND, Grant
 
 T = TypeVar("T")
+
+log = logging.getLogger(__name__)
 
 LOOK_FOR_RCM: Final = 3.0
 """Seconds in which a mesh that has an RCM shows it."""
@@ -156,8 +159,16 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         self._watch = asyncio.create_task(self._interrupt_when_over(held))
 
     async def _interrupt_when_over(self, held: BlockingHeld) -> None:
+        direct = self._lab.client.direct_hold(held.grant)
         await held._held.over()
         await held._body.interrupt()
+        if direct is not None:
+            await asyncio.sleep(max(0, direct.gone_by - held._held.now()) / SECOND)
+            log.warning(
+                "%s clears up for too long after its hold, and is interrupted: the next holder begins", direct.arc.name
+            )
+            held._body.told = False
+            await held._body.interrupt()
 
     async def _end(self) -> None:
         if self._watch is not None:
@@ -251,7 +262,7 @@ class Lab:
         is `completed` where it had its time.
 
         A body that touches devices past their RCs says `direct`: they settle until it has been left, in at most nine
-        tenths of their `settle`; the next holder waits for that.
+        tenths of their `settle`; the next holder waits for that, and Revoked is raised once more in who takes longer.
 
         What can never start is refused; with `wait_for_device`, not for a need that nobody knows.
 

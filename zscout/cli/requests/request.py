@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 import sys
 from collections.abc import AsyncIterator, Coroutine, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager
 from typing import IO, Any, Final
 
 import click
@@ -168,8 +169,9 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         if wanted.command:
             code = await _run(wanted, report, held, client)
         else:
-            async with report.telling(report.follow_hold(arc)):
-                await held.over()
+            with _never_suspended(report):
+                async with report.telling(report.follow_hold(arc)):
+                    await held.over()
     except BaseException:
         await client.end(arc)
         report.event("ended", f"{arc.name} gave back {rcs}", outcome="released")
@@ -194,6 +196,17 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
             return None
         return TIME_OVER if wanted.command else 0
     return await _taken(client, wanted, report, arc)
+
+
+@contextmanager
+def _never_suspended(report: Report) -> Iterator[None]:
+    """Ctrl-Z would lose what is held: this client could not confirm it any more."""
+    loop, text = asyncio.get_running_loop(), "not suspended: it would lose what it holds"
+    loop.add_signal_handler(signal.SIGTSTP, report.event, "not_suspended", text)
+    try:
+        yield
+    finally:
+        loop.remove_signal_handler(signal.SIGTSTP)
 
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
@@ -257,7 +270,7 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
         await client.end(arc)
     if wanted.command:
         return TAKEN_AWAY
-    raise Failed(f"{line}; ask again, or with a higher priority")
+    raise Failed(f"{line}; ask again{', or with a higher priority' if ending.outcome == 'preempted' else ''}")
 
 
 def _yours(arc: OpenArc, left: float) -> str:
