@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import io
 import re
+import shlex
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, by, end, events, gone, named, out_of, read_until
+from tests.cli.tools import CLOCK, COMMAND, by, end, events, gone, named, out_of, read_until
 from tests.hang import HANG
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
 from zscout.cli.requests.request import REFRESH, Report
@@ -352,3 +354,10 @@ def test_a_hold_without_a_command_is_not_suspended_either(fleet: CliFleet) -> No
         terminal.press("\x03")
         terminal.until("gave back")
         assert terminal.code() == 130
+
+
+def test_where_nothing_can_be_said_a_command_runs_all_the_same(fleet: CliFleet, tmp_path: Path) -> None:
+    ran = tmp_path / "ran"
+    command = shlex.join([*COMMAND, "request", "robot/a", "--", "sh", "-c", f"sleep 0.1; : > {ran}; exit 7"])
+    done = subprocess.run(["sh", "-c", f"exec {command} 2>/dev/full"], env=fleet.lab.env, timeout=HANG)
+    assert (done.returncode, ran.exists()) == (7, True)

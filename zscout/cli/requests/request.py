@@ -6,7 +6,7 @@ import asyncio
 import signal
 import sys
 from collections.abc import AsyncIterator, Coroutine, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
 from typing import IO, Any, Final
 
 import click
@@ -330,10 +330,12 @@ class Report(LiveLine):
 
     def event(self, kind: str, text: str, /, **details: Any) -> None:
         """Reports one event: `text` for people (empty: nothing), the rest for programs."""
-        if self._as_json:
-            print_json({"event": kind, "arc": self._name, "client": str(self._mesh.me)} | details, self._stream)
-        elif text:
-            self.print(text)
+        # What a command does, and its exit code, do not depend on who reads what is said beside it.
+        with suppress(OSError) if self._stream is sys.stderr else nullcontext():
+            if self._as_json:
+                print_json({"event": kind, "arc": self._name, "client": str(self._mesh.me)} | details, self._stream)
+            elif text:
+                self.print(text)
 
     def news(self, arc: OpenArc) -> None:
         """A watcher for the client."""
