@@ -160,10 +160,10 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     if grant is None:  # taken away since the RCs confirmed it
         return await _taken(client, wanted, report, arc)
     held = Held(client, arc, grant)
-    rcs, left = _held_text(held), held.remaining
+    rcs, left, longest = _held_text(held), held.remaining, client.fleet.scheduling.max_runtime
     details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
     details |= {"grant": grant, "remaining": round(left, 3)}
-    report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left)}", **details)
+    report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left, longest)}", **details)
     try:
         code = None
         if wanted.command:
@@ -273,9 +273,15 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
     raise Failed(f"{line}; ask again{', or with a higher priority' if ending.outcome == 'preempted' else ''}")
 
 
-def _yours(arc: OpenArc, left: float) -> str:
-    """For how long a hold goes on, of which so many seconds are protected."""
-    return f"yours for {span(left)} (until {clock(left)}), then {UNTIL if arc.keep else 'given back'}"
+def _yours(arc: OpenArc, left: float, longest: Ns | None) -> str:
+    """For how long a hold goes on, of which so many seconds are protected; `longest` as the fleet allows."""
+    goes_on = arc.keep and (longest is None or arc.min_runtime * SECOND < longest)
+    then = _kept(longest) if goes_on else "given back"
+    return f"yours for {span(left)} (until {clock(left)}), then {then}"
+
+
+def _kept(longest: Ns | None) -> str:
+    return UNTIL if longest is None else f"{UNTIL}, {span(longest / SECOND)} in all at most"
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
@@ -374,10 +380,12 @@ class Report(LiveLine):
 
     async def follow_hold(self, arc: OpenArc) -> None:
         """Shows how long a hold without a command goes on, until cancelled."""
+        longest = self._client.fleet.scheduling.max_runtime
         while True:
             self.changed.clear()
             left = (arc.end - self._mesh.now()) / SECOND
-            rest = _yours(arc, left) if left > 0 or not arc.keep else f"for {span(self._since(arc))}, {UNTIL}"
+            protected = left > 0 or not arc.keep
+            rest = _yours(arc, left, longest) if protected else f"for {span(self._since(arc))}, {_kept(longest)}"
             self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}\n  Ctrl-C gives back")
             await done_within(REFRESH if self.watched else None, self.changed.wait())
 
