@@ -129,6 +129,14 @@ def test_a_closed_stream_is_no_error(command: str, code: int, closed: str) -> No
     assert (done.returncode, "Traceback" in done.stdout + done.stderr) == (code, False), done.stderr
 
 
+def test_a_full_disk_is_told_in_one_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*tools.COMMAND, "completion", "fish"], stdout=full, stderr=subprocess.PIPE, text=True, timeout=HANG
+        )
+    assert (done.returncode, done.stderr) == (1, "zscout: No space left on device; free some\n")
+
+
 def test_completion_knows_the_commands_without_loading_them() -> None:
     script = zscout("completion", "bash")
     assert script.returncode == 0

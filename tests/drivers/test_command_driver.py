@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,6 +17,7 @@ from tests.hang import HANG
 from zscout.config.devices import CommandRc
 from zscout.drivers import command_driver
 from zscout.drivers.command_driver import CommandDriver
+from zscout.drivers.instances import InstanceState
 from zscout.mesh import Supervisor
 from zscout.messages import Parameter
 from zscout.types import SECOND
@@ -32,6 +33,7 @@ class Rc:
 
     def __init__(self) -> None:
         self.supervisor = Supervisor(self.name, lambda _error: None)
+        self.instances = SimpleNamespace(state=InstanceState.SERVES)
         self.said: list[str] = []
         self.news = asyncio.Event()
 
@@ -87,7 +89,7 @@ def _quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(command_driver, "AGAIN", (0.05, 0.1))
     monkeypatch.setattr(command_driver, "OPENING", HANG)
     yield
-    assert not any(map(alive, told("pids")))
+    asyncio.run(until(lambda: not any(map(alive, told("pids")))))  # who was killed may take a moment to go
 
 
 def play(
@@ -96,12 +98,14 @@ def play(
     timeout: float = HANG,
     every: float = 0.05,
     parameters: Mapping[str, Decimal] = MappingProxyType({}),
+    state: InstanceState = InstanceState.SERVES,
     **scripts: str,
 ) -> None:
     """Plays a story with a driver whose commands are these shell scripts."""
 
     async def run() -> None:
         rc = Rc()
+        rc.instances.state = state
         bounds: dict[str, Any] = {"timeout": round(timeout * SECOND), "every": round(every * SECOND)}
         words: dict[str, Any] = {name: ("sh", "-c", script) for name, script in scripts.items()}
         driver = CommandDriver.configured(CommandRc(name=rc.name, parameters=parameters, **bounds, **words))
@@ -319,6 +323,30 @@ def test_a_node_that_ends_stops_and_makes_safe() -> None:
         await driver.begin(holder(1))
         await until(lambda: told() == ["safe", "start"])
         await rc.supervisor.close()
+        await driver.safe()
+        assert told() == ["safe", "start", "stop", "safe"]
+
+    play(story, start=TELL, stop=TELL, safe=TELL)
+
+
+def test_one_that_stands_by_leaves_the_device_alone_until_it_is_used() -> None:
+    async def story(driver: CommandDriver, rc: Rc) -> None:
+        await rc.until("it was not made safe: it stands by")
+        await driver.safe()  # as its node ends
+        assert told() == []
+        rc.instances.state = InstanceState.OFFERED
+        await rc.until("ok")
+        assert told()[:2] == ["safe", "health"]
+
+    play(story, state=InstanceState.STANDS_BY, safe=TELL, health=TELL)
+
+
+def test_one_that_stands_by_from_now_on_ends_its_own_hold_in_order() -> None:
+    async def story(driver: CommandDriver, rc: Rc) -> None:
+        await driver.begin(holder(1))
+        await until(lambda: told() == ["safe", "start"])
+        rc.instances.state = InstanceState.STANDS_BY
+        await driver.end(holder(1))
         await driver.safe()
         assert told() == ["safe", "start", "stop", "safe"]
 

@@ -83,6 +83,25 @@ def test_a_direct_body_clears_up_before_the_next_program_begins(fleet: CliFleet,
     assert told.read_text().split() == ["left", "next"]
 
 
+def test_a_direct_body_that_clears_up_for_too_long_is_interrupted_once_more(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            try:
+                with lab.hold("survey", {"robot/a": {}}, direct=True):
+                    say("entered")
+                    try:
+                        time.sleep(LONGER)
+                    finally:
+                        time.sleep(LONGER)
+            except zscout.Revoked as revoked:
+                say(revoked.outcome, isinstance(revoked.__context__, zscout.Revoked))
+    """
+    survey = script(fleet.lab, text)
+    read_until(survey, "entered")
+    take(fleet, "robot/a", "--priority", "5")
+    assert rest_of(survey) == ["preempted True"]
+
+
 def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> None:
     text = """
         before = signal.getsignal(signal.SIGURG)
@@ -337,6 +356,45 @@ def test_without_an_rcm_it_says_so_and_what_to_do(tmp_path: Path) -> None:
     assert told.startswith(
         f"no RCM is on the mesh of fleet {lab.fleet.name} (no other program either); start zscout-node"
     )
+
+
+def test_a_lab_that_was_closed_says_so(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect() as lab:
+            with lab.hold("survey", {"robot/a": {}}) as held:
+                pass
+        for use in (lab.hold("again", {"robot/a": {}}).__enter__, held.wait, lambda: held.command("robot/a", {})):
+            try:
+                use()
+            except RuntimeError as closed:
+                say(closed)
+    """
+    told = rest_of(script(fleet.lab, text))
+    assert told == ["this lab is closed; zscout.connect() gives a new one"] * 3
+
+
+def test_who_waits_in_another_thread_as_a_lab_is_closed_is_told(fleet: CliFleet) -> None:
+    text = """
+        import asyncio
+        begun = threading.Event()
+
+        async def work():
+            begun.set()
+            await asyncio.sleep(LONGER)
+
+        def wait():
+            try:
+                lab.run(work())
+            except RuntimeError as closed:
+                say(closed)
+
+        with zscout.connect() as lab:
+            thread = threading.Thread(target=wait, daemon=True)
+            thread.start()
+            begun.wait()
+        thread.join()
+    """
+    assert rest_of(script(fleet.lab, text)) == ["this lab is closed; zscout.connect() gives a new one"]
 
 
 def test_all_names_are_listed_and_there() -> None:

@@ -117,6 +117,8 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     """The exit code and the line for an error that people can mend; None: a bug, to be shown in full."""
     if isinstance(error, OSError) and _nobody_reads(error):
         return COULD_NOT, ""
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        return COULD_NOT, f"zscout: {error.strerror}{f': {error.filename}' if error.filename else ''}; free some"
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         return BAD_INPUT, error.format_message()
     if isinstance(error, click.UsageError):

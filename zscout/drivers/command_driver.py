@@ -21,6 +21,7 @@ from typing import Final
 
 from zscout.config.devices import CommandRc, Words
 from zscout.drivers.driver import Driver, RcHandle
+from zscout.drivers.instances import InstanceState
 from zscout.mesh.supervision import done_within
 from zscout.messages import Figures, Holder, Parameter
 from zscout.types import SECOND
@@ -124,6 +125,8 @@ class CommandDriver(Driver):
 
     async def safe(self) -> None:
         """Stops it first, where it was started: that may take its time as well."""
+        if self._stands_by and self._started is None:
+            return
         self._holder, started, self._started = None, self._started, None
         self._unsure, before = "it is being made safe", self._unsure
         try:
@@ -145,9 +148,13 @@ class CommandDriver(Driver):
     def figures(self) -> Figures:
         return {**self._counts, "start_seconds": round(self._start_seconds, 3)}
 
+    @property
+    def _stands_by(self) -> bool:
+        """Whether another host's is used: somebody may hold there what is one device, and it is not to be touched."""
+        return self._rc.instances.state is InstanceState.STANDS_BY
+
     def _lose(self, why: str) -> None:
         if why != self._lost:
-            log.warning("%s is lost: %s", self._rc.name, why)
             self._lost = why
             self._rc.fail(why)
         self._news.set()
@@ -164,13 +171,17 @@ class CommandDriver(Driver):
                 self._news.clear()
                 if not await done_within(every, self._news.wait()):
                     continue
+            if self._stands_by:
+                tries = 0
             again = min(AGAIN[0] * 2.0 ** min(max(tries, self._failed_starts - 1), 16), AGAIN[1])
             tries += 1
             await asyncio.sleep(again if every is None or self._unsure else min(again, every))
 
     async def _look(self) -> None:
         """Makes it safe where its state is not known, and looks whether it is well."""
-        if self._unsure and self._holder is None:
+        if self._stands_by:
+            self._unsure = "it was not made safe: it stands by"
+        elif self._unsure and self._holder is None:
             self._unsure = (await self._run("safe", self._told.safe)).problem
         why = self._unsure
         if not why:
@@ -181,7 +192,6 @@ class CommandDriver(Driver):
         if why:
             self._lose(why)
         elif self._lost:
-            log.info("%s is well again", self._rc.name)
             self._lost = ""
             self._rc.recover()
 

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Final, Protocol, Self
 from msgspec import Struct
 
 from zscout.drivers.holds import HoldTable
+from zscout.drivers.instances import Instances
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import Declaration, Mesh, Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder
@@ -29,6 +30,8 @@ class RcHandle(Protocol):
     mesh: Mesh
     name: str
     holds: HoldTable
+    instances: Instances
+    """Whether this one serves, or stands by for another host's."""
     directory: RcDirectory | None
     """Only of a driver that relays."""
     supervisor: Supervisor

@@ -5,18 +5,22 @@ from __future__ import annotations
 import asyncio
 import io
 import re
+import shlex
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, by, end, events, gone, named, out_of, read_until
+from tests.cli.tools import CLOCK, COMMAND, by, end, events, gone, named, out_of, read_until
 from tests.hang import HANG
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
-from zscout.cli.requests.request import REFRESH, Report
+from zscout.behaviors.client.request import OpenArc
+from zscout.cli.requests.request import REFRESH, Report, _yours
 from zscout.mesh import clock
 from zscout.messages import RcmState
 from zscout.types import SECOND
@@ -342,3 +346,34 @@ def test_a_command_has_the_terminal(fleet: CliFleet) -> None:
         terminal.press("\n")
         terminal.until("gave back")
         assert terminal.code() == 9
+
+
+def test_a_hold_without_a_command_is_not_suspended_either(fleet: CliFleet) -> None:
+    with fleet.terminal("request", "robot/a") as terminal:
+        terminal.until("Ctrl-C gives back")
+        terminal.press("\x1a")
+        terminal.until("not suspended")
+        terminal.press("\x03")
+        terminal.until("gave back")
+        assert terminal.code() == 130
+
+
+def test_where_nothing_can_be_said_a_command_runs_all_the_same(fleet: CliFleet, tmp_path: Path) -> None:
+    ran = tmp_path / "ran"
+    command = shlex.join([*COMMAND, "request", "robot/a", "--", "sh", "-c", f"sleep 0.1; : > {ran}; exit 7"])
+    done = subprocess.run(["sh", "-c", f"exec {command} 2>/dev/full"], env=fleet.lab.env, timeout=HANG)
+    assert (done.returncode, ran.exists()) == (7, True)
+
+
+@pytest.mark.parametrize(
+    ("keep", "longest", "then"),
+    [
+        (True, None, "until somebody waits for it"),
+        (True, 120 * SECOND, "until somebody waits for it, 2 min in all at most"),
+        (True, 60 * SECOND, "given back"),
+        (False, None, "given back"),
+    ],
+)
+def test_how_long_it_may_go_on_is_said_beforehand(keep: bool, longest: int | None, then: str) -> None:
+    arc = OpenArc("id", "survey", {"robot/a": {}}, 0, Decimal(60), keep)
+    assert _yours(arc, 60.0, longest).endswith(f"), then {then}")

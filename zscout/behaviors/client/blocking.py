@@ -13,8 +13,10 @@ RC obeys nothing under a hold that is over, whatever the body does.
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import Coroutine, Mapping
+from concurrent import futures
 from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
@@ -27,12 +29,17 @@ from zscout.behaviors.client.interruption import InterruptibleBody, interruptibl
 from zscout.behaviors.client.request import HoldEnd, Needs
 from zscout.config.fleet import Fleet
 from zscout.mesh.supervision import done_within
-from zscout.types import Grant
+from zscout.types import SECOND, Grant
 
 T = TypeVar("T")
 
+log = logging.getLogger(__name__)
+
 LOOK_FOR_RCM: Final = 3.0
 """Seconds in which a mesh that has an RCM shows it."""
+CLOSED: Final = "this lab is closed; zscout.connect() gives a new one"
+LAST_STEPS: Final = 1.0
+"""Seconds in which what still runs in the loop hears that its lab is closed."""
 
 
 class BlockingHeld:
@@ -71,7 +78,7 @@ class BlockingHeld:
         """Waits until the hold is over, at most `timeout` seconds. True: it is over, and nothing is raised for it."""
         self._body.waits = True
         try:
-            over = self._lab.run(done_within(timeout, self._held.over()))
+            over = self._lab.run(self._over_within(timeout))
             self._body.told |= over
         finally:
             self._body.waits = False
@@ -90,6 +97,9 @@ class BlockingHeld:
         """Has one of the held RCs do something and returns its result: the one of this name, or that meets
         this pattern. Raises CommandRefused, and KeyError for a pattern that was not asked for."""
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
+
+    async def _over_within(self, timeout: float | None) -> bool:
+        return await done_within(timeout, self._held.over())
 
     def _revoked(self) -> Revoked:
         arc = self._held.arc
@@ -149,8 +159,16 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         self._watch = asyncio.create_task(self._interrupt_when_over(held))
 
     async def _interrupt_when_over(self, held: BlockingHeld) -> None:
+        direct = self._lab.client.direct_hold(held.grant)
         await held._held.over()
         await held._body.interrupt()
+        if direct is not None:
+            await asyncio.sleep(max(0, direct.gone_by - held._held.now()) / SECOND)
+            log.warning(
+                "%s clears up for too long after its hold, and is interrupted: the next holder begins", direct.arc.name
+            )
+            held._body.told = False
+            await held._body.interrupt()
 
     async def _end(self) -> None:
         if self._watch is not None:
@@ -174,6 +192,8 @@ class Lab:
     def __init__(self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> None:
         self._loop = uvloop.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="zscout", daemon=True)
+        self._asking = threading.Lock()
+        self._stopped = False
         self._thread.start()
         try:
             self.client = self.run(Client.connect(name, fleet=fleet, host=host))
@@ -189,13 +209,23 @@ class Lab:
 
     @property
     def closed(self) -> bool:
-        return not self._thread.is_alive()
+        # No thread: this is a fork of the process that has it.
+        return self._stopped or not self._thread.is_alive()
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """What the coroutine returns, which runs in the loop of the client."""
-        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        """What the coroutine returns, which runs in the loop of the client. Raises RuntimeError where that is closed,
+        or is closed meanwhile by another thread."""
+        with self._asking:
+            if closed := self.closed:
+                coroutine.close()
+            else:
+                future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        if closed:
+            raise RuntimeError(CLOSED)
         try:
             return future.result()
+        except futures.CancelledError:
+            raise RuntimeError(CLOSED) from None
         except BaseException:
             future.cancel()
             raise
@@ -204,8 +234,10 @@ class Lab:
     def close(self) -> None:
         """Gives back everything and leaves the mesh."""
         if not self.closed:
-            self.run(self.client.close())
-            self._stop()
+            try:
+                self.run(self.client.close())
+            finally:
+                self._stop()
 
     def hold(
         self,
@@ -230,7 +262,7 @@ class Lab:
         is `completed` where it had its time.
 
         A body that touches devices past their RCs says `direct`: they settle until it has been left, in at most nine
-        tenths of their `settle`; the next holder waits for that.
+        tenths of their `settle`; the next holder waits for that, and Revoked is raised once more in who takes longer.
 
         What can never start is refused; with `wait_for_device`, not for a need that nobody knows.
 
@@ -242,8 +274,22 @@ class Lab:
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
     def _stop(self) -> None:
+        with self._asking:
+            if self._stopped:
+                return
+            self._stopped = True
+        asyncio.run_coroutine_threadsafe(self._cancel_rest(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(timeout=5)
+        self._thread.join()
+        self._loop.close()
+
+    async def _cancel_rest(self) -> None:
+        """Other threads may wait for something here."""
+        rest = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in rest:
+            task.cancel()
+        if rest:
+            await asyncio.wait(rest, timeout=LAST_STEPS)
 
 
 def connect(name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> Lab:

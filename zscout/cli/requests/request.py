@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 import sys
 from collections.abc import AsyncIterator, Coroutine, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
 from typing import IO, Any, Final
 
 import click
@@ -159,17 +160,18 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     if grant is None:  # taken away since the RCs confirmed it
         return await _taken(client, wanted, report, arc)
     held = Held(client, arc, grant)
-    rcs, left = _held_text(held), held.remaining
+    rcs, left, longest = _held_text(held), held.remaining, client.fleet.scheduling.max_runtime
     details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
     details |= {"grant": grant, "remaining": round(left, 3)}
-    report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left)}", **details)
+    report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left, longest)}", **details)
     try:
         code = None
         if wanted.command:
             code = await _run(wanted, report, held, client)
         else:
-            async with report.telling(report.follow_hold(arc)):
-                await held.over()
+            with _never_suspended(report):
+                async with report.telling(report.follow_hold(arc)):
+                    await held.over()
     except BaseException:
         await client.end(arc)
         report.event("ended", f"{arc.name} gave back {rcs}", outcome="released")
@@ -194,6 +196,17 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
             return None
         return TIME_OVER if wanted.command else 0
     return await _taken(client, wanted, report, arc)
+
+
+@contextmanager
+def _never_suspended(report: Report) -> Iterator[None]:
+    """Ctrl-Z would lose what is held: this client could not confirm it any more."""
+    loop, text = asyncio.get_running_loop(), "not suspended: it would lose what it holds"
+    loop.add_signal_handler(signal.SIGTSTP, report.event, "not_suspended", text)
+    try:
+        yield
+    finally:
+        loop.remove_signal_handler(signal.SIGTSTP)
 
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
@@ -257,12 +270,18 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
         await client.end(arc)
     if wanted.command:
         return TAKEN_AWAY
-    raise Failed(f"{line}; ask again, or with a higher priority")
+    raise Failed(f"{line}; ask again{', or with a higher priority' if ending.outcome == 'preempted' else ''}")
 
 
-def _yours(arc: OpenArc, left: float) -> str:
-    """For how long a hold goes on, of which so many seconds are protected."""
-    return f"yours for {span(left)} (until {clock(left)}), then {UNTIL if arc.keep else 'given back'}"
+def _yours(arc: OpenArc, left: float, longest: Ns | None) -> str:
+    """For how long a hold goes on, of which so many seconds are protected; `longest` as the fleet allows."""
+    goes_on = arc.keep and (longest is None or arc.min_runtime * SECOND < longest)
+    then = _kept(longest) if goes_on else "given back"
+    return f"yours for {span(left)} (until {clock(left)}), then {then}"
+
+
+def _kept(longest: Ns | None) -> str:
+    return UNTIL if longest is None else f"{UNTIL}, {span(longest / SECOND)} in all at most"
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
@@ -317,10 +336,12 @@ class Report(LiveLine):
 
     def event(self, kind: str, text: str, /, **details: Any) -> None:
         """Reports one event: `text` for people (empty: nothing), the rest for programs."""
-        if self._as_json:
-            print_json({"event": kind, "arc": self._name, "client": str(self._mesh.me)} | details, self._stream)
-        elif text:
-            self.print(text)
+        # What a command does, and its exit code, do not depend on who reads what is said beside it.
+        with suppress(OSError) if self._stream is sys.stderr else nullcontext():
+            if self._as_json:
+                print_json({"event": kind, "arc": self._name, "client": str(self._mesh.me)} | details, self._stream)
+            elif text:
+                self.print(text)
 
     def news(self, arc: OpenArc) -> None:
         """A watcher for the client."""
@@ -359,10 +380,12 @@ class Report(LiveLine):
 
     async def follow_hold(self, arc: OpenArc) -> None:
         """Shows how long a hold without a command goes on, until cancelled."""
+        longest = self._client.fleet.scheduling.max_runtime
         while True:
             self.changed.clear()
             left = (arc.end - self._mesh.now()) / SECOND
-            rest = _yours(arc, left) if left > 0 or not arc.keep else f"for {span(self._since(arc))}, {UNTIL}"
+            protected = left > 0 or not arc.keep
+            rest = _yours(arc, left, longest) if protected else f"for {span(self._since(arc))}, {_kept(longest)}"
             self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}\n  Ctrl-C gives back")
             await done_within(REFRESH if self.watched else None, self.changed.wait())
 
