@@ -13,8 +13,9 @@ from typing import Any, cast
 import msgspec
 import pytest
 
+from tests.behaviors.client.small_fleet import small_fleet
 from tests.mesh import kit
-from zscout.behaviors.client.arc import Held, Revoked
+from zscout.behaviors.client.arc import Held, Revoked, hold
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import OpenArc, RequestStore
 from zscout.config.fleet import default_fleet
@@ -71,7 +72,12 @@ def runs(bound: dict[str, str], step: int = 2, grant: Grant = FIRST) -> Notice:
         ([RUNS, TAKEN, WAITS], "queued", None, ("preempted", "preempted by op", "h/c/op")),
         ([RUNS, TAKEN, WAITS, AGAIN], "running", SECOND_GRANT, ("preempted", "preempted by op", "h/c/op")),
         ([RUNS, WAITS], "queued", None, ("lost", "needs robot/x", None)),
-        ([RUNS, AGAIN], "running", SECOND_GRANT, ("lost", "it was granted anew", None)),
+        (
+            [RUNS, AGAIN],
+            "running",
+            SECOND_GRANT,
+            ("lost", "the RCM took this client for gone; it is granted anew", None),
+        ),
         ([RUNS, notice(3, "ended", outcome="completed")], "ended", None, ("completed", "", None)),
         ([RUNS, notice(1)], "running", FIRST, None),
         ([RUNS, RUNS], "running", FIRST, None),
@@ -339,3 +345,26 @@ def test_who_shows_a_place_shows_the_term_as_well() -> None:
         assert asked == [None, TERM]
 
     asyncio.run(story())
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"needs": ["robot/x"]}, "needs is ["),
+        ({"needs": {"robot/x": None}}, "'robot/x' has None; write its parameters"),
+        ({"min_runtime": "90s"}, "min_runtime is '90s'; write a number of seconds above 0"),
+        ({"min_runtime": float("nan")}, "min_runtime is nan"),
+        ({"min_runtime": Decimal("Infinity")}, "min_runtime is Decimal('Infinity')"),
+        ({"min_runtime": 0}, "min_runtime is 0;"),
+        ({"timeout": -1}, "timeout is -1;"),
+        ({"timeout": True}, "timeout is True;"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_told_in_one_line(how: dict[str, Any], words: str) -> None:
+    async def story() -> None:
+        async with small_fleet("one") as (_, (one,)):
+            with pytest.raises((TypeError, ValueError), match=re.escape(words)):
+                async with hold(one, "x", **{"needs": {"robot/x": {}}, **how}):
+                    pass
+
+    kit.run(story())

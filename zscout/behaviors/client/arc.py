@@ -31,7 +31,7 @@ from typing import Any
 
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.direct import DirectHold
-from zscout.behaviors.client.request import HoldEnd, Needs, OpenArc
+from zscout.behaviors.client.request import HoldEnd, Needs, OpenArc, check_seconds
 from zscout.keyexpr import is_pattern
 from zscout.messages import Done
 from zscout.types import SECOND, Grant, Ns
@@ -119,6 +119,9 @@ class Attempt:
     def __init__(
         self, client: Client, ask: dict[str, Any], *, again: bool = False, timeout: float | None = None
     ) -> None:
+        for what, value in (("timeout", timeout), ("min_runtime", ask.get("min_runtime"))):
+            if value is not None:
+                check_seconds(what, value)
         self._client, self._ask, self._again, self._timeout = client, ask, again, timeout
         self.arc: OpenArc | None = None
         self._anew = False

@@ -18,7 +18,15 @@ from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.identity import checked_comment, this_program
 from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN
-from zscout.behaviors.client.request import CommandRefused, Needs, NoRcm, OpenArc, RequestRefused, amounts
+from zscout.behaviors.client.request import (
+    CommandRefused,
+    Needs,
+    NoRcm,
+    OpenArc,
+    RequestRefused,
+    amounts,
+    check_seconds,
+)
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
@@ -257,7 +265,9 @@ class Client(MovableClient):
         return arc
 
     def _protected(self, min_runtime: float | Decimal | None) -> Decimal:
-        """In seconds; what nobody gave is the fleet's."""
+        """In seconds; what nobody gave is the fleet's. Raises ValueError."""
+        if min_runtime is not None:
+            check_seconds("min_runtime", min_runtime)
         return Decimal(self.fleet.min_runtime) / SECOND if min_runtime is None else Decimal(str(min_runtime))
 
     def _waits(self, wait_for_device: bool | None) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -146,7 +147,7 @@ class OpenArc:
         if notice.state != "running":
             self._close(HoldEnd(notice.outcome or "lost", notice.reason, notice.by), now)
         elif notice.grant != self.grant:
-            self._close(HoldEnd("lost", "it was granted anew"), now)
+            self._close(HoldEnd("lost", "the RCM took this client for gone; it is granted anew"), now)
         self.state = notice.state
         self.reason, self.why = notice.reason, notice.why
         self.outcome, self.by = notice.outcome, notice.by
@@ -281,8 +282,20 @@ class OpenArc:
 
 
 def amounts(needs: Needs) -> dict[str, Amounts]:
-    """Needs as people write them (ints, floats, Decimals), as they are sent. 0.1 means one tenth."""
+    """Needs as people write them (ints, floats, Decimals), as they are sent. 0.1 means one tenth. Raises TypeError."""
+    if not isinstance(needs, Mapping):
+        raise TypeError(f'needs is {needs!r}; write {{"robot/scout33": {{}}}}')
+    for rc, params in needs.items():
+        if not isinstance(params, Mapping):
+            raise TypeError(f'{rc!r} has {params!r}; write its parameters: {{"{rc}": {{}}}}')
     return {rc: {name: Decimal(str(value)) for name, value in params.items()} for rc, params in needs.items()}
+
+
+def check_seconds(what: str, value: Any) -> None:
+    """Raises ValueError for what is no span of time."""
+    is_number = isinstance(value, (int, float, Decimal)) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or value <= 0:
+        raise ValueError(f"{what} is {value!r}; write a number of seconds above 0")
 
 
 class RequestStore:
