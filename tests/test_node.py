@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from tests.mesh.kit import run, until
 from zscout import node as node_module
 from zscout.config.node import Node, load_node
+from zscout.drivers.driver import RcHandle
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import MemoryNetwork
@@ -72,6 +73,27 @@ def test_an_rc_that_fails_ends_its_node(
     logged = next(record for record in caplog.records if record.levelno == logging.ERROR)
     assert logged.message == "robot/a failed"
     assert logged.exc_info is not None
+
+
+def test_a_driver_that_fails_as_it_is_opened_ends_its_node(
+    node: Node, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Unopened(ExclusiveDriver):
+        async def open(self, _rc: RcHandle) -> None:
+            raise KeyError("a fault of the driver")
+
+    monkeypatch.setattr(node_module, "driver_for", lambda _rc: Unopened())
+
+    async def story() -> None:
+        mesh = MemoryNetwork().open("f", Sender("anvil", "node"))
+        with pytest.raises(
+            NodeFailed, match="robot/a can't be opened: KeyError\\('a fault of the driver'\\); see the log"
+        ):
+            await run_services(node, mesh, asyncio.Event())
+        await mesh.close()
+
+    run(story())
+    assert "robot/a can't be opened" in caplog.messages
 
 
 def test_a_component_host_that_fails_ends_its_node(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,7 +88,13 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
                 stall=stall,
                 on_failure=fail,
             )
-            await rc.start()
+            try:
+                await rc.start()
+            except MeshError:
+                raise
+            except Exception as error:
+                log.exception("%s can't be opened", spec.name)
+                raise NodeFailed(f"{spec.name} can't be opened: {error!r}; see the log") from error
             stack.push_async_callback(rc.stop)
             log.info("runs %s (%s)", spec.name, driver_name(spec))
         components = ComponentHost(mesh, node.fleet, node.components, fail)
