@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from tests.hang import HANG
+from tests.live.lab import Lab
 from tests.mesh.kit import run, until
 from zscout import node as node_module
 from zscout.config.node import Node, load_node
@@ -167,3 +169,32 @@ def test_an_rc_that_another_process_of_its_host_offers_is_refused_and_free_when_
     other.kill()
     other.communicate()
     run(begin())
+
+
+@pytest.mark.live
+def test_a_node_ends_though_a_thread_of_a_driver_hangs_in_its_device(tmp_path: Path) -> None:
+    program = (
+        "import asyncio, sys, time\n"
+        "from zscout import node\n"
+        "from zscout.drivers.generic import ExclusiveDriver\n"
+        "class Hung(ExclusiveDriver):\n"
+        "    async def safe(self):\n"
+        "        await asyncio.to_thread(time.sleep, 10_000)\n"
+        "node.driver_for = lambda _rc: Hung()\n"
+        "node.main(sys.argv[1:])\n"
+    )
+    lab = Lab(tmp_path)
+    file = tmp_path / "anvil.toml"
+    file.write_text(
+        '[node]\nhost = "anvil"\nfleet = "fleet.toml"\n[[rc]]\nname = "robot/a"\ndriver = "exclusive"\nsettle = 0.5\n'
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, str(file)], env=lab.env, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    said = iter(process.stderr.readline, "")
+    assert any("is on the mesh" in line for line in said)
+    process.terminate()
+    rest = process.communicate(timeout=HANG)[1]
+    assert process.returncode == 1
+    assert "a thread of a driver hangs: this process ends without it" in rest

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 import sys
+import threading
 from contextlib import AsyncExitStack
 from pathlib import Path
 
@@ -39,6 +41,9 @@ log = logging.getLogger("zscout.node")
 LOOK_FOR_TWIN = 0.5
 ALONE_AFTER = 3.0
 """Seconds after which a node that is linked to nobody says so."""
+
+THREADS_END = 5.0
+"""Seconds that threads of drivers have to end once all else has."""
 
 
 class NodeFailed(Exception):
@@ -135,7 +140,19 @@ async def _main(node: Node) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    await run_node(node, stop)
+    try:
+        await run_node(node, stop)
+    finally:
+        # The interpreter waits for threads, and one of a driver may hang in its device.
+        last = threading.Timer(THREADS_END, _end)
+        last.daemon = True
+        last.start()
+
+
+def _end() -> None:
+    log.warning("a thread of a driver hangs: this process ends without it")
+    logging.shutdown()
+    os._exit(1)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})

@@ -122,6 +122,9 @@ def test_of_two_that_did_not_see_each_other_the_one_that_was_taken_in_first_goes
         await until(lambda: second.instances.state is InstanceState.STANDS_BY)
         assert await confirms(client, grant_of(answer)) == [None]
         assert (told(first), told(second)) == (["begin tally"], [])
+        # As it leaves, the device is the other one's holder's.
+        await second.stop()
+        assert told(second) == []
 
     run(story())
 

@@ -18,7 +18,7 @@ from zscout.keyexpr import Role, Sender
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import Mesh
-from zscout.messages import Grants, RcAsk, RcmState, RcState
+from zscout.messages import Grants, Malformed, RcAsk, RcmState, RcState
 from zscout.types import SECOND, Grant
 
 Story = Callable[[Rcm, ResourceController, Device, Mesh], Awaitable[None]]
@@ -346,3 +346,34 @@ def test_who_waits_is_woken() -> None:
         assert await asyncio.wait_for(waiting, HANG) == query("early")
 
     asyncio.run(story())
+
+
+def test_figures_that_are_no_numbers_are_left_out() -> None:
+    """In a message they would make all of it unreadable."""
+
+    class Odd(Device):
+        def figures(self) -> dict[str, float]:
+            return {"good": 1.5, "nan": float("nan"), "endless": float("inf")}
+
+    async def story() -> None:
+        network = MemoryNetwork()
+        asker, rc = network.open("f", Sender("h", "asker")), await started(network, Odd())
+        reply = await asker.ask_one(asker.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=1)
+        assert reply is not None
+        assert reply.message is not None
+        assert reply.message.figures == {"good": 1.5}
+        await close(rc, asker)
+
+    run(story())
+
+
+def test_what_its_driver_declares_amiss_is_told_before_anybody_is_offered_it() -> None:
+    class Amiss(Device):
+        def parameters(self) -> list[Any]:
+            return ["voltage"]
+
+    async def story() -> None:
+        with pytest.raises(Malformed):
+            await started(MemoryNetwork(), Amiss())
+
+    run(story())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
@@ -185,6 +186,8 @@ class ResourceController:
         if self.directory is not None:
             self._declared.append(self.directory.watch())
         await self.driver.open(self)
+        # What its driver says of it is what others can read, or it is not offered at all. Raises Malformed.
+        messages.decode(messages.encode(self._rc_state([])), messages.RcState)
         self.supervisor.spawn(self._worker())
         self.supervisor.spawn(self._publish_figures())
         self.supervisor.spawn(self._keep_looking())
@@ -222,7 +225,9 @@ class ResourceController:
         for declared in (*self._served, *reversed(self._declared)):
             declared.close()
         await self.supervisor.close()
-        await self._guard(self._make_safe_in_time())
+        # While another instance serves, that one's holder has the device.
+        if self.instances.state is not InstanceState.STANDS_BY or self._at_driver:
+            await self._guard(self._make_safe_in_time())
         # Where a program may still touch the device, another instance is not taken at once.
         self._state.put(self._rc_state([], leaving=not self._last_holder.may_be_direct))
         await self._guard(self.driver.close())
@@ -321,12 +326,16 @@ class ResourceController:
             leader=self._hears and bool(self._leaders),
             # The driver is asked nothing any more: it may be the one that failed.
             capacity={} if leaving else self.driver.capacity(),
-            figures={} if leaving else self.driver.figures(),
+            figures={} if leaving else self._figures(),
             duplicate_of=self.instances.duplicate_of,
             leaving=leaving,
             settle=self._settle / SECOND,
             parameters=None if leaving else self.driver.parameters(),
         )
+
+    def _figures(self) -> messages.Figures:
+        """No message has a number that is none."""
+        return {name: value for name, value in self.driver.figures().items() if math.isfinite(value)}
 
     def _on_proposal(self, query: IncomingQuery[messages.Proposal]) -> None:
         proposal = query.message
@@ -543,7 +552,7 @@ class ResourceController:
         try:
             await action
         except Exception as error:
-            log.exception("%s: its driver failed", self.name)
+            log.exception("%s: its driver failed; unless that recovers by itself, start its node anew", self.name)
             self.fail(f"its driver failed: {error}")
 
     def _apply(self, change: HoldChange) -> None:
@@ -624,9 +633,9 @@ class ResourceController:
 
     async def _publish_figures(self) -> None:
         while True:
-            published = self.driver.figures()
+            published = self._figures()
             await asyncio.sleep(FIGURES_PERIOD)
-            if self.driver.figures() != published or self.mesh.now() - self._published > SAY_AGAIN * SECOND:
+            if self._figures() != published or self.mesh.now() - self._published > SAY_AGAIN * SECOND:
                 self.publish()
 
     async def _keep_looking(self) -> None:
