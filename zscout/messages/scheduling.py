@@ -94,6 +94,8 @@ class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
     client: str | None = None
     who: Who | None = None
     """Who ends it, where that is not its owner."""
+    left: bool = False
+    """Its program, where the ARC is direct, is gone: no RC settles for it."""
 
 
 class Release(Message, frozen=True, tag_field="op", tag="release"):
@@ -102,6 +104,8 @@ class Release(Message, frozen=True, tag_field="op", tag="release"):
     id: str
     client: str | None = None
     who: Who | None = None
+    left: bool = False
+    """As in `Cancel`."""
 
 
 class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):

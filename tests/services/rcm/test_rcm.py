@@ -326,3 +326,19 @@ def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it_ended
         rcm.stop()
 
     run(story())
+
+
+def test_rcs_settle_unless_the_client_says_that_its_program_is_gone() -> None:
+    """One that started anew under its name gives back what it knows nothing of: a program of that may run yet."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"))
+        client = fleet.client("one")
+        for arc, left in (("first", False), ("second", True)):
+            await client.ask(arc, "robot/a", direct=True)
+            await client.do(Release(arc, left=left))
+            assert [one.own for one in fleet.published[-1].revoked] == [left]
+
+    run(story())

@@ -245,7 +245,8 @@ class RcmLink:
         """Gives back a hold, or leaves the queue: returns when that was answered, or was tried a few times.
         `keep_asking` goes on with it then."""
         running = arc.state == "running"
-        self.store.withdrawn[arc.id] = Release(id=arc.id) if running else Cancel(id=arc.id)
+        # What its program touched it has left.
+        self.store.withdrawn[arc.id] = (Release if running else Cancel)(id=arc.id, left=True)
         arc.finish("released" if running else "cancelled", "given up by this client", self.mesh.now())
         self.store.notify(arc)
         for _ in range(END_TRIES):

@@ -263,8 +263,8 @@ class Rcm:
         self._put(number, holders, revoked, instances)
 
     def _is_own(self, effect: HoldEnded) -> bool:
-        """Whether its own client has given this hold back, in the burst that is being decided."""
-        return effect.outcome in (Outcome.RELEASED, Outcome.CANCELLED) and effect.arc in self.requests.given_up
+        """Whether its own client has given this hold back, and its program is gone, in the burst that is decided."""
+        return effect.outcome in (Outcome.RELEASED, Outcome.CANCELLED) and effect.arc in self.requests.left
 
     async def _send_heartbeats(self) -> None:
         """Repeats the last number whenever nothing was published for a while."""

@@ -87,6 +87,8 @@ class RequestHandler:
         """Operations that are not answered yet, by ARC."""
         self.given_up: set[ArcId] = set()
         """ARCs that end in this burst by their own client's will."""
+        self.left: set[ArcId] = set()
+        """Those whose programs are gone: a client that started anew gives up what its former life may use yet."""
         self._batch: dict[ArcId, Requested | Cancelled | Released] = {}
         """Operations of the present burst that are not decided yet."""
         self._deferred: dict[Query, None] = {}
@@ -210,6 +212,8 @@ class RequestHandler:
         self._keep_order(arc)
         if owner == sender:
             self.given_up.add(arc)
+            if operation.left:
+                self.left.add(arc)
             if self.core.arc(arc) is None:
                 self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
         event = Cancelled if isinstance(operation, Cancel) else Released
@@ -278,6 +282,7 @@ class RequestHandler:
         ended = [event for event in batch.values() if not isinstance(event, Requested)]
         self._emit(*ended, *asked)
         self.given_up.clear()
+        self.left.clear()
         self._answer(event.arc for event in ended)
         undecided = [event.request.arc for event in asked if event.request.arc in self.waiting]
         if undecided:
