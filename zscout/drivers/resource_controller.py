@@ -185,13 +185,14 @@ class ResourceController:
         await asyncio.wait({self._read_state()})
         if self.directory is not None:
             self._declared.append(self.directory.watch())
+        # Where another instance is there, its holder has the device: a driver that begins leaves it alone.
+        self.instances.begin()
         await self.driver.open(self)
         # What its driver says of it is what others can read, or it is not offered at all. Raises Malformed.
         messages.decode(messages.encode(self._rc_state([])), messages.RcState)
         self.supervisor.spawn(self._worker())
         self.supervisor.spawn(self._publish_figures())
         self.supervisor.spawn(self._keep_looking())
-        self.instances.begin()
         self._is_open = True
         self._serve()
         self._declared.append(mesh.alive(Token(mesh.me.host, Role.RC, self.name, self.instance)))

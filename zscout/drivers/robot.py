@@ -17,6 +17,7 @@ import msgspec
 from zscout.config.devices import RobotRc
 from zscout.drivers import commands
 from zscout.drivers.driver import Driver, RcDirectory, RcHandle
+from zscout.drivers.instances import InstanceState
 from zscout.mesh import Declaration, Refused, Reply
 from zscout.mesh.supervision import done_within
 from zscout.messages import Command, Done, Figures, Holder, Parameter, RcState
@@ -29,6 +30,8 @@ HALT_TRIES: Final = 4
 """Before the robot counts as lost; it is tried on all the same."""
 PAUSES: Final = (0.05, 2.0)
 """Seconds between halts while its state is unknown: the first, and the longest."""
+LOOK_AGAIN: Final = 0.5
+"""Seconds between two looks whether it still stands by."""
 MAX_WAITING: Final = 16
 RECENT: Final = 64
 """Answers of the radio over which the latency is measured."""
@@ -244,6 +247,10 @@ class RobotDriver(Driver):
         while True:
             await self._unsure.wait()
             self._wake.clear()
+            if self._rc.instances.state is InstanceState.STANDS_BY:
+                # Another host's is used, and its holder has the robot.
+                await asyncio.sleep(LOOK_AGAIN)
+                continue
             if await self._send_urgent(commands.RadioHalt(self._id, self._rc.name), 1):
                 self._unsure.clear()
                 self._rc.recover()
