@@ -119,7 +119,7 @@ class Attempt:
     def __init__(
         self, client: Client, ask: dict[str, Any], *, again: bool = False, timeout: float | None = None
     ) -> None:
-        for what, value in (("timeout", timeout), ("min_runtime", ask.get("min_runtime"))):
+        for what, value in (("timeout", timeout), ("min_runtime", ask["min_runtime"])):
             if value is not None:
                 check_seconds(what, value)
         self._client, self._ask, self._again, self._timeout = client, ask, again, timeout
@@ -211,6 +211,14 @@ class Attempt:
         raise revoked from None
 
 
+_ASKED = ("name", "needs", "priority", "min_runtime", "keep", "direct", "comment", "wait_for_device")
+
+
+def _ask(*values: Any) -> dict[str, Any]:
+    """What `Client.request` is given."""
+    return dict(zip(_ASKED, values, strict=True))
+
+
 def hold(
     client: Client,
     name: str,
@@ -228,15 +236,8 @@ def hold(
     `comment` is shown to others; `wait_for_device` as `Client.request` has it.
 
     Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
-    how: dict[str, Any] = {
-        "priority": priority,
-        "min_runtime": min_runtime,
-        "keep": keep,
-        "direct": direct,
-        "comment": comment,
-    }
-    how["wait_for_device"] = wait_for_device
-    return Attempt(client, {"name": name, "needs": needs} | how, timeout=timeout)
+    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device)
+    return Attempt(client, ask, timeout=timeout)
 
 
 async def holds(
@@ -253,15 +254,8 @@ async def holds(
 ) -> AsyncIterator[Attempt]:
     """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
     without `keep` has had its time."""
-    how: dict[str, Any] = {
-        "priority": priority,
-        "min_runtime": min_runtime,
-        "keep": keep,
-        "direct": direct,
-        "comment": comment,
-    }
-    how["wait_for_device"] = wait_for_device
-    attempt = Attempt(client, {"name": name, "needs": needs} | how, again=True)
+    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device)
+    attempt = Attempt(client, ask, again=True)
     yield attempt
     while attempt.goes_on:
         yield attempt

@@ -14,6 +14,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Final, Protocol
 
 from zscout.behaviors.client.request import CommandRefused, OpenArc
+from zscout.config.devices import SETTLE
 from zscout.messages import Done
 from zscout.types import SECOND, Grant, Ns, RcName
 
@@ -23,7 +24,7 @@ TRY_AGAIN_AFTER: Final = 0.1
 """Seconds after which an RC that did not answer is told again."""
 TELL_TIMEOUT: Final = 0.5
 """Seconds that one `leaving` or `left` waits for an answer."""
-DEFAULT_SETTLE: Final[Ns] = 5 * SECOND
+DEFAULT_SETTLE: Final = SETTLE
 """Where no RC says how long it settles."""
 MARGIN: Final = 10
 """The last tenth of `settle` is for the kernel, and for clocks that run apart."""

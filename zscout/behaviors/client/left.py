@@ -14,6 +14,7 @@ from contextlib import suppress
 
 import msgspec
 
+from zscout.behaviors.client.client import CONFIRM_AGAIN
 from zscout.behaviors.client.direct import DEFAULT_SETTLE, TELL_TIMEOUT, TRY_AGAIN_AFTER
 from zscout.config.fleet import fleet_from_env
 from zscout.config.strict import BadInput
@@ -21,8 +22,6 @@ from zscout.keyexpr import BadName, check_rc, client_of
 from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.messages import Command, Done
 from zscout.types import SECOND, Grant
-
-AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
 
 
 async def tell(mesh: Mesh, rcs: list[str], grant: Grant, patience: float) -> None:
@@ -36,7 +35,7 @@ async def _tell(mesh: Mesh, rc: str, grant: Grant) -> None:
     left = Command(grant=grant, do={"name": "left"}, ttl=1.0)
     while True:
         reply = await mesh.ask_one(mesh.keys.command(rc, mesh.me), left, Done, timeout=TELL_TIMEOUT)
-        if reply is not None and (reply.problem is None or reply.problem.code not in AGAIN):
+        if reply is not None and (reply.problem is None or reply.problem.code not in CONFIRM_AGAIN):
             return
         await asyncio.sleep(TRY_AGAIN_AFTER)
 
