@@ -45,7 +45,7 @@ async def serve(fleet_file: Path) -> None:
     def answer(request: IncomingQuery[StateAsk]) -> None:
         request.answer(NOTICE)
 
-    async with await ZenohMesh.open(fleet.name, Sender("bench", "face"), fleet.mesh) as mesh:
+    async with await ZenohMesh.open(fleet, Sender("bench", "face")) as mesh:
         mesh.serve(key(mesh.keys), StateAsk, answer)
         ready()
         await asyncio.to_thread(sys.stdin.read)

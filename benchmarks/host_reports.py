@@ -82,7 +82,7 @@ async def main(fleet_file: Path, count: int) -> None:
     fleet, rng = load_fleet(fleet_file), random.Random(count)  # noqa: S311
     async with AsyncExitStack() as stack:
         meshes = [
-            await stack.enter_async_context(await ZenohMesh.open(fleet.name, Sender("crowd", f"s{number}"), fleet.mesh))
+            await stack.enter_async_context(await ZenohMesh.open(fleet, Sender("crowd", f"s{number}")))
             for number in range(SESSIONS)
         ]
         hosts = []

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 MAX_NAME = 64
 NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
@@ -185,6 +185,8 @@ class Keys:
     """The keys of one fleet. Arguments must be valid names; each method checks its own."""
 
     fleet: str
+    closed: bool = False
+    """Whether the fleet has certificates: then every question names its sender."""
 
     everything = _Key("**")
     schedule_any = _Key("rcm/schedule/*/*")
@@ -193,9 +195,7 @@ class Keys:
     rc_state_any = _Key("rc/*/*/state")
     frame_any = _Key("rc/*/*/frame")
     load_any = _Key("host/*/load")
-    component_any = _Key("host/*/component")
     rank = _Key("balancer/rank")
-    placer = _Key("placer/component")
     placements = _Key("placer/placements")
     notice_any = _Key("client/*/*/notice")
     requests_any = _Key("client/*/*/requests")
@@ -210,7 +210,6 @@ class Keys:
     rc_state = _rc_key("state")
     frame = _rc_key("frame")
     load = _host_key("load")
-    component = _host_key("component")
     notice = _sender_key("client", "/notice")
     requests = _sender_key("client", "/requests")
     behavior = _sender_key("client", "/behavior")
@@ -227,6 +226,31 @@ class Keys:
 
     def command(self, rc: str, sender: Sender) -> str:
         return f"{self.base}/rc/{check_rc(rc)}/command/{_sender(sender)}"
+
+    def placer(self, sender: Sender) -> str:
+        """Where the component placer is asked."""
+        return self._asked("placer/component", sender)
+
+    def component(self, host: str, sender: Sender) -> str:
+        """Where the node of a host is asked about its components."""
+        return self._asked(f"host/{check_name(host, 'host')}/component", sender)
+
+    def component_any(self, sender: Sender) -> str:
+        return self._asked("host/*/component", sender)
+
+    def _asked(self, key: str, sender: Sender) -> str:
+        # Who is older than certificates serves the key without a sender alone.
+        return f"{self.base}/{key}/{_sender(sender)}" if self.closed else f"{self.base}/{key}"
+
+    def served_placer(self) -> tuple[str, ...]:
+        return self._served("placer/component")
+
+    def served_component(self, host: str) -> tuple[str, ...]:
+        return self._served(f"host/{check_name(host, 'host')}/component")
+
+    def _served(self, key: str) -> tuple[str, ...]:
+        named = f"{self.base}/{key}/*/*"
+        return (named,) if self.closed else (named, f"{self.base}/{key}")
 
     # Liveliness
 
@@ -259,6 +283,8 @@ class Keys:
                 | ["rc", _, _, "command", host, client]
                 | ["client", host, client, "notice" | "requests" | "behavior"]
                 | ["building", host, client, "plan" | "poses"]
+                | ["placer", "component", host, client]
+                | ["host", _, "component", host, client]
             ):
                 return Sender(check_name(host, "host"), check_name(client, "client"))
         raise BadName(f"{key[:200]!r} does not name its sender")
@@ -300,3 +326,132 @@ def client_of(text: str) -> Sender:
 
 def _sender(sender: Sender) -> str:
     return f"{check_name(sender.host, 'host')}/{check_name(sender.client, 'client')}"
+
+
+# Access: what each role may send on each key. The `<host>` in a sender's keys is the name of its certificate
+
+Rank: TypeAlias = Literal["viewer", "client", "operator", "node", "manager", "relay"]
+"""What a name may do in a fleet. A manager is a node that may lead."""
+PEOPLE: Final[frozenset[Rank]] = frozenset({"viewer", "client", "operator"})
+MACHINES: Final[frozenset[Rank]] = frozenset({"node", "manager", "relay"})
+_ALL: Final[frozenset[Rank]] = frozenset({"viewer", "client", "operator", "node", "manager"})
+_USERS: Final = _ALL - {"viewer"}
+_NODES: Final[frozenset[Rank]] = frozenset({"node", "manager"})
+_MANAGERS: Final[frozenset[Rank]] = frozenset({"manager"})
+_NOBODY: Final[frozenset[Rank]] = frozenset()
+
+
+class Access(NamedTuple):
+    """One row of the key space. In `key` stands `{by}` for the name of who asks, `{at}` for that of who serves,
+    publishes or shows a token, `{rc}` for an RC that it may serve; to all others they are `*`."""
+
+    key: str
+    ask: frozenset[Rank] = _NOBODY
+    serve: frozenset[Rank] = _NOBODY
+    publish: frozenset[Rank] = _NOBODY
+    subscribe: frozenset[Rank] = _NOBODY
+    show: frozenset[Rank] = _NOBODY
+    """A liveliness token."""
+
+
+ACCESS: Final = (
+    Access("rcm/schedule/{by}/*", ask=_USERS, serve=_MANAGERS),
+    Access("rcm/grants", publish=_MANAGERS, subscribe=_ALL),
+    Access("rcm/state", ask=_ALL, serve=_MANAGERS),
+    Access("rc/{rc}/vote", ask=_MANAGERS, serve=_NODES),
+    Access("rc/{rc}/command/{by}/*", ask=_USERS, serve=_NODES),
+    # Who asks may ask for a promise: a leader's right.
+    Access("rc/{rc}/state", ask=_MANAGERS, serve=_NODES, publish=_NODES, subscribe=_ALL),
+    Access("rc/{rc}/frame", publish=_NODES, subscribe=_ALL),
+    Access("host/{at}/load", publish=_NODES, subscribe=_ALL),
+    Access("host/{at}/component/{by}/*", ask=_ALL, serve=_NODES),
+    Access("balancer/rank", ask=_ALL, serve=_MANAGERS),
+    Access("placer/component/{by}/*", ask=_ALL, serve=_MANAGERS),
+    Access("placer/placements", publish=_MANAGERS, subscribe=_ALL),
+    Access("client/*/*/notice", publish=_MANAGERS, subscribe=_ALL),
+    Access("client/{at}/*/requests", ask=_MANAGERS, serve=_USERS),
+    Access("client/{at}/*/behavior", publish=_USERS, subscribe=_ALL),
+    Access("recorder/{at}/*/recorded", ask=_ALL, serve=_ALL),
+    Access("building/{at}/*/plan", ask=_ALL, serve=_USERS),
+    Access("building/{at}/*/poses", publish=_USERS, subscribe=_ALL),
+    *(Access(f"alive/{{at}}/{role}/**", show=_ALL) for role in (Role.CLIENT, Role.RECORDER, Role.SESSION)),
+    *(Access(f"alive/{{at}}/{role}/**", show=_NODES) for role in (Role.NODE, Role.LOAD, Role.COMPONENT)),
+    *(Access(f"alive/{{at}}/{role}/**", show=_MANAGERS) for role in (Role.CANDIDATE, Role.RCM)),
+    Access(f"alive/{{at}}/{Role.RC}/{{rc}}/*", show=_NODES),
+)
+"""Every key of the fleet, with who may do what there. What keys can't tell is checked by who answers."""
+
+_SENT: Final[dict[str, tuple[str, ...]]] = {
+    "ask": ("query",),
+    "serve": ("declare_queryable", "reply"),
+    "publish": ("put",),
+    "show": ("liveliness_token",),
+}
+_READ: Final = ("liveliness_query", "declare_liveliness_subscriber")
+_EVERYTHING: Final = [*(kind for kinds in _SENT.values() for kind in kinds), "delete", "declare_subscriber", *_READ]
+
+
+class Member(NamedTuple):
+    """Somebody of a fleet: the name of a machine or a person, and the RCs, or patterns of RCs, that it may serve."""
+
+    name: str
+    ranks: frozenset[Rank]
+    rcs: tuple[str, ...] = ()
+
+
+def access_control(keys: Keys, members: Collection[Member]) -> dict[str, Any]:
+    """Zenoh's `access_control` for a session of this fleet: whoever has no certificate of a member's name may send
+    nothing, a member what its ranks say, under its own name. (Rules have no templates: each name has its own.)"""
+    out = {"id": "out", "permission": "allow", "flows": ["egress"], "messages": _EVERYTHING}
+    read = {"id": "read", "permission": "allow", "flows": ["ingress"], "messages": ["declare_subscriber"]}
+    watch = {"id": "watch", "permission": "allow", "flows": ["ingress"], "messages": list(_READ)}
+    rules: list[dict[str, Any]] = [
+        out | {"key_exprs": [keys.everything]},
+        read | {"key_exprs": [f"{keys.base}/{_filled(row.key)}" for row in ACCESS if row.subscribe]},
+        watch | {"key_exprs": [f"{keys.base}/alive/**"]},
+    ]
+    subjects, policies = [], []
+    for member in members:
+        own = list(_rules(keys, member))
+        rules += own
+        subjects.append({"id": member.name, "cert_common_names": [member.name]})
+        policies.append({"subjects": [member.name], "rules": ["out", "read", "watch", *(rule["id"] for rule in own)]})
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
+
+
+def _rules(keys: Keys, member: Member) -> Iterable[dict[str, Any]]:
+    for act, kinds in _SENT.items():
+        if "relay" in member.ranks:
+            # What others send comes to a site under the name of the relay, which checks it.
+            found = [keys.everything]
+        else:
+            found = [
+                f"{keys.base}/{key}"
+                for row in ACCESS
+                if getattr(row, act) & member.ranks
+                for key in _keys_of(row, member, asks=act == "ask")
+            ]
+        if found:
+            yield {
+                "id": f"{member.name} {act}",
+                "permission": "allow",
+                "flows": ["ingress"],
+                "messages": list(kinds),
+                "key_exprs": found,
+            }
+
+
+def _keys_of(row: Access, member: Member, *, asks: bool) -> list[str]:
+    if asks:
+        return [_filled(row.key, by=member.name)]
+    rcs = map(as_pattern, member.rcs) if "{rc}" in row.key else ["*/*"]
+    return [_filled(row.key, at=member.name, rc=rc) for rc in rcs]
+
+
+def _filled(key: str, *, by: str = "*", at: str = "*", rc: str = "*/*") -> str:
+    return key.format(by=by, at=at, rc=rc)
+
+
+def as_pattern(text: str) -> str:
+    """`kind/name` with `*` for any part of either, as a pattern of RCs (`robot/arm*` as `robot/arm$*`)."""
+    return "/".join(chunk if chunk == "*" else chunk.replace("*", "$*") for chunk in text.split("/"))

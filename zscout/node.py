@@ -52,7 +52,7 @@ class NodeFailed(Exception):
 
 async def run_node(node: Node, stop: asyncio.Event) -> None:
     """Runs a node until `stop`. Raises MeshError where it can't begin, NodeFailed where it can't go on."""
-    async with await ZenohMesh.open(node.fleet.name, Sender(node.host, "node"), node.fleet.mesh) as mesh:
+    async with await ZenohMesh.open(node.fleet, Sender(node.host, "node")) as mesh:
         await run_services(node, mesh, stop)
 
 

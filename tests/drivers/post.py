@@ -51,7 +51,7 @@ class Post:
         name = f"{host}/{client}"
         if name not in self.meshes:
             fleet = self.lab.fleet
-            self.meshes[name] = await ZenohMesh.open(fleet.name, Sender(host, client), fleet.mesh)
+            self.meshes[name] = await ZenohMesh.open(fleet, Sender(host, client))
         return self.meshes[name]
 
     async def rc(self, host: str, name: str, driver: Driver) -> ResourceController:

@@ -67,7 +67,7 @@ class Stand:
     async def __aenter__(self) -> Stand:
         fleet = self.lab.fleet
         self.stall = StallWatch(clock.now).start()
-        self.mesh = await ZenohMesh.open(fleet.name, Sender("bench", "node"), fleet.mesh)
+        self.mesh = await ZenohMesh.open(fleet, Sender("bench", "node"))
         return self
 
     async def __aexit__(self, *exc: object) -> None:

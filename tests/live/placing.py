@@ -49,8 +49,8 @@ class Placing:
         self.client = client
 
     async def ask(self, operation: msgspec.Struct, kind: type[R], host: str | None = None) -> R | Problem:
-        keys = self.client.mesh.keys
-        key = keys.placer if host is None else keys.component(host)
+        keys, me = self.client.mesh.keys, self.client.mesh.me
+        key = keys.placer(me) if host is None else keys.component(host, me)
         async with asyncio.timeout(2 * HANG):
             while True:
                 reply = await self.client.mesh.ask_one(key, operation, kind, timeout=HANG)
@@ -153,7 +153,7 @@ class WitnessRc:
     async def __aenter__(self) -> Self:
         fleet = self.lab.fleet
         self._stall = StallWatch(clock.now).start()
-        self._mesh = await ZenohMesh.open(fleet.name, Sender("devices", "node"), fleet.mesh)
+        self._mesh = await ZenohMesh.open(fleet, Sender("devices", "node"))
         self._rc = ResourceController(
             self._mesh, self.name, self.witness, hold_lease=fleet.timing.hold_lease / SECOND, stall=self._stall
         )

@@ -234,7 +234,7 @@ async def ranked(client: Client, *hosts: str) -> None:
 
 
 async def placer(client: Client, operation: PlaceComponent | MigrateComponent) -> Placement | Problem:
-    reply = await client.mesh.ask_one(client.mesh.keys.placer, operation, Placement, timeout=2 * HANG)
+    reply = await client.mesh.ask_one(client.mesh.keys.placer(client.mesh.me), operation, Placement, timeout=2 * HANG)
     assert reply is not None
     answer = reply.message or reply.problem
     assert answer is not None

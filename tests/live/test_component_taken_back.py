@@ -41,7 +41,7 @@ class Target:
         """What becomes of it then."""
         mesh = node.mesh
         self.token = mesh.alive(Token("b", Role.NODE, "node", "x"))
-        mesh.serve(mesh.keys.component("b"), ComponentOperation, self._asked)
+        mesh.serve(mesh.keys.component("b", mesh.me), ComponentOperation, self._asked)
 
     @classmethod
     async def there(cls, fleet: Fleet, incarnation: int, *, component: bool = True) -> Target:

@@ -83,9 +83,7 @@ def test_who_looks_has_the_newest_frame_and_whoever_publishes_knows(tmp_path: Pa
         async with AsyncExitStack() as stack:
             lab = Lab(tmp_path)
             here, there = [
-                await stack.enter_async_context(
-                    await ZenohMesh.open(lab.fleet.name, Sender(name, "node"), lab.fleet.mesh)
-                )
+                await stack.enter_async_context(await ZenohMesh.open(lab.fleet, Sender(name, "node")))
                 for name in ("here", "there")
             ]
             key = here.keys.frame(GRABBER)
@@ -192,7 +190,7 @@ async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
         two = stack.enter_context(
             MjpegServer(rate=40, picture=lambda number: jpeg(numbered(BLUE + number, grey=False)))
         )
-        leader = await ZenohMesh.open(lab.fleet.name, Sender("leader", "node"), lab.fleet.mesh)
+        leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
         stack.push_async_callback(leader.close)
         rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
         rcm.start(RecoveredState())

@@ -24,7 +24,7 @@ def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(tmp_pat
         async with Lab(tmp_path, lease=0.5) as lab, Stand(lab) as stand:
             rc = await stand.rc("robot/real", Bench())
             client = await lab.client()
-            leader = await ZenohMesh.open(lab.fleet.name, Sender("leader", "node"), lab.fleet.mesh)
+            leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
             rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
             try:
                 # Both answered when they were asked; then one of them died, and nobody saw its token go.

@@ -54,13 +54,14 @@ def test_the_document_names_every_error_code_and_outcome() -> None:
 
 def test_the_document_names_every_key_and_role() -> None:
     keys, sender = Keys("fleet"), Sender("H", "C")
+    both = keys, Keys("fleet", closed=True)
     built = [
         keys.schedule(sender),
         keys.grants,
         keys.rcm_state,
         keys.rank,
-        keys.component("H"),
-        keys.placer,
+        *(keys.component("H", sender) for keys in both),
+        *(keys.placer(sender) for keys in both),
         keys.placements,
         keys.vote("K/N"),
         keys.command("K/N", sender),

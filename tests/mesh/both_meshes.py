@@ -9,10 +9,12 @@ from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from typing import Any, TypeAlias
 
+from msgspec.structs import replace
+
 from tests.mesh import kit
 from tests.mesh.kit import until
 from zscout import messages
-from zscout.config.fleet import MeshConfig
+from zscout.config.fleet import MeshConfig, default_fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.lab.faults.memory import MemoryNetwork
 from zscout.lab.faults.virtual_time import VirtualTimeLoop
@@ -85,7 +87,7 @@ class Zenoh(World):
             port = random.randint(20_000, 60_000)  # noqa: S311
             config = MeshConfig(listen=(f"tcp/127.0.0.1:{port}",), connect=endpoints, multicast=False, lease=self.lease)
             try:
-                mesh = await ZenohMesh.open("test", me, config)
+                mesh = await ZenohMesh.open(replace(default_fleet(), name="test", mesh=config), me)
             except MeshError:  # somebody else's port
                 continue
             self._ports.append(port)

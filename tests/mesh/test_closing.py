@@ -12,6 +12,7 @@ import zenoh
 
 from tests.hang import HANG
 from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Play, Pong, World, token
+from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender
 from zscout.mesh import ZenohMesh, zenoh_mesh
 
@@ -70,7 +71,7 @@ def test_a_caller_that_is_cancelled_while_it_joins_has_the_session_closed(
     monkeypatch.setattr(zenoh, "open", slow)
 
     async def main() -> None:
-        joining = asyncio.create_task(ZenohMesh.open("test", Sender("a", "b")))
+        joining = asyncio.create_task(ZenohMesh.open(default_fleet(), Sender("a", "b")))
         await asyncio.sleep(0)
         if opened_first:
             may_open.set()

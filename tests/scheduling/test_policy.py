@@ -13,7 +13,7 @@ from tests.scheduling.invariants import Ledger
 from tests.scheduling.test_waiting import workload
 from tests.scheduling.validate import validate
 from tests.thorough import times
-from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
+from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy, StrategyName
 from zscout.lab.replay import replay
 from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.capacity import excess
@@ -172,6 +172,66 @@ def test_a_host_has_its_quota(strategy: StrategyName) -> None:
     assert running(core) == {"minea", "theirs"}
     core.handle(3 * SECOND, Released("minea"))
     assert running(core) == {"mineb", "theirs"}
+
+
+def _shared_quota(rcs: int, *owners: str) -> dict[str, tuple[RcQuota, ...]]:
+    quota = RcQuota("arms", frozenset(owners), rcs)
+    return dict.fromkeys(owners, (quota,))
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_a_group_has_its_quota_of_rcs(strategy: StrategyName) -> None:
+    policy = SchedulingPolicy(rc_quotas=_shared_quota(2, "ada", "bob"))
+    core = core_of(strategy, policy, "robot/a", "robot/b", "robot/c", "robot/d")
+    core.handle(0, Requested(request("one", "robot/a", host="ada")), Requested(request("two", "robot/b", host="bob")))
+    core.handle(0, Requested(request("third", "robot/c", host="ada")))
+    core.handle(0, Requested(request("theirs", "robot/d", host="eve")))
+    assert running(core) == {"one", "two", "theirs"}
+    assert str(core._state.queued["third"].reason) == "arms may hold 2 RCs at one time"
+    core.handle(SECOND, Requested(request("operator", "robot/c", priority=10, host="bob")))
+    assert running(core) == {"one", "two", "theirs"}
+    core.handle(2 * SECOND, Released("two"))
+    assert running(core) == {"one", "operator", "theirs"}
+    core.handle(3 * SECOND, Released("operator"))
+    assert running(core) == {"one", "third", "theirs"}
+
+
+@pytest.mark.parametrize("strategy", ALL)
+def test_a_pattern_is_met_by_no_rc_that_its_owner_may_not_hold(strategy: StrategyName) -> None:
+    policy = SchedulingPolicy(barred={"bob": ("robot/arm$*",)})
+    core = core_of(strategy, policy, "robot/arm1", "robot/scout1")
+    core.handle(
+        0, Requested(request("theirs", "robot/*", host="bob")), Requested(request("more", "robot/*", host="bob"))
+    )
+    assert running(core) == {"theirs"}
+    assert core.arc("theirs").needs.keys() == {"robot/scout1"}
+    core.handle(SECOND, Requested(request("mine", "robot/*", host="ada")))
+    assert core.arc("mine").needs.keys() == {"robot/arm1"}
+
+
+@pytest.mark.parametrize("strategy", ALL)
+@pytest.mark.parametrize("seed", range(times(20)))
+def test_no_group_ever_holds_more_rcs_than_its_quota(strategy: StrategyName, seed: int) -> None:
+    draw = random.Random(seed)  # noqa: S311
+    arrivals = tuple(
+        Arrival(one.at, _of_host(one.request, f"h{draw.randint(1, 3)}")) for one in workload(seed).arrivals
+    )
+    work = Workload(workload(seed).rcs, arrivals)
+    owners = {one.request.arc: one.request.client.partition("/")[0] for one in arrivals}
+    most = max(len(one.request.needs) for one in arrivals) + 1
+    held: Counter[str] = Counter()
+
+    def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
+        validate(core)
+        for effect in effects:
+            if isinstance(effect, Granted):
+                held[owners[effect.arc]] += len(effect.rcs)
+                assert held["h1"] + held["h2"] <= most
+            elif isinstance(effect, HoldEnded):
+                held[owners[effect.arc]] -= len(effect.rcs)
+
+    policy = SchedulingPolicy(rc_quotas=_shared_quota(most, "h1", "h2"), patience=PATIENCE)
+    assert not replay(work, watch, strategy=STRATEGIES[strategy](), policy=policy).unserved
 
 
 @pytest.mark.parametrize("strategy", ALL)

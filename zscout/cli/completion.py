@@ -87,7 +87,7 @@ def _on_mesh(find: Callable[[Mesh, str], Awaitable[Iterable[str]]]) -> Completer
 async def components(mesh: Mesh, _parameter: str) -> Iterable[str]:
     from zscout.messages import ListPlacements, Placements
 
-    listed = await mesh.ask_one(mesh.keys.placer, ListPlacements(), Placements, timeout=LOOK)
+    listed = await mesh.ask_one(mesh.keys.placer(mesh.me), ListPlacements(), Placements, timeout=LOOK)
     return {one.component for one in listed.message.components} if listed and listed.message else ()
 
 
@@ -125,7 +125,7 @@ async def shown(mesh: Mesh, _parameter: str) -> Iterable[str]:
 async def _fleet_kinds(mesh: Mesh, _parameter: str) -> Iterable[str]:
     from zscout.messages import ComponentList, ListComponents
 
-    replies = await mesh.ask(mesh.keys.component_any, ListComponents(), ComponentList, timeout=LOOK)
+    replies = await mesh.ask(mesh.keys.component_any(mesh.me), ListComponents(), ComponentList, timeout=LOOK)
     return {kind for reply in replies if reply.message is not None for kind in reply.message.kinds or ()}
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
+from zscout.config.access import MAX_NAMES, AccessPolicy, Ceiling, Names, Quota, Roles, check_access
 from zscout.config.scheduling_policy import DEFAULT, PATIENCE, Preempt, Promise, SchedulingPolicy, StrategyName
 from zscout.config.strict import (
     BadInput,
@@ -24,12 +25,17 @@ from zscout.config.strict import (
     read_toml,
     seconds,
 )
+from zscout.keyexpr import Rank
 from zscout.types import SECOND, Ns
 
 FLEET_VARIABLE: Final = "ZSCOUT_FLEET"
 """Environment variable with the path of the fleet file, for the CLI."""
+KEYS_VARIABLE: Final = "ZSCOUT_KEYS"
+"""Environment variable with the folder of this user's certificate, instead of the file's."""
+KEYS: Final = 'folder = "/etc/zscout/keys"'
 MAX_CANDIDATES: Final = 1_000
 MAX_ENDPOINTS: Final = 256
+MAX_SITES: Final = 64
 MIN_RUNTIME: Final[Ns] = 60 * SECOND
 """Default, in ns."""
 MAX_HOSTS: Final = 1_000
@@ -43,6 +49,7 @@ _ENDPOINT: Final = re.compile(
 _PROTOCOLS: Final = ("tcp", "tls", "udp", "quic", "ws")
 _INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:,@-]{1,64}")
 
+Sites = Annotated[tuple[str, ...], Meta(max_length=MAX_SITES)]
 Endpoints = Annotated[tuple[str, ...], Meta(max_length=MAX_ENDPOINTS)]
 
 
@@ -55,6 +62,22 @@ class MeshConfig(Struct, frozen=True, forbid_unknown_fields=True):
     multicast_address: Annotated[str, key("`ip:port`.")] = "224.0.0.224:7446"
     interface: Annotated[str, key("Network interfaces for multicast.", example="eth0")] = "auto"
     lease: Annotated[float, key("A host that was silent for this long is gone.", 0.2, 30, unit="s")] = 1.0
+    site: Annotated[
+        str | None, key("The site of this host, where relays join several to one fleet.", example="north")
+    ] = None
+    relay: Annotated[
+        tuple[str, ...],
+        key("Makes this host the relay between these sites.", most=MAX_SITES, example=["north", "south"]),
+    ] = ()
+
+
+class SecurityTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [security]: only who has a certificate of the fleet's is let in. `ca.pem`, `cert.pem` and `key.pem` lie
+    in its folder; the certificate's name is the host's, or the person's. [roles] says what each may do."""
+
+    folder: Annotated[
+        str, key("The folder of the certificate, relative to this file; `~` is the home.", example="/etc/zscout/keys")
+    ]
 
 
 class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
@@ -129,6 +152,9 @@ class Fleet(Struct, frozen=True):
     """For how long a hold is protected where its program says nothing."""
     devices: Mapping[str, tuple[str, ...]] = {}
     """The RCs that are expected, by their host."""
+    security: Path | None = None
+    """The folder of this host's or this user's certificate; None: a plain mesh, on which `access` is advice."""
+    access: AccessPolicy = AccessPolicy()
 
     @property
     def operator_priority(self) -> int:
@@ -171,6 +197,23 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
     limits: RcmLimits = RcmLimits()
     timing: Timing = Timing()
     placement: PlacementPolicy = DEFAULT_PLACEMENT
+    security: SecurityTable | None = None
+    roles: Roles = Roles()
+    groups: Annotated[
+        Mapping[str, Names],
+        key("Names that are one to [access] and [quotas].", most=MAX_NAMES, example={"arms": ["bob"]}),
+    ] = {}
+    access: Annotated[
+        Mapping[str, Names],
+        key("RCs that only these names and groups may hold.", most=MAX_NAMES, example={"robot/arm*": ["arms"]}),
+    ] = {}
+    quotas: Annotated[
+        Mapping[str, Quota], key("By name or group.", most=MAX_NAMES, example={"arms": {"rcs": 4, "arcs": 8}})
+    ] = {}
+    ceilings: Annotated[
+        Mapping[Rank, Ceiling],
+        key("By role: client (programs on machines, too), operator.", example={"client": {"priority": 5}}),
+    ] = {}
     devices: Annotated[
         Mapping[str, Annotated[tuple[str, ...], Meta(max_length=MAX_DEVICES)]],
         key("The RCs that are expected there, by host.", most=MAX_HOSTS, example={"anvil": ["robot/scout33"]}),
@@ -180,7 +223,7 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
 def load_fleet(path: Path, named_by: str = "") -> Fleet:
     """Reads a fleet file; an error says what named it. Raises BadInput."""
     try:
-        return _fleet(read_toml(path, FleetFile), Where(str(path)))
+        return _fleet(read_toml(path, FleetFile), Where(str(path)), path.parent)
     except BadInput as error:
         raise (BadInput(f"{error} (named by {named_by})") if named_by else error) from None
 
@@ -196,14 +239,17 @@ def fleet_from_env() -> Fleet:
     return load_fleet(Path(path), f"${FLEET_VARIABLE}") if path else default_fleet()
 
 
-def _fleet(file: FleetFile, top: Where) -> Fleet:
+def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
     table, mesh, at = file.fleet, file.mesh, top / "fleet"
     check_name(table.name, at / "name")
     check_names(table.candidates, at / "candidates")
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")
+    check_sites(mesh, top / "mesh")
     _check_timing(file.timing, mesh.lease, top / "timing")
     _check_devices(file.devices, top / "devices")
+    access = AccessPolicy(file.roles, file.groups, file.access, file.quotas, file.ceilings)
+    check_access(access, top)
     if table.promise != "equals" and (table.strategy != "adaptive" or not table.patience):
         raise (at / "promise").bad(
             f'is "{table.promise}", but only "adaptive" with some patience promises anything',
@@ -217,7 +263,7 @@ def _fleet(file: FleetFile, top: Where) -> Fleet:
         max_running_per_host=file.limits.max_running_per_host or None,
         max_runtime=file.limits.max_runtime or None,
     )
-    return Fleet(
+    fleet = Fleet(
         name=table.name,
         candidates=table.candidates,
         strategy=table.strategy,
@@ -227,8 +273,46 @@ def _fleet(file: FleetFile, top: Where) -> Fleet:
         timing=file.timing,
         placement=file.placement,
         devices=file.devices,
+        security=None if file.security is None else keys_folder(file.security, folder, top),
+        access=access,
         min_runtime=min(table.min_runtime, policy.max_runtime or table.min_runtime),
     )
+    check_security(fleet, top)
+    return fleet
+
+
+def keys_folder(table: SecurityTable, beside: Path, top: Where) -> Path:
+    """The folder of the certificate that this process is to show. Raises BadInput."""
+    text, at = os.environ.get(KEYS_VARIABLE) or table.folder, top / "security" / "folder"
+    if not text or "\0" in text:
+        raise at.bad(f"{quoted(text)} is no folder", f"name one, as in {KEYS}")
+    try:
+        return beside / Path(text).expanduser()
+    except RuntimeError:
+        raise at.bad(f"{quoted(text)} is in nobody's home", f"name a folder, as in {KEYS}") from None
+
+
+def check_security(fleet: Fleet, top: Where) -> None:
+    """Refuses certificates without roles, and what the roles do not allow. Raises BadInput."""
+    if fleet.security is None:
+        return
+    access = fleet.access
+    if not access.roles.manager:
+        raise (top / "roles").bad(
+            "[security] is there, and no host may lead", 'write manager = ["anvil"] under [roles]'
+        )
+    for name in ("listen", "connect"):
+        for number, endpoint in enumerate(getattr(fleet.mesh, name)):
+            if not endpoint.startswith("tls/"):
+                remedy = "write tls/host:port, or remove [security]"
+                raise (top / "mesh" / name).item(number).bad(f"{quoted(endpoint)} is not TLS", remedy)
+    for number, host in enumerate(fleet.candidates):
+        if "manager" not in access.ranks_of(host):
+            raise (top / "fleet" / "candidates").item(number).bad(f"{host} is no manager", "name it so under [roles]")
+    for host, rcs in fleet.devices.items():
+        for rc in rcs:
+            if not access.may_serve(host, rc):
+                raise (top / "devices" / host).bad(f"{host} may not serve {rc}", f"name it under [roles.node], {host}")
 
 
 def _check_devices(devices: Mapping[str, tuple[str, ...]], at: Where) -> None:
@@ -271,6 +355,17 @@ def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: st
         check_unique(endpoints, at / name)
     if not _INTERFACE.fullmatch(interface):
         raise (at / "interface").bad(f"{quoted(interface)} names no interface", 'write "auto", or as in "eth0"')
+
+
+def check_sites(mesh: MeshConfig, at: Where) -> None:
+    """Refuses a relay of fewer than two sites, or of one of its own. Raises BadInput."""
+    if mesh.site is not None:
+        check_name(mesh.site, at / "site")
+    check_names(mesh.relay, at / "relay")
+    if len(mesh.relay) == 1:
+        raise (at / "relay").bad(f"joins {mesh.relay[0]} to nothing", 'name the sites, as in ["north", "south"]')
+    if mesh.relay and mesh.site is not None:
+        raise (at / "site").bad("a relay is of none of its sites", "remove site, or relay")
 
 
 def check_multicast(address: str, where: Where) -> None:

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, Struct, structs
 
+from zscout.config.access import AccessPolicy
 from zscout.config.devices import RcConfig, read_rc
-from zscout.config.fleet import Endpoints, Fleet, check_links, default_fleet, ip_of, load_fleet
+from zscout.config.fleet import (
+    Endpoints,
+    Fleet,
+    SecurityTable,
+    Sites,
+    check_links,
+    check_security,
+    check_sites,
+    default_fleet,
+    ip_of,
+    keys_folder,
+    load_fleet,
+)
 from zscout.config.strict import Where, check_name, check_names, check_unique, key, quoted, read_toml
-from zscout.keyexpr import valid_name
+from zscout.keyexpr import MACHINES, valid_name
 from zscout.messages import MAX_LABELS
 
 MAX_RCS: Final = 1_000
@@ -109,6 +123,10 @@ class NodeMeshTable(Struct, frozen=True, forbid_unknown_fields=True):
     listen: Annotated[Endpoints | None, key("Endpoints of this host.", example=["tcp/0.0.0.0:7447"])] = None
     connect: Annotated[Endpoints | None, key("Endpoints of other hosts.", example=["tcp/anvil:7447"])] = None
     interface: Annotated[str | None, key("Network interface for multicast.", example="eth0")] = None
+    site: Annotated[str | None, key("The site of this host.", example="north")] = None
+    relay: Annotated[
+        Sites | None, key("Makes this host the relay between these sites.", example=["north", "south"])
+    ] = None
 
 
 class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
@@ -119,6 +137,7 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
     rc: Annotated[tuple[dict[str, Any], ...], Meta(max_length=MAX_RCS)] = ()
     """Each is read by itself: which keys it may have is its driver's."""
     recorder: RecorderTable | None = None
+    security: SecurityTable | None = None
     components: ComponentsConfig = ComponentsConfig()
 
 
@@ -141,15 +160,23 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     own = {name: value for name, value in structs.asdict(file.mesh).items() if value is not None}
     mesh = structs.replace(fleet.mesh, **own)
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
+    check_sites(mesh, top / "mesh")
+    security = fleet.security if file.security is None else keys_folder(file.security, folder, top)
+    fleet = structs.replace(fleet, mesh=mesh, security=security)
+    check_security(fleet, top)
     check_names(file.node.labels, top / "node" / "labels")
     for number, kind in enumerate(file.components.kinds or ()):
         check_name(kind, (top / "components" / "kinds").item(number))
     rcs = tuple(read_rc(table, (top / "rc").item(number, table.get("name"))) for number, table in enumerate(file.rc))
     check_unique((rc.name for rc in rcs), top / "rc", "name")
+    leads = file.node.candidate
+    if security is not None:
+        _check_roles(host, (rc.name for rc in rcs), fleet.access, top)
+        leads = leads and "manager" in fleet.access.ranks_of(host)
     return Node(
         host=host,
-        fleet=structs.replace(fleet, mesh=mesh),
-        candidate=file.node.candidate,
+        fleet=fleet,
+        candidate=leads,
         load=file.node.load,
         rcs=rcs,
         recorder=None if file.recorder is None else _recorder(file.recorder, folder, top / "recorder"),
@@ -157,6 +184,17 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         components=file.components,
         state=None if file.node.state is None else _folder(file.node.state, folder, top / "node" / "state", STATE),
     )
+
+
+def _check_roles(host: str, rcs: Iterable[str], access: AccessPolicy, top: Where) -> None:
+    """Raises BadInput."""
+    if not access.ranks_of(host) & MACHINES:
+        remedy = "name it under [roles] of the fleet file, as manager or under node"
+        raise (top / "node" / "host").bad(f"{quoted(host)} is no machine of this fleet", remedy)
+    for number, rc in enumerate(rcs):
+        if not access.may_serve(host, rc):
+            remedy = f"name it at {host} under [roles.node] of the fleet file"
+            raise (top / "rc").item(number, rc).bad(f"{host} may not serve {rc}", remedy)
 
 
 def _folder(text: str, folder: Path, at: Where, example: str) -> Path:

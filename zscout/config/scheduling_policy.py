@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final, Literal, TypeAlias
 
 from zscout.types import SECOND, Ns
@@ -14,6 +16,15 @@ OPERATOR_PRIORITY: Final = 10
 StrategyName: TypeAlias = Literal["priority", "optimal", "adaptive"]
 Preempt: TypeAlias = Literal["always", "after_min_runtime"]
 Promise: TypeAlias = Literal["equals", "all"]
+
+
+@dataclass(frozen=True, slots=True)
+class RcQuota:
+    """How many RCs some owners (hosts and people) together may hold at one time."""
+
+    name: str
+    owners: frozenset[str]
+    rcs: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +42,10 @@ class SchedulingPolicy:
     `all`, what a due ARC is granted at last is not preempted within its minimum runtime either."""
     max_running_per_host: int | None = None
     """ARCs that the clients of one host may have running at one time; None: any number."""
+    rc_quotas: Mapping[str, tuple[RcQuota, ...]] = field(default_factory=lambda: MappingProxyType({}))
+    """By owner: the quotas that bind it."""
+    barred: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: MappingProxyType({}))
+    """By owner: patterns of the RCs that no need of its ARCs is bound to."""
     max_runtime: Ns | None = None
     """Time in ns after which every hold ends as completed, kept or not, whoever's it is; None: never."""
 

@@ -302,9 +302,10 @@ class ResourceController:
         promise = query.message.promise
         if promise is not None:
             self._last_terms.shown(promise, self.holds.term)
-        if promise is not None and not self.holds.promise(promise, self.mesh.now(), above=above):
+        promised = promise is not None and self.holds.promise(promise, self.mesh.now(), above=above)
+        if promise is not None and not promised and not query.message.ordinary:
             raise Refused("old_term", f"{self.name} obeys term {self.holds.term.counter}", self.holds.term)
-        if promise is not None:
+        if promise is not None and promised:
             if query.message.instance in (None, self.instance):
                 self._asked = promise
             self._trace("promise", promised=promise)

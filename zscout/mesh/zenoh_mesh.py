@@ -12,15 +12,17 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Any, Self, TypeVar
+from datetime import UTC, datetime
+from typing import Any, NamedTuple, Self, TypeVar
 
 import zenoh
 from msgspec.structs import replace
 from zenoh.handlers import Callback, RingChannel
 
 from zscout import messages
-from zscout.config.fleet import MeshConfig
-from zscout.keyexpr import Keys, Sender
+from zscout.config.certificates import Certificates, read_certificates
+from zscout.config.fleet import Fleet, MeshConfig
+from zscout.keyexpr import Keys, Member, Sender, access_control
 from zscout.mesh.exchange import MeshError
 from zscout.mesh.relinking import MEETING, Relinking
 from zscout.mesh.renewal import RenewableTransport
@@ -43,14 +45,25 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
     Quality.DATA: {"congestion_control": DROP, "priority": zenoh.Priority.DATA_LOW, "express": False},
     Quality.FRAME: {"congestion_control": DROP, "priority": zenoh.Priority.DATA, "express": True},
 }
+MAX_MESSAGE = 17_000_000
+"""Bytes: a little more than any message of zscout's has."""
+ANY_TLS = "tls/0.0.0.0:0"
 T = TypeVar("T")
 _PORT = re.compile(r":\d+$")
 
 
-def zenoh_config(config: MeshConfig) -> zenoh.Config:
+class Security(NamedTuple):
+    """What makes a session one of a closed fleet."""
+
+    certificates: Certificates
+    keys: Keys
+    members: tuple[Member, ...]
+
+
+def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.Config:
     """The Zenoh settings behind a `[mesh]` table, for one session."""
     settings: dict[str, Any] = {
-        "mode": "peer",
+        "mode": "router" if config.relay else "peer",
         "id": increasing_id(),
         "scouting/multicast/enabled": config.multicast,
         "scouting/multicast/address": config.multicast_address,
@@ -64,34 +77,78 @@ def zenoh_config(config: MeshConfig) -> zenoh.Config:
         # processor time, Zenoh's own sending threads stand still as well, and any burst would cost a sound link.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(config.lease * 1_000_000),
         "transport/link/tx/queue/size": {"interactive_high": CONTROL_BATCHES},
+        # What is greater is not read to its end: whoever sends it would fill this process's memory.
+        "transport/link/rx/max_message_size": MAX_MESSAGE,
         "transport/shared_memory/enabled": False,
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
     }
+    if config.site is not None:
+        settings["region_name"] = config.site
+    if config.relay:
+        regions = [{"filters": [{"region_names": [site]}]} for site in config.relay]
+        settings["gateway"] = {"south": regions}
     if config.listen:
         settings["listen/endpoints"] = list(config.listen)
+    elif security is not None:
+        settings["listen/endpoints"] = [ANY_TLS]
     if config.connect:
         settings["connect/endpoints"] = list(config.connect)
+    if security is not None:
+        settings |= _closed(security)
     result = zenoh.Config()
     for key, value in settings.items():
         result.insert_json5(key, json.dumps(value))
     return result
 
 
+def _closed(security: Security) -> dict[str, Any]:
+    """That only members of the fleet are let in, and what each may send. Each of these is needed."""
+    own = security.certificates
+    return {
+        # Else a peer dials whoever is announced at an address without TLS, and talks to it.
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(own.ca),
+            "listen_private_key": str(own.key),
+            "listen_certificate": str(own.cert),
+            "connect_private_key": str(own.key),
+            "connect_certificate": str(own.cert),
+            "enable_mtls": True,
+            # A name stands for a machine or a person, not for an address: the rules below go by it.
+            "verify_name_on_connect": False,
+            # A link that was good when it was made stays: certificates are renewed in place.
+            "close_link_on_expiration": False,
+        },
+        "access_control": access_control(security.keys, security.members),
+    }
+
+
 class ZenohMesh(Mesh):
     """The mesh over a Zenoh session of this process."""
 
     @classmethod
-    async def open(cls, fleet: str, me: Sender, config: MeshConfig | None = None) -> Self:
-        """Joins the mesh of `fleet`. Raises MeshError where an address can't be had."""
-        config = config or MeshConfig()
-        openings = [functools.partial(_open, config)]
+    async def open(cls, fleet: Fleet, me: Sender) -> Self:
+        """Joins the mesh of `fleet`. Raises MeshError where an address can't be had, BadInput for certificates that are
+        none or another's."""
+        config, keys = fleet.mesh, Keys(fleet.name, closed=fleet.security is not None)
+        security = None if fleet.security is None else _security(fleet, keys, me)
+        openings = [functools.partial(_open, config, security)]
         if config.listen:
             # Its addresses are to be had again once the session that listens there is closed. Until then one on other
             # ports hears from that session who else is there.
             own = tuple(one.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for one in config.listen)  # noqa: S104
             ports = tuple(_PORT.sub(":0", one) for one in config.listen)
-            openings.insert(0, functools.partial(_open, replace(config, listen=ports, connect=(*config.connect, *own))))
-        return cls(RenewableTransport(await _open(config), openings), Keys(fleet), me, clock.now)
+            beside = replace(config, listen=ports, connect=(*config.connect, *own))
+            openings.insert(0, functools.partial(_open, beside, security))
+        return cls(RenewableTransport(await _open(config, security), openings), keys, me, clock.now)
+
+
+def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
+    """Raises BadInput."""
+    assert fleet.security is not None  # noqa: S101 - its caller has looked
+    own = read_certificates(fleet.security)
+    own.check(datetime.now(UTC), me.host)
+    return Security(own, keys, tuple(fleet.access.members()))
 
 
 def increasing_id() -> str:
@@ -101,8 +158,8 @@ def increasing_id() -> str:
     return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
 
 
-async def _open(config: MeshConfig) -> Transport:
-    opening = _in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config)))
+async def _open(config: MeshConfig, security: Security | None) -> Transport:
+    opening = _in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config, security)))
     try:
         session = await asyncio.wrap_future(opening)
     except asyncio.CancelledError:
@@ -114,20 +171,20 @@ async def _open(config: MeshConfig) -> Transport:
     except zenoh.ZError as error:
         raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
     try:
-        return ZenohTransport(session, _relinking(session, config) if config.multicast else None)
+        return ZenohTransport(session, _relinking(session, config, security) if config.multicast else None)
     except BaseException:
         _in_thread("closes the mesh", session.close)
         raise
 
 
-def _relinking(session: zenoh.Session, config: MeshConfig) -> Relinking:
+def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | None) -> Relinking:
     def meeting(addresses: Sequence[str]) -> zenoh.Config:
-        settings = zenoh_config(replace(config, multicast=False, connect=tuple(addresses)))
+        settings = zenoh_config(replace(config, multicast=False, connect=tuple(addresses)), security)
         settings.insert_json5("listen/endpoints", "[]")
         settings.insert_json5("scouting/gossip/autoconnect", '{"peer": []}')
         return settings
 
-    return Relinking(session, zenoh_config(config), meeting)
+    return Relinking(session, zenoh_config(config, security), meeting)
 
 
 def _in_thread(name: str, call: Callable[[], T]) -> Future[T]:

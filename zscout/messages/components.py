@@ -52,6 +52,8 @@ class ComponentSpec(Message, frozen=True):
     """Bytes that it may use with all its processes; 0: as many as there are."""
     cpu_limit: Figure = 0.0
     """Cores that it may use with all its processes; 0: as many as there are."""
+    owner: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    """Who had it placed, by the name of a certificate: set by the placer. Empty on a mesh without."""
 
 
 # To a node

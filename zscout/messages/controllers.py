@@ -66,6 +66,9 @@ class RcAsk(Message, frozen=True):
     the jump is no reason to refuse it then, if its token is seen."""
     instance: str | None = None
     """That of the RC whose token led to this question: another that answers is not meant, and may not be seen."""
+    ordinary: bool = False
+    """Whether who does not promise answers all the same, with the term that it obeys, instead of `old_term`: an error
+    travels under the key of the question, and where that has a wildcard access control lets none through."""
 
 
 class EndedHold(Message, frozen=True):

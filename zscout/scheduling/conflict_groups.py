@@ -45,6 +45,8 @@ class _Search:
         """Bits of the RCs whose watchers come."""
         self._started: Counter[str] = Counter()
         """ARCs of each owner that might start, where there is a quota."""
+        self._taken: Counter[str] = Counter()
+        """RCs that these would hold, likewise."""
         self._shared_taken = 0
         """Sharable RCs where one ARC was already let past the starving ones; a second was not checked."""
 
@@ -116,7 +118,13 @@ class _Search:
         quota_left = self.state.quota_left(arc)
         if quota_left is not None:
             self._started[arc.owner] += 1
-        return quota_left is None or self._started[arc.owner] <= quota_left
+        if quota_left is not None and self._started[arc.owner] > quota_left:
+            return False
+        if arc.owner in self.state.policy.rc_quotas:
+            if self.state.rc_quota(arc, self._taken) is not None:
+                return False
+            self._taken[arc.owner] += len(arc.request.needs)
+        return True
 
     def _note_preemptible(self, arc: Arc) -> None:
         """Notes the running ARCs that might have to end for `arc`."""

@@ -14,6 +14,7 @@ comes back with what follows from them: votes, and a `Tick` at the latest when `
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
@@ -44,7 +45,7 @@ class Core:
 
     def __init__(self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT) -> None:
         """The strategy is `priority` unless another is given."""
-        self.strategy, self.policy = strategy or Priority(), policy
+        self.strategy = strategy or Priority()
         self._state = SchedulerState(policy)
         self._votes = self._state.votes
         self.term: Term = NO_TERM
@@ -83,6 +84,15 @@ class Core:
                 self.wait(arc, _claimed_by(other))
         self._set_wake()
         return self._effects
+
+    @property
+    def policy(self) -> SchedulingPolicy:
+        return self._state.policy
+
+    @policy.setter
+    def policy(self, policy: SchedulingPolicy) -> None:
+        """What runs goes on; the next pass goes by the new one."""
+        self._state.policy = policy
 
     # The present state
 
@@ -126,6 +136,14 @@ class Core:
         """The ARCs of one client, those that wait first: so none of them profits from the others' end."""
         arcs = self._state.arcs_of(client)
         return [arc.id for arc in sorted(arcs, key=lambda arc: (arc.hold is not None, arc.entry))]
+
+    def arcs(self) -> list[ArcId]:
+        """All ARCs, those that wait first."""
+        return [arc.id for arc in self._state.all_arcs()]
+
+    def arcs_of_owners(self, owners: Collection[str]) -> list[ArcId]:
+        """The ARCs of all clients of these hosts and people."""
+        return [arc.id for arc in self._state.all_arcs() if arc.owner in owners]
 
     def at_place(self, place: Place) -> list[ArcId]:
         """The ARCs of this place: one, or more where clients claim the same after a takeover."""

@@ -38,8 +38,8 @@ class Fitness(IntEnum):
 
 def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None, *, without: int = 0, claimed: int = 0) -> bool:
     """Binds `arc` to the best RCs there are but those of `without`; others are bound to those of `claimed` already (bit
-    masks). False: there is no such binding; the old one stays."""
-    taken = without | arc.named_mask
+    masks), and some its owner may not hold. False: there is no such binding; the old one stays."""
+    taken = without | state.barred(arc) | arc.named_mask
     options: dict[Need, list[tuple[int, float, int, Rc]]] = {}
     for need in arc.patterns:
         matching = (rc for rc in state.matching(need) if rc.present and not rc.bit & taken)

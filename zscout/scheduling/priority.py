@@ -46,7 +46,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Final, Literal, TypeAlias
 
-from zscout.config.scheduling_policy import StrategyName
+from zscout.config.scheduling_policy import RcQuota, StrategyName
 from zscout.scheduling.model import Arc, ArcState, Rank, Rc, absences, union
 from zscout.scheduling.patterns import bind, no_match
 from zscout.scheduling.reason import SHOWN, SHOWN_CHOICES, Reason, ReasonCode, of_rcs
@@ -232,7 +232,7 @@ MAX_REPORTED: Final = 4
 """To how many of an RC's watchers a new holder is reported at once; for the others `Core.arc` has it. In a
 long queue every grant would else be reported to every ARC."""
 
-_Verdict: TypeAlias = Inadmissible | VotesNeeded | Admissible | Literal["off limits", "over quota"]
+_Verdict: TypeAlias = Inadmissible | VotesNeeded | Admissible | RcQuota | Literal["off limits", "over quota"]
 
 
 class Priority(Strategy):
@@ -345,6 +345,8 @@ class Pass:
             return obstacle
         if self.state.quota_left(arc) == 0:
             return "over quota"
+        if (quota := self.state.rc_quota(arc)) is not None:
+            return quota
         conflict = self.reserved.conflict(arc) if self.reserved is not None else None
         if conflict is not None:
             return conflict
@@ -374,6 +376,9 @@ class Pass:
                 self.index.put(arc, ArcState.READY)
                 quota = self.state.policy.max_running_per_host or 0
                 self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=arc.owner, number=quota))
+            case RcQuota(name, _, most):
+                self.index.put(arc, ArcState.READY)
+                self.actions.wait(arc, Reason(ReasonCode.RC_QUOTA, detail=name, number=most))
             case "off limits":
                 self._defer(arc, check, ArcState.DEFERRED)
                 self.actions.wait(arc, VOTING, settled=False)

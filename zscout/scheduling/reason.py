@@ -36,6 +36,8 @@ class ReasonCode(StrEnum):
     """The RC is reserved for `by`, which has waited too long."""
     QUOTA = "quota"
     """`detail`, its host, has its quota of ARCs running: `number`."""
+    RC_QUOTA = "rc_quota"
+    """With it `detail`, a name or a group, would hold more RCs than its quota: `number`."""
     VOTING = "voting"
     """Votes on it, or on one that ranks before it, are out."""
     SEARCHING = "searching"
@@ -209,6 +211,7 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
         f"{one.rcs[0]} is kept for {one.by[0]}, whose time to wait is over before this ends"
     ),
     ReasonCode.QUOTA: lambda one: f"host {one.detail} has {one.number} ARCs running, its quota",
+    ReasonCode.RC_QUOTA: lambda one: f"{one.detail} may hold {one.number} RCs at one time",
     ReasonCode.VOTING: lambda _: "votes are out",
     ReasonCode.SEARCHING: lambda _: "a better schedule is sought",
     ReasonCode.EXPIRED: lambda _: "its minimum runtime is over",

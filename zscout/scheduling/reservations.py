@@ -92,15 +92,25 @@ class Reservations:
         RC if none is left."""
         rcs = list(self._state.rcs_in(arc.named_mask)) if arc.patterns else list(arc.rcs)
         for need in arc.patterns:
-            left = [rc for rc in self._state.matching(need) if rc.present and rc not in rcs]
+            matching = self._state.matching(need)
+            left = [rc for rc in matching if rc.present and rc not in rcs and not rc.bit & self._state.barred(arc)]
             rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc), rc.bit), default=Rc(need, 0)))
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:
         """When its owner has room for `arc`."""
-        if self._state.quota_left(arc) != 0:
-            return self._state.now
-        return min(one.known_end() for one in self._state.running.values() if one.owner == arc.owner)
+        state, ends = self._state, [float(self._state.now)]
+        if state.quota_left(arc) == 0:
+            ends.append(min(one.known_end() for one in state.running.values() if one.owner == arc.owner))
+        for quota in state.policy.rc_quotas.get(arc.owner, ()):
+            running = [one for one in state.running.values() if one.owner in quota.owners]
+            held = sum(len(one.rcs) for one in running)
+            for one in sorted(running, key=lambda one: one.known_end()):
+                if held + len(arc.request.needs) <= quota.rcs:
+                    break
+                ends.append(one.known_end())
+                held -= len(one.rcs)
+        return max(ends)
 
     def _free_from(self, rc: Rc, arc: Arc) -> float:
         """When `rc` has room for `arc` at the latest; infinite where that is not known."""

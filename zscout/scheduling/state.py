@@ -11,11 +11,12 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from operator import itemgetter
+from types import MappingProxyType
 from typing import Protocol
 
 from msgspec import structs
 
-from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName
+from zscout.config.scheduling_policy import DEFAULT, RcQuota, SchedulingPolicy, StrategyName
 from zscout.keyexpr import matcher
 from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc, union
 from zscout.scheduling.reason import Reason
@@ -145,6 +146,8 @@ class SchedulerState:
         self._matching: dict[Need, list[Rc]] = {}
         self.running_by_owner: Counter[str] = Counter()
         """How many ARCs of each owner run."""
+        self.held_by_owner: Counter[str] = Counter()
+        """How many RCs they hold."""
         self._by_bit: list[Rc] = []
         self._clients: dict[ClientId, dict[ArcId, Arc]] = {}
         self.entries = 0
@@ -213,6 +216,11 @@ class SchedulerState:
 
     def arc(self, arc: ArcId) -> Arc | None:
         return self.running.get(arc) or self.queued.get(arc) or self.held_back.get(arc)
+
+    def all_arcs(self) -> Iterator[Arc]:
+        """Those that wait first."""
+        for arcs in (self.queued, self.held_back, self.running):
+            yield from arcs.values()
 
     def join(self, name: RcName, *, sharable: bool) -> None:
         rc = self.rc(name)
@@ -400,10 +408,24 @@ class SchedulerState:
             return None
         return max(0, quota - self.running_by_owner[arc.owner])
 
+    def rc_quota(self, arc: Arc, starting: Mapping[str, int] = MappingProxyType({})) -> RcQuota | None:
+        """The quota of RCs that has no room for `arc`, beside the RCs of each owner that are `starting` as well."""
+        for quota in self.policy.rc_quotas.get(arc.owner, ()):
+            held = sum(self.held_by_owner[owner] + starting.get(owner, 0) for owner in quota.owners)
+            if held + len(arc.request.needs) > quota.rcs:
+                return quota
+        return None
+
+    def barred(self, arc: Arc) -> int:
+        """Bits of the RCs to which no pattern of `arc` is bound."""
+        patterns = self.policy.barred.get(arc.owner, ()) if arc.patterns else ()
+        return union(rc.bit for pattern in patterns for rc in self.matching(pattern))
+
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
         self.version += 1
         self.running_by_owner[arc.owner] += 1
+        self.held_by_owner[arc.owner] += len(arc.rcs)
         for rc in arc.rcs:
             rc.holders[arc.id] = arc
 
@@ -411,8 +433,9 @@ class SchedulerState:
         del self.running[arc.id]
         self.version += 1
         self.running_by_owner[arc.owner] -= 1
+        self.held_by_owner[arc.owner] -= len(arc.rcs)
         if not self.running_by_owner[arc.owner]:
-            del self.running_by_owner[arc.owner]
+            del self.running_by_owner[arc.owner], self.held_by_owner[arc.owner]
         for rc in arc.rcs:
             del rc.holders[arc.id]
 

@@ -28,7 +28,7 @@ class FakePlacer:
         self.mesh, self.client = (network.open("test", Sender(host, "x")) for host in "ab")
         self.operations: list[PlacerOperation] = []
         self._answer = answer
-        self._served = self.mesh.serve(self.mesh.keys.placer, PlacerOperation, self._on_query)
+        self._served = self.mesh.serve(self.mesh.keys.placer(self.mesh.me), PlacerOperation, self._on_query)
         self.publisher = self.mesh.publisher(self.mesh.keys.placements, Placements)
 
     def _on_query(self, query: IncomingQuery[PlacerOperation]) -> None:

@@ -71,7 +71,7 @@ class Hosts:
 
     async def ask(self, host: str, operation: msgspec.Struct, kind: type[R]) -> R | Problem:
         """The answer of a host, which must come."""
-        key = self.client.mesh.keys.component(host)
+        key = self.client.mesh.keys.component(host, self.client.mesh.me)
         async with asyncio.timeout(2 * HANG):
             while True:
                 reply = await self.client.mesh.ask_one(key, operation, kind, timeout=HANG)

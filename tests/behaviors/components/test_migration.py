@@ -44,7 +44,7 @@ def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
         assert (client.mesh.now() - began) / SECOND == pytest.approx(RESTORE_TIMEOUT, abs=1.1)
 
         def serve() -> None:
-            node.serve(node.keys.component("b"), ComponentOperation, lambda query: query.answer(STANDS_BY))
+            node.serve(node.keys.component("b", node.me), ComponentOperation, lambda query: query.answer(STANDS_BY))
 
         asyncio.get_running_loop().call_later(1, serve)
         await move._give(b"", [])
@@ -70,7 +70,7 @@ def test_where_the_rcm_refuses_the_hand_over_the_other_one_is_stopped() -> None:
                 view = replace(STANDS_BY, phase=phase, ended="stopped" if phase == "ended" else None)
                 query.answer(ComponentList("b", [view]) if listed else view)
 
-            node.serve(node.keys.component("b"), ComponentOperation, answer)
+            node.serve(node.keys.component("b", node.me), ComponentOperation, answer)
             token = node.alive(Token("b", Role.NODE, "node", "i"))
             moving = asyncio.ensure_future(
                 OutgoingMove(client, Counter({}), gate, MoveComponent("c", 1, "b", 2)).carry_out()
@@ -94,7 +94,7 @@ def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
         node = network.open("f", Sender("b", "node"))
         token = node.alive(Token("b", Role.NODE, "node", "i"))
         dies: list[asyncio.Task[None]] = []
-        key = node.keys.component("b")
+        key = node.keys.component("b", node.me)
         node.serve(key, ComponentOperation, lambda _: dies.append(asyncio.ensure_future(node.close())))
         await asyncio.sleep(1)
         gate = SafePointGate()

@@ -71,7 +71,7 @@ class FakeNode:
 
     def start(self) -> None:
         keys, mesh = self.mesh.keys, self.mesh
-        mesh.serve(keys.component(self.host), ComponentOperation, self._on_query)
+        mesh.serve(keys.component(self.host, mesh.me), ComponentOperation, self._on_query)
         self.reporter = mesh.alive(Token(self.host, Role.LOAD, "load", "l1"))
         self.token = mesh.alive(Token(self.host, Role.NODE, "node", self.instance))
         self._numbers = itertools.count(1)
@@ -178,7 +178,7 @@ class PlacerFleet:
     async def ask(self, operation: PlacerOperation | RankAsk, kind: type[R], timeout: float = 90) -> R:
         """The answer of placer or balancer. Raises Refusal."""
         keys = self.watcher.keys
-        key = keys.rank if isinstance(operation, RankAsk) else keys.placer
+        key = keys.rank if isinstance(operation, RankAsk) else keys.placer(self.client.me)
         reply = await self.watcher.ask_one(key, operation, kind, timeout=timeout)
         assert reply is not None, "no answer"
         if reply.message is None:

@@ -220,9 +220,9 @@ def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -
                 request.answer(Placements(TERM, [placement("counter", "running", "anvil", 1)]))
                 asked.set()
 
-            served = mesh.serve(mesh.keys.placer, PlacerOperation, answer)
+            served = mesh.serve(mesh.keys.placer(mesh.me), PlacerOperation, answer)
             fleet = lab.fleet
-            async with await ZenohMesh.open(fleet.name, Sender("here", "recorder"), fleet.mesh) as ears:
+            async with await ZenohMesh.open(fleet, Sender("here", "recorder")) as ears:
                 with Timeline("lab", path=path) as timeline:
                     there, stop = asyncio.Event(), asyncio.Event()
                     show = timeline.hosts.lanes.show

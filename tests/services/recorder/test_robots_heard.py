@@ -50,7 +50,7 @@ def test_who_takes_no_pictures_does_not_look(tmp_path: Path) -> None:
             publisher = speaker.frame_publisher(speaker.keys.frame(CAMERA))
             publisher.follow(watched.put_nowait)
             here = Sender("here", "ears")
-            async with await ZenohMesh.open(lab.fleet.name, here, lab.fleet.mesh) as ears:
+            async with await ZenohMesh.open(lab.fleet, here) as ears:
                 with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
                     heard, offered, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
                     timeline.robots.behavior = lambda *_: heard.set()  # type: ignore[method-assign]
@@ -106,7 +106,7 @@ def test_a_recorder_sees_what_robots_do(tmp_path: Path) -> None:
             assert blind.stdin is not None
             blind.stdin.close()
             assert await asyncio.to_thread(blind.wait, HANG) == 0
-            async with await ZenohMesh.open(lab.fleet.name, Sender("here", "recorder"), lab.fleet.mesh) as ears:
+            async with await ZenohMesh.open(lab.fleet, Sender("here", "recorder")) as ears:
                 with Timeline("lab", path=path) as timeline:
                     stop = asyncio.Event()
                     running = asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop))

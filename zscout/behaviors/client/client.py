@@ -27,6 +27,7 @@ from zscout.behaviors.client.request import (
     amounts,
     check_seconds,
 )
+from zscout.config.certificates import read_certificates
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
@@ -101,10 +102,14 @@ class Client(MovableClient):
     @classmethod
     async def _connect(cls, name: str | None, fleet: Fleet | None, host: str | None) -> Self:
         fleet = fleet or fleet_from_env()
-        host = host or os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
+        machine = valid_name(socket.gethostname())
+        if fleet.security is not None:
+            # Keys have the certificate's name: of this machine, or of who runs this program.
+            host = host or read_certificates(fleet.security).name
+        host = host or os.environ.get("ZSCOUT_HOST") or machine
         me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
-        client = cls(await ZenohMesh.open(fleet.name, me, fleet.mesh), fleet)
-        client.who = this_program(host)
+        client = cls(await ZenohMesh.open(fleet, me), fleet)
+        client.who = this_program(host if fleet.security is None else machine)
         return client.start()
 
     async def __aenter__(self) -> Self:

@@ -44,7 +44,7 @@ async def _main(env: Mapping[str, str]) -> None:
     fleet, me = fleet_from_env(), client_of(env["ZSCOUT_CLIENT"])
     rcs = [check_rc(rc) for rc in env["ZSCOUT_RCS"].split()]
     grant = msgspec.json.decode(env["ZSCOUT_GRANT"], type=Grant)
-    mesh = await ZenohMesh.open(fleet.name, me, fleet.mesh)
+    mesh = await ZenohMesh.open(fleet, me)
     try:
         await tell(mesh, rcs, grant, (fleet.timing.hold_lease + DEFAULT_SETTLE) / SECOND)
     finally:

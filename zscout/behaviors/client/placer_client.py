@@ -120,7 +120,11 @@ class PlacerClient:
         """One query; None: no answer, or the placer can't answer now. Raises RequestRefused."""
         timeout = TIMEOUT + (operation.wait if isinstance(operation, PlacementOperation) else 0.0)
         replies = await self.mesh.ask(
-            self.mesh.keys.placer, operation, kind, timeout=timeout, enough=lambda reply: reply.message is not None
+            self.mesh.keys.placer(self.mesh.me),
+            operation,
+            kind,
+            timeout=timeout,
+            enough=lambda reply: reply.message is not None,
         )
         for reply in replies:
             if reply.message is not None:

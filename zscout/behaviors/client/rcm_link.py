@@ -120,7 +120,8 @@ class RcmLink:
 
     def _promise(self, request: IncomingQuery[RcAsk], *, above: bool) -> None:
         promise = request.message.promise
-        if promise is not None and not self.accept(promise, above=above):
+        promised = promise is None or self.accept(promise, above=above)
+        if not promised and not request.message.ordinary:
             raise Refused("old_term", f"this client obeys term {self.term.counter}", self.term)
         request.answer(ClientRequests(client=str(self.mesh.me), requests=self.store.open_requests(), term=self.term))
 

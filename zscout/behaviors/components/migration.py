@@ -181,5 +181,5 @@ class OutgoingMove:
 
     async def _ask(self, operation: Operation, kind: type[R], timeout: float) -> R | Problem | None:
         mesh = self._client.mesh
-        reply = await mesh.ask_one(mesh.keys.component(self.to), operation, kind, timeout=timeout)
+        reply = await mesh.ask_one(mesh.keys.component(self.to, mesh.me), operation, kind, timeout=timeout)
         return None if reply is None else reply.message or reply.problem

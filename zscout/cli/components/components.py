@@ -154,7 +154,9 @@ class Listing:
 
 async def ask_nodes(client: Client, asked: ListComponents) -> list[ComponentList]:
     """The lists of the nodes that answer in time, by host."""
-    replies = await client.mesh.ask(client.mesh.keys.component_any, asked, ComponentList, timeout=ASK_NODES)
+    replies = await client.mesh.ask(
+        client.mesh.keys.component_any(client.mesh.me), asked, ComponentList, timeout=ASK_NODES
+    )
     lists = (reply.message for reply in replies if reply.message is not None)
     return sorted(lists, key=lambda one: one.host)
 

@@ -109,7 +109,7 @@ class Reader:
         """What is new at its host; None where that does not answer, or knows nothing of it."""
         if self._host is None:
             return None
-        key = self._client.mesh.keys.component(self._host)
+        key = self._client.mesh.keys.component(self._host, self._client.mesh.me)
         reply = await self._client.mesh.ask_one(key, ReadOutput(self._name, self._at), Output, timeout=READ_TIMEOUT)
         output = reply.message if reply is not None else None
         if output is None or output.incarnation < self._incarnation:
@@ -132,7 +132,7 @@ class Reader:
             return None
         mesh = self._client.mesh
         asked = ReadOutput(self._name)
-        replies = await mesh.ask(mesh.keys.component_any, asked, Output, timeout=READ_TIMEOUT)
+        replies = await mesh.ask(mesh.keys.component_any(mesh.me), asked, Output, timeout=READ_TIMEOUT)
         found = [(one.message.incarnation, mesh.keys.host_of(one.key)) for one in replies if one.message]
         self._host = max(found)[1] if found else self._host
         return await self._read() if found else None

@@ -58,11 +58,12 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
                 ("put", own.grants, "holders of each RC touched, revocations, heartbeat"),
                 ("put", own.notice_any, "what becomes of each ARC, to its client"),
                 ("query", own.rank, "the best hosts for a component"),
-                ("query", own.placer, "place, stop, migrate, drain, uncordon, list"),
+                ("query", own.served_placer()[0], "place, stop, migrate, drain, uncordon, list"),
                 ("put", own.placements, "how components stand, at each change"),
             ]
         case Role.NODE:
-            found = [("query", own.component(token.host), "components here: start, stop, list, logs, move")]
+            [named, *_] = own.served_component(token.host)
+            found = [("query", named, "components here: start, stop, list, logs, move")]
         case Role.RC:
             found = [
                 ("query", own.command_any(token.name), "do this, under a grant"),

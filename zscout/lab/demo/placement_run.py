@@ -98,7 +98,7 @@ class PlacementDemo(DemoRunner):
         """Starts the nodes, and waits until all are there and report."""
         await self.start_nodes({}, 'load = "tree"\n')
         fleet = self.fleet()
-        mesh = self._mesh = await ZenohMesh.open(fleet.name, Sender("demo", "watch"), fleet.mesh)
+        mesh = self._mesh = await ZenohMesh.open(fleet, Sender("demo", "watch"))
         self._placer = PlacerClient(mesh)
         mesh.subscribe(mesh.keys.load_any, LoadReport, self._on_load)
         mesh.subscribe(mesh.keys.placements, Placements, self._on_placements)

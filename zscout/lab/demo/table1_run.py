@@ -52,7 +52,7 @@ class Table1Demo(DemoRunner):
         )
         await self._start_arcs()
         fleet = self.fleet()
-        self._mesh = await ZenohMesh.open(fleet.name, Sender("demo", "watch"), fleet.mesh)
+        self._mesh = await ZenohMesh.open(fleet, Sender("demo", "watch"))
         await self.within(START, self._all_ready(self._mesh), "the nodes did not find each other")
         ready = (self._milestone(arrival.request.arc, "ready").wait() for arrival in self.workload.arrivals)
         await self.within(START, asyncio.gather(*ready), "the behaviors did not find the nodes")

@@ -17,6 +17,7 @@ from zscout.config.node import MAX_KINDS, ComponentsConfig
 from zscout.keyexpr import BadName, check_name
 from zscout.mesh import IncomingQuery, Mesh, Refused, Supervisor
 from zscout.mesh.supervision import done_within
+from zscout.services.authority import Authority
 from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.services.node.process_use import RunningComponent
@@ -45,11 +46,13 @@ class ComponentHost:
         on_failure: Callable[[Exception], object],
         limits: ControlGroups | None = None,
         *,
+        authority: Authority | None = None,
         kinds: Callable[[], dict[str, str]] = installed_kinds,
         process: type[ComponentProcess] = ComponentProcess,
     ) -> None:
         self.mesh, self._rules, self._kinds, self._process = mesh, rules, kinds, process
         self._fleet = msgspec.structs.replace(fleet, mesh=beside(fleet.mesh))
+        self._authority = authority or Authority(fleet)
         self._limits = limits or ControlGroups()
         self._living: dict[str, ComponentProcess] = {}
         self._ended: OrderedDict[str, ComponentProcess] = OrderedDict()
@@ -61,14 +64,17 @@ class ComponentHost:
 
     async def start(self) -> None:
         await asyncio.to_thread(self._limits.sweep)
-        key = self.mesh.keys.component(self.mesh.me.host)
-        self._served = self.mesh.serve(key, messages.ComponentOperation, self._on_request, limit=messages.MAX_MOVE)
+        self._served = [
+            self.mesh.serve(key, messages.ComponentOperation, self._on_request, limit=messages.MAX_MOVE)
+            for key in self.mesh.keys.served_component(self.mesh.me.host)
+        ]
 
     async def stop(self) -> None:
         """Ends all components, side by side, each within GRACE seconds."""
         self._stopping = True
         await asyncio.gather(*(process.stop(GRACE) for process in list(self._living.values())))
-        self._served.close()
+        for served in self._served:
+            served.close()
         await self.supervisor.close()
 
     def running(self) -> list[RunningComponent]:
@@ -84,6 +90,8 @@ class ComponentHost:
     def _on_request(self, request: IncomingQuery[messages.ComponentOperation]) -> None:
         if self._underway >= MAX_UNDERWAY:
             raise Refused("busy", "too many operations are under way here; ask again")
+        if self.mesh.keys.closed and not isinstance(request.message, messages.ListComponents | messages.ReadOutput):
+            self._authority.check_machine(self.mesh.keys.sender_of(request.key), "tell a node to do this")
         self._underway += 1
         self.supervisor.spawn(self._answer(request))
 

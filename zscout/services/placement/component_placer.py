@@ -18,6 +18,7 @@ from zscout.mesh.supervision import Supervisor
 from zscout.messages import ListComponents, Placement, Placements, PlacerOperation
 from zscout.placement import events
 from zscout.placement.placer import Placer
+from zscout.services.authority import Authority
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.placement.node_client import NodeClient
 from zscout.services.placement.request_handler import PlacerRequestHandler
@@ -46,11 +47,14 @@ class ComponentPlacer:
         balancer: LoadBalancer,
         inherited: events.Inherited,
         on_failure: Callable[[Exception], object],
+        authority: Authority | None = None,
     ) -> None:
         self.mesh, self.term = mesh, term
         self._core = Placer(balancer.core, term.counter, fleet.placement)
         self._supervisor = Supervisor("the component placer", on_failure)
-        self._requests = PlacerRequestHandler(self._core, term, self._supervisor, self._feed)
+        self._requests = PlacerRequestHandler(
+            self._core, term, mesh.keys, authority or Authority(fleet), self._supervisor, self._feed
+        )
         self._nodes = NodeClient(mesh, fleet.placement.start_timeout)
         self._inherited = inherited
         self._instances: dict[HostName, set[str]] = {}
@@ -70,7 +74,7 @@ class ComponentPlacer:
         for declared in (
             mesh.watch(keys.alive_any(Role.NODE), guard(self._on_node)),
             mesh.watch(keys.alive_any(Role.COMPONENT), guard(self._on_component)),
-            mesh.serve(keys.placer, PlacerOperation, guard(self._requests.receive)),
+            *(mesh.serve(key, PlacerOperation, guard(self._requests.receive)) for key in keys.served_placer()),
         ):
             self._declarations.callback(declared.close)
         self._supervisor.call_later(BEGIN, self._requests.open)

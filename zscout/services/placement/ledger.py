@@ -71,7 +71,8 @@ class PlacementLedger:
 
     async def _catch_up(self) -> None:
         for _ in range(TRIES):
-            reply = await self.mesh.ask_one(self.mesh.keys.placer, ListPlacements(), Placements, timeout=ASK_TIMEOUT)
+            key = self.mesh.keys.placer(self.mesh.me)
+            reply = await self.mesh.ask_one(key, ListPlacements(), Placements, timeout=ASK_TIMEOUT)
             if reply is not None and reply.message is not None:
                 # What was published meanwhile is newer than the answer or the same.
                 listed = reply.message

@@ -75,4 +75,4 @@ class NodeClient:
         return answered("moved", dead=reply.message.dead)
 
     async def _ask(self, host: HostName, message: msgspec.Struct, kind: type[R], timeout: float) -> Reply[R] | None:
-        return await self.mesh.ask_one(self.mesh.keys.component(host), message, kind, timeout=timeout)
+        return await self.mesh.ask_one(self.mesh.keys.component(host, self.mesh.me), message, kind, timeout=timeout)

@@ -11,18 +11,20 @@ import msgspec
 from msgspec import structs
 
 from zscout import messages
-from zscout.keyexpr import check_name
+from zscout.keyexpr import Keys, Sender, check_name
 from zscout.mesh import IncomingQuery, Refused
 from zscout.mesh.supervision import Supervisor
 from zscout.placement.events import PlacementRefused, PlacerEvent
 from zscout.placement.placer import Placer
 from zscout.placement.state import OVER
+from zscout.services.authority import Authority
 from zscout.types import HostName, Term
 
 MAX_WAIT: Final = 60.0
 MAX_WAITING: Final = 1_000
 """Requests that wait for their answer at one time."""
 
+Operation: TypeAlias = messages.PlacementOperation | messages.DrainHost | messages.UncordonHost
 PlacerQuery: TypeAlias = IncomingQuery[messages.PlacerOperation]
 
 SETTLED: Final = OVER | {"running", "waiting"}
@@ -42,8 +44,15 @@ class PlacerRequestHandler:
     over. `feed` gives an event to the core, and returns what the core refused."""
 
     def __init__(
-        self, placer: Placer, term: Term, supervisor: Supervisor, feed: Callable[[PlacerEvent], list[PlacementRefused]]
+        self,
+        placer: Placer,
+        term: Term,
+        keys: Keys,
+        authority: Authority,
+        supervisor: Supervisor,
+        feed: Callable[[PlacerEvent], list[PlacementRefused]],
     ) -> None:
+        self._keys, self._authority = keys, authority
         self._placer, self.term, self._supervisor, self._feed = placer, term, supervisor, feed
         self._early: list[tuple[PlacerQuery, PlacerEvent]] = []
         self._is_open = False
@@ -58,10 +67,26 @@ class PlacerRequestHandler:
         if len(self._early) + len(self._waiting) >= MAX_WAITING:
             raise Refused("busy", "too many operations are waiting here; ask again")
         event = _event_of(operation)
+        if self._keys.closed:
+            event = self._allowed(event, self._keys.sender_of(query.key))
         if self._is_open:
             self._carry_out(query, event)
         else:
             self._early.append((query, event))
+
+    def _allowed(self, event: Operation, sender: Sender) -> Operation:
+        """What of that its sender may do, in its name. Raises Refused."""
+        if isinstance(event, messages.DrainHost | messages.UncordonHost):
+            self._authority.check_operator(sender, f"empty {event.host} or fill it again")
+            return event
+        if isinstance(event, messages.PlaceComponent):
+            self._authority.check_user(sender, "start components")
+            return structs.replace(event, spec=structs.replace(event.spec, owner=sender.host))
+        known = self._placer.components.get(event.component)
+        if known is None or known.spec.owner != sender.host:
+            whose = f", which is {known.spec.owner}'s" if known is not None and known.spec.owner else ""
+            self._authority.check_operator(sender, f"stop or move {event.component}{whose}")
+        return event
 
     def open(self) -> None:
         """From now on requests are carried out, first those that came before."""
@@ -127,7 +152,7 @@ class PlacerRequestHandler:
         return waiting
 
 
-def _event_of(operation: messages.PlacementOperation | messages.DrainHost | messages.UncordonHost) -> PlacerEvent:
+def _event_of(operation: Operation) -> Operation:
     """The operation, its spec in order. Raises BadName or Refused for what can't be."""
     if isinstance(operation, messages.DrainHost | messages.UncordonHost):
         check_name(operation.host, "host")
@@ -151,4 +176,4 @@ def _checked(spec: messages.ComponentSpec) -> messages.ComponentSpec:
     if size > messages.MAX_PARAMS_SIZE:
         raise Refused("too_large", f"the parameters have {size} bytes; at most {messages.MAX_PARAMS_SIZE} are taken")
     hosts = None if spec.hosts is None else sorted(set(spec.hosts))
-    return structs.replace(spec, labels=sorted(set(spec.labels)), hosts=hosts)
+    return structs.replace(spec, labels=sorted(set(spec.labels)), hosts=hosts, owner="")

@@ -19,6 +19,7 @@ from zscout.mesh import Mesh, Reply
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
 from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd, disbelieved
+from zscout.services.authority import Authority
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
@@ -44,8 +45,11 @@ BACKOFF_RESET_AFTER: Ns = 60 * SECOND
 class Candidate:
     """Stands by, leads when it must, steps down when a higher term is seen or when anything fails."""
 
-    def __init__(self, mesh: Mesh, fleet: Fleet, folder: Path | None = None) -> None:
+    def __init__(
+        self, mesh: Mesh, fleet: Fleet, folder: Path | None = None, authority: Authority | None = None
+    ) -> None:
         """`folder`: where it keeps what it must know after a restart; None: it does not."""
+        self._authority = authority or Authority(fleet)
         self.mesh, self.fleet = mesh, fleet
         self.known: Term = NO_TERM
         """The highest term seen anywhere."""
@@ -98,6 +102,11 @@ class Candidate:
             self._supervisor.spawn(self._run())
         except Exception as error:  # noqa: BLE001 - it is logged there
             self._supervisor.fail(error)
+
+    def on_reload(self) -> None:
+        """The rights have changed."""
+        if self.rcm is not None:
+            self.rcm.on_reload()
 
     def _failed(self, _: Exception) -> None:
         """Steps down and withdraws; becomes a new candidate after a while."""
@@ -223,28 +232,26 @@ class Candidate:
             log.error("no term is left: end all nodes and clients of the fleet, and start them again")
             return False
         term = Term(self.known.counter + 1, new_instance())
-        promise_query = RcAsk(promise=term, above=self.mesh.me.host if self._goes_above else None)
+        promise_query = RcAsk(promise=term, above=self.mesh.me.host if self._goes_above else None, ordinary=True)
         rcs, clients = await asyncio.gather(
             self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=self._timeout),
             self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=self._timeout),
         )
-        problems = [(reply.key, reply.problem) for reply in rcs] + [(reply.key, reply.problem) for reply in clients]
-        for key, problem in problems:
-            if problem is not None and problem.term is not None:
-                await self._refused(key, problem.term)
+        refusals = [_refusal(reply, term) for reply in rcs]
+        for key, other in filter(None, [*refusals, *(_refusal(reply, term) for reply in clients)]):
+            await self._refused(key, other)
         if self.known > term:
             self.election.rivalled(self.mesh.now())
             return False
-        # One of a lower term is from before the promise.
-        answers = [one for one in self._credible(rcs, lambda state: keys.rc_state(state.rc)) if one[0].term >= term]
-        refused = (reply.problem.term for reply in rcs if reply.problem is not None)
-        if not answers and any(other is not None and disbelieved(term, other) for other in refused):
+        # One of another term does not promise, or is from before it did.
+        answers = [one for one in self._credible(rcs, lambda state: keys.rc_state(state.rc)) if one[0].term == term]
+        if not answers and any(refused is not None and disbelieved(term, refused[1]) for refused in refusals):
             log.info("no RC believes term %d while they hear an RCM of another: waiting", term.counter)
             return False
         now = self.mesh.now()
         states = [aged(state, now - arrived) for state, arrived in answers]
         open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
-        self._lead(term, states, [one for one, _ in open_requests])
+        self._lead(term, states, [one for one, _ in open_requests if one.term in (term, NO_TERM)])
         return True
 
     async def _refused(self, key: str, term: Term) -> None:
@@ -274,12 +281,20 @@ class Candidate:
         self.known, self._goes_above = term, False
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
-        rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed, self.inventory)
+        rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed, self.inventory, self._authority)
         rcm.membership.on_disbelieved = self._disbelieved
         self._leading.callback(rcm.stop)
         rcm.start(recovered)
         balancer = LoadBalancer(self.mesh, self._failed)
-        placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, self.ledger.inherited(), self._failed)
+        inherited = self.ledger.inherited()
+        placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, inherited, self._failed, self._authority)
         for service in (balancer, placer):
             self._leading.callback(service.stop)
             service.start()
+
+
+def _refusal(reply: Reply[RcState] | Reply[ClientRequests], promise: Term) -> tuple[str, Term] | None:
+    """Who does not promise that term, and which it obeys; None: it promises, or says nothing of a term."""
+    if reply.message is not None:
+        return None if reply.message.term in (promise, NO_TERM) else (reply.key, reply.message.term)
+    return None if reply.problem is None or reply.problem.term is None else (reply.key, reply.problem.term)

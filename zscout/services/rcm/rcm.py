@@ -49,10 +49,11 @@ from zscout.scheduling.model import (
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.services.authority import Authority
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.recovery import RecoveredState
-from zscout.services.rcm.registry import RequestRegistry, reason_info, request_id
+from zscout.services.rcm.registry import RequestRegistry, client_id, reason_info, request_id
 from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import SECOND, ArcId, ClientId, Ns, RcName, Term
 
@@ -62,6 +63,7 @@ MAX_LISTED = 1_000
 """Queued ARCs in one answer."""
 LATE_VOTE = 2.0
 """Seconds within which a late vote still counts."""
+REMOVED = "the fleet file, which names its owner under no role"
 MAX_REASON = 500
 """Characters of a veto's reason."""
 
@@ -78,11 +80,13 @@ class Rcm:
         on_newer: Callable[[Term, str | None], object],
         on_failure: Callable[[Exception], object],
         inventory: Inventory | None = None,
+        authority: Authority | None = None,
     ) -> None:
-        """`inventory`: that of its candidate, if it has one."""
+        """`inventory` and `authority`: those of its candidate, if it has one."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
-        self.core = Core(STRATEGIES[fleet.strategy](), fleet.scheduling)
+        self._authority = authority or Authority(fleet)
+        self.core = Core(STRATEGIES[fleet.strategy](), self._authority.bound(fleet.scheduling))
         supervisor, receive = self.supervisor, self._receive
         self.registry = RequestRegistry(mesh, self.core, term, supervisor)
         self._own_inventory = inventory is None
@@ -92,7 +96,7 @@ class Rcm:
         self.membership.on_requests = self._on_requests
         self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(
-            mesh, fleet, self.core, self.registry, self.membership, devices, supervisor, receive
+            mesh, fleet, self.core, self.registry, self.membership, devices, self._authority, supervisor, receive
         )
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
@@ -151,6 +155,12 @@ class Rcm:
         self.registry.close()
         self.requests.close()
         self._grants.close()
+
+    def on_reload(self) -> None:
+        """The rights have changed: who has none any more holds and waits for nothing."""
+        self.core.policy = self._authority.bound(self.fleet.scheduling)
+        gone = [arc for arc in self.core.arcs() if self._authority.is_removed(client_id(arc))]
+        self._receive(Tick(), *(Released(arc, REMOVED) for arc in gone))
 
     # In
 

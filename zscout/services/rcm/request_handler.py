@@ -46,10 +46,11 @@ from zscout.scheduling.model import (
     Unconfirmed,
 )
 from zscout.scheduling.reason import Party, named
+from zscout.services.authority import Authority
 from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.door import check_door
 from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.registry import RequestRegistry, arc_id, party_info, reason_info, request_id
+from zscout.services.rcm.registry import RequestRegistry, arc_id, client_id, party_info, reason_info, request_id
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
 Query: TypeAlias = IncomingQuery[Operation]
@@ -72,10 +73,12 @@ class RequestHandler:
         registry: RequestRegistry,
         membership: Membership,
         devices: ExpectedDevices,
+        authority: Authority,
         supervisor: Supervisor,
         emit: Callable[..., None],
     ) -> None:
         self.mesh, self.limits, self.core, self._devices = mesh, fleet.limits, core, devices
+        self._authority = authority
         self._knows_all = mesh.now() + fleet.timing.hold_lease
         """From when on an RC that was not seen yet is none of this fleet."""
         self._first_answer_timeout = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
@@ -134,6 +137,7 @@ class RequestHandler:
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
         arc = arc_id(str(sender), ask.id)
         self._keep_order(arc)
+        self._authority.check_ask(sender, ask, lambda names: self._open_of(names, arc))
         if self._may_hold(arc, ask) and self._membership.awaits(arc, ask.rcs) and len(self._deferred) < MAX_BATCH:
             self._defer(query)
         elif arc in self.waiting:
@@ -208,6 +212,8 @@ class RequestHandler:
 
     def _end(self, query: Query, operation: Cancel | Release, sender: Sender) -> None:
         owner = client_of(operation.client) if operation.client is not None else sender
+        if owner.host != sender.host:
+            self._authority.check_operator(sender, f"end what is {owner}'s")
         arc = arc_id(str(owner), operation.id)
         self._keep_order(arc)
         if owner == sender:
@@ -225,6 +231,12 @@ class RequestHandler:
         same_place = self.core.at_place(ask.place) if ask.place is not None else ()
         return any(request_id(arc) == ask.id for arc in same_place)
 
+    def _open_of(self, names: Collection[str], but: ArcId) -> int:
+        """How many ARCs these have, waiting or running; what this burst has brought counts."""
+        coming = {event.request.arc for event in self._batch.values() if isinstance(event, Requested)}
+        owned = {arc for arc in coming if client_id(arc).partition("/")[0] in names}
+        return len({*owned, *self.core.arcs_of_owners(names)} - {but})
+
     def _check_room(self, client: ClientId) -> None:
         """Refuses what is too much at once; what this burst has brought already counts."""
         coming = [event for event in self._batch.values() if isinstance(event, Requested)]
@@ -240,6 +252,7 @@ class RequestHandler:
         if self.core.arc(arc) is not None:
             raise Refused("bad_request", f"{asked.id} is a request already; ask how it stands")
         now = self.mesh.now()
+        self._authority.check_ask(sender, asked, lambda names: self._open_of(names, arc))
         request = admit(asked, sender, arc, self.core, self.limits)
         if asked.check:
             self._check_door(asked)
@@ -348,6 +361,9 @@ class RequestHandler:
         room = self.limits.max_requests_per_client - len(self.core.arcs_of(to))
         if len(moves) > room:
             raise Refused("too_many", f"{to} has room for {max(0, room)} more requests, not for {len(moves)}")
+        for move in moves:
+            known = self.core.arc(move.arc)
+            self._authority.check_hand_over(client_of(to), known.needs if known is not None else ())
         for move in moves:
             self._registry.enter(move.renamed, self._registry.name(move.arc))
         self._emit(*moves)

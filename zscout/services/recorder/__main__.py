@@ -92,7 +92,7 @@ async def _record(job: RecorderJob, out: BinaryIO) -> None:
         stack.callback(files.close)
         timeline = stack.enter_context(files.timeline)
         files.prune()
-        async with await ZenohMesh.open(fleet.name, Sender(job.host, "recorder"), fleet.mesh) as mesh:
+        async with await ZenohMesh.open(fleet, Sender(job.host, "recorder")) as mesh:
             out.write(msgspec.json.encode(Recording(str(files.path.absolute()), timeline.url)) + b"\n")
             out.flush()
             recorder = Recorder(mesh, fleet, timeline, settings.frames, files.where if job.joined else None)

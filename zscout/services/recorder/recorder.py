@@ -218,7 +218,7 @@ class Recorder:
 
     async def _keep_asking_placer(self) -> None:
         """Asks the placer at the start, and whenever something may have been missed. Does not return."""
-        key, failed = self.mesh.keys.placer, 0
+        key, failed = self.mesh.keys.placer(self.mesh.me), 0
         while True:
             if await done_within(AGAIN if 0 < failed < TRIES else None, self._placer_wanted.wait()):
                 failed = 0

@@ -1,0 +1,159 @@
+"""Who may do what in a fleet: the roles, groups, quotas and ceilings of a fleet file, and what they come to.
+
+A name is what a certificate says: a machine's (node, manager, relay) or a person's (viewer, client, operator). Without
+`[security]` nothing proves a name, so all of this is advice that nobody enforces."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Mapping
+from functools import cached_property
+from typing import Annotated, Final, get_args
+
+from msgspec import Meta, Struct
+
+from zscout.config.strict import Where, check_name, check_names, key, quoted, seconds
+from zscout.keyexpr import PEOPLE, Member, Rank, as_pattern, matcher
+from zscout.types import HostName, Ns, RcName
+
+MAX_NAMES: Final = 1_000
+"""Names of one role or group; groups, patterns and quotas of one file."""
+MAX_PATTERNS: Final = 1_000
+"""RCs, or patterns of them, that one host may serve."""
+_RC: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}/[A-Za-z0-9_.*-]{1,64}")
+
+Names = Annotated[tuple[str, ...], Meta(max_length=MAX_NAMES)]
+Patterns = Annotated[tuple[str, ...], Meta(max_length=MAX_PATTERNS)]
+
+
+class Roles(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [roles]: what each name may do. A person has one role; a machine may be node and manager."""
+
+    viewer: Annotated[Names, key("People who may look.", example=["wall"])] = ()
+    client: Annotated[Names, key("People whose programs may hold RCs, and start components.", example=["bob"])] = ()
+    operator: Annotated[
+        Names, key("People who may also take, end others' ARCs, move components and drain hosts.", example=["ada"])
+    ] = ()
+    node: Annotated[
+        Mapping[str, Patterns],
+        key(
+            "Hosts, with the RCs that each may serve; `*` is any part of a name.",
+            most=MAX_NAMES,
+            example={"bellows": ["robot/scout33", "radio/*"]},
+        ),
+    ] = {}
+    manager: Annotated[Names, key("Hosts whose nodes may lead; the others never do.", example=["anvil"])] = ()
+    relay: Annotated[Names, key("Hosts that join sites. What others send comes in their name.", example=["gate"])] = ()
+
+
+class Quota(Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of [quotas]: what one name, or the members of one group together, may have at one time."""
+
+    rcs: Annotated[Annotated[int, Meta(ge=0, le=100_000)] | None, key("RCs that are held.")] = None
+    arcs: Annotated[Annotated[int, Meta(ge=0, le=100_000)] | None, key("ARCs, waiting or running.")] = None
+
+
+class Ceiling(Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of [ceilings]: what ARCs of one role may ask for."""
+
+    priority: Annotated[
+        Annotated[int, Meta(ge=-1_000_000, le=1_000_000)] | None,
+        key("The highest; for clients it is below `operator_priority` in any case."),
+    ] = None
+    runtime: Annotated[Ns, seconds("0", "31622400", "The longest minimum runtime, and none may `keep`; 0: any.")] = 0
+
+
+class AccessPolicy(Struct, frozen=True, dict=True):
+    """The rights of all names of a fleet."""
+
+    roles: Roles = Roles()
+    groups: Mapping[str, tuple[str, ...]] = {}
+    access: Mapping[str, tuple[str, ...]] = {}
+    """By pattern of RCs: the names and groups that may hold them. Of several patterns each must allow it."""
+    quotas: Mapping[str, Quota] = {}
+    ceilings: Mapping[Rank, Ceiling] = {}
+
+    @cached_property
+    def ranks(self) -> Mapping[str, frozenset[Rank]]:
+        """Of every name that has any."""
+        found: dict[str, set[Rank]] = {}
+        for rank in get_args(Rank):
+            for name in getattr(self.roles, rank):
+                found.setdefault(name, set()).add(rank)
+        return {name: frozenset(ranks) for name, ranks in found.items()}
+
+    def ranks_of(self, name: str) -> frozenset[Rank]:
+        return self.ranks.get(name, frozenset())
+
+    def members(self) -> list[Member]:
+        """All names, with the RCs that they may serve."""
+        return [Member(name, ranks, self.roles.node.get(name, ())) for name, ranks in sorted(self.ranks.items())]
+
+    def may_serve(self, host: HostName, rc: RcName) -> bool:
+        return any(matcher(as_pattern(pattern))(rc) for pattern in self.roles.node.get(host, ()))
+
+    def groups_of(self, name: str) -> list[str]:
+        return [group for group, members in self.groups.items() if name in members]
+
+    def holders(self, rc: RcName) -> frozenset[str] | None:
+        """The names that may hold this RC; None: all who may hold any."""
+        allowed: frozenset[str] | None = None
+        for pattern, names in self.access.items():
+            if matcher(as_pattern(pattern))(rc):
+                these = frozenset(one for name in names for one in self.groups.get(name, (name,)))
+                allowed = these if allowed is None else allowed & these
+        return allowed
+
+    def quotas_of(self, name: str) -> Iterator[tuple[str, Collection[str], Quota]]:
+        """What bounds this name: whose quota it is, the names whose ARCs count, and the quota."""
+        for owner in (name, *self.groups_of(name)):
+            if owner in self.quotas:
+                yield owner, self.groups.get(owner, (owner,)), self.quotas[owner]
+
+    def ceiling(self, name: str) -> Ceiling:
+        """What an ARC of this name may ask for. Programs on a machine (its components) may what a client may."""
+        ranks = self.ranks_of(name)
+        rank: Rank = "operator" if "operator" in ranks else "client"
+        return self.ceilings.get(rank, Ceiling())
+
+
+def check_access(policy: AccessPolicy, at: Where) -> None:
+    """Refuses names in two roles, and groups and quotas of nobody. Raises BadInput."""
+    seen: dict[str, Rank] = {}
+    for rank in get_args(Rank):
+        names, here = getattr(policy.roles, rank), at / "roles" / rank
+        check_names(names, here)
+        for name in names:
+            other = seen.setdefault(name, rank)
+            if other != rank and not {other, rank} <= {"node", "manager"}:
+                what = "a machine or a person" if (other in PEOPLE) != (rank in PEOPLE) else "one of the two"
+                raise here.bad(f"{quoted(name)} is {other} already", f"a name has one role: make it {what}")
+    for host, patterns in policy.roles.node.items():
+        for number, pattern in enumerate(patterns):
+            _check_pattern(pattern, (at / "roles" / "node" / host).item(number))
+    for group, members in policy.groups.items():
+        check_name(group, at / "groups" / group)
+        if group in seen:
+            raise (at / "groups" / group).bad(f"{quoted(group)} is a name with a role", "call the group otherwise")
+        _check_known(members, seen, at / "groups" / group)
+    known = {*seen, *policy.groups}
+    for pattern, names in policy.access.items():
+        _check_pattern(pattern, at / "access" / pattern)
+        _check_known(names, known, at / "access" / pattern)
+    _check_known(policy.quotas, known, at / "quotas")
+    for rank in policy.ceilings:
+        if rank not in ("client", "operator"):
+            raise (at / "ceilings" / rank).bad("only ARCs of clients and operators have a ceiling", 'write "client"')
+
+
+def _check_known(names: Collection[str], known: Collection[str], at: Where) -> None:
+    for number, name in enumerate(names):
+        check_name(name, at.item(number))
+        if name not in known:
+            raise at.item(number).bad(f"{quoted(name)} has no role", "name it under [roles], or mend the name")
+
+
+def _check_pattern(pattern: str, at: Where) -> None:
+    if not _RC.fullmatch(pattern) or "**" in pattern:
+        remedy = 'write kind/name with * for any part, as in "robot/scout33" or "robot/arm*"'
+        raise at.bad(f"{quoted(pattern)} names no RC", remedy)

@@ -1,0 +1,142 @@
+"""What a sender's role allows beyond what its keys tell: checked by whoever answers it. Pure.
+
+Access control holds the `<host>` in a sender's keys to its certificate, so that name is all that is looked up. On a
+plain mesh nothing proves a name, and nothing is refused here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import replace
+
+from zscout.config.access import AccessPolicy
+from zscout.config.fleet import Fleet
+from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy
+from zscout.keyexpr import Rank, Sender, as_pattern, is_pattern
+from zscout.mesh import Refused
+from zscout.messages import Ask, Foresee, duration
+from zscout.types import ClientId, RcName
+
+MAX_NAMED = 4
+"""Names that a refusal lists of those who could."""
+
+
+class Authority:
+    """The rights of all names, as the fleet file has them at present."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._policy, self._enforced = fleet.access, fleet.security is not None
+        self._operator_priority = fleet.operator_priority
+
+    def reload(self, fleet: Fleet) -> None:
+        """Takes the rights of a fleet file that was read anew."""
+        self._policy = fleet.access
+
+    def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
+        """The policy, with what the scheduler has to see to: quotas of RCs, and what no pattern is bound to."""
+        if not self._enforced:
+            return policy
+        names = list(self._policy.ranks)
+        quotas = {
+            name: tuple(
+                RcQuota(owner, frozenset(members), quota.rcs)
+                for owner, members, quota in self._policy.quotas_of(name)
+                if quota.rcs is not None
+            )
+            for name in names
+        }
+        return replace(
+            policy,
+            rc_quotas={name: found for name, found in quotas.items() if found},
+            barred={name: found for name in names if (found := self._barred(name))},
+        )
+
+    def check_ask(self, sender: Sender, ask: Ask | Foresee, open_by: Callable[[Collection[str]], int]) -> None:
+        """Raises Refused for what `sender` may not ask for. `open_by`: how many ARCs some names have open."""
+        if not self._enforced:
+            return
+        name = sender.host
+        self._check_rank(name, "ask for an ARC", ("client", "operator", "node", "manager"))
+        ceiling, most = self._policy.ceiling(name), None
+        if "operator" not in self._policy.ranks_of(name):
+            most = self._operator_priority - 1
+        if ceiling.priority is not None:
+            most = ceiling.priority if most is None else min(most, ceiling.priority)
+        if most is not None and ask.priority > most:
+            raise self._refused(name, f"ask for priority {ask.priority}; at most {most}", ("operator",))
+        if ceiling.runtime:
+            if ask.keep:
+                raise self._refused(name, "keep a hold", ("operator",))
+            if duration(ask.min_runtime, "min_runtime") > ceiling.runtime:
+                what = f"ask for {ask.min_runtime} s; at most {ceiling.runtime / 1e9:g}"
+                raise self._refused(name, what, ("operator",))
+        for need in ask.needs:
+            if not is_pattern(need) and not self.may_hold(name, need):
+                raise self._not_its(name, need)
+        for owner, members, quota in self._policy.quotas_of(name):
+            if quota.rcs is not None and len(ask.needs) > quota.rcs:
+                raise Refused("not_allowed", f"{owner} may hold {quota.rcs} RCs at one time, and this asks for more")
+            if quota.arcs is not None and open_by(members) >= quota.arcs:
+                raise Refused("not_allowed", f"{owner} has {quota.arcs} ARCs open, its quota; release or cancel one")
+
+    def check_hand_over(self, to: Sender, rcs: Iterable[RcName]) -> None:
+        """Raises Refused where the new client may not hold what it is given."""
+        if self._enforced:
+            self._check_rank(to.host, "take over an ARC", ("client", "operator", "node", "manager"))
+            for rc in rcs:
+                if not self.may_hold(to.host, rc):
+                    raise self._not_its(to.host, rc)
+
+    def check_operator(self, sender: Sender, what: str) -> None:
+        """Raises Refused for all but operators. `what` stands behind `may not`."""
+        if self._enforced:
+            self._check_rank(sender.host, what, ("operator",))
+
+    def check_user(self, sender: Sender, what: str) -> None:
+        """Raises Refused for who may only look."""
+        if self._enforced:
+            self._check_rank(sender.host, what, ("client", "operator", "node", "manager"))
+
+    def check_machine(self, sender: Sender, what: str) -> None:
+        """Raises Refused for all but the placer, and components that move."""
+        if self._enforced:
+            self._check_rank(sender.host, what, ("manager", "node"))
+
+    def may_hold(self, name: str, rc: RcName) -> bool:
+        holders = self._policy.holders(rc) if self._enforced else None
+        return holders is None or name in holders
+
+    def _barred(self, name: str) -> tuple[str, ...]:
+        """The patterns of RCs that may not be had by this name."""
+        allowed = {name, *self._policy.groups_of(name)}
+        barred = (pattern for pattern, names in self._policy.access.items() if not allowed & {*names})
+        return tuple(map(as_pattern, barred))
+
+    def is_removed(self, client: ClientId) -> bool:
+        """Whether this client's name has no role any more that lets it hold anything."""
+        ranks = self._policy.ranks_of(client.partition("/")[0])
+        return self._enforced and not ranks & {"client", "operator", "node", "manager"}
+
+    def _check_rank(self, name: str, what: str, needed: tuple[Rank, ...]) -> None:
+        if not self._policy.ranks_of(name) & {*needed}:
+            raise self._refused(name, what, needed)
+
+    def _not_its(self, name: str, rc: RcName) -> Refused:
+        who = _listed(sorted(self._policy.holders(rc) or ()))
+        return Refused("not_allowed", f"{_titled(self._policy, name)} may not hold {rc}; {who} may")
+
+    def _refused(self, name: str, what: str, needed: tuple[Rank, ...]) -> Refused:
+        could = sorted(one for one, ranks in self._policy.ranks.items() if ranks & {*needed})
+        who = f"{_listed(could)} may" if could else f"nobody may: no {needed[0]} is named under [roles]"
+        return Refused("not_allowed", f"{_titled(self._policy, name)} may not {what}; {who}")
+
+
+def _titled(policy: AccessPolicy, name: str) -> str:
+    ranks = policy.ranks_of(name)
+    return f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, who has no role,"
+
+
+def _listed(names: list[str]) -> str:
+    if not names:
+        return "nobody"
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return ", ".join(names[:MAX_NAMED]) + more
