@@ -335,8 +335,9 @@ Rank: TypeAlias = Literal["viewer", "client", "operator", "node", "manager", "re
 PEOPLE: Final[frozenset[Rank]] = frozenset({"viewer", "client", "operator"})
 MACHINES: Final[frozenset[Rank]] = frozenset({"node", "manager", "relay"})
 _ALL: Final[frozenset[Rank]] = frozenset({"viewer", "client", "operator", "node", "manager"})
-_USERS: Final = _ALL - {"viewer"}
-_NODES: Final[frozenset[Rank]] = frozenset({"node", "manager"})
+USERS: Final = _ALL - {"viewer"}
+"""Whose programs may hold RCs."""
+NODES: Final[frozenset[Rank]] = frozenset({"node", "manager"})
 _MANAGERS: Final[frozenset[Rank]] = frozenset({"manager"})
 _NOBODY: Final[frozenset[Rank]] = frozenset()
 
@@ -355,29 +356,29 @@ class Access(NamedTuple):
 
 
 ACCESS: Final = (
-    Access("rcm/schedule/{by}/*", ask=_USERS, serve=_MANAGERS),
+    Access("rcm/schedule/{by}/*", ask=USERS, serve=_MANAGERS),
     Access("rcm/grants", publish=_MANAGERS, subscribe=_ALL),
     Access("rcm/state", ask=_ALL, serve=_MANAGERS),
-    Access("rc/{rc}/vote", ask=_MANAGERS, serve=_NODES),
-    Access("rc/{rc}/command/{by}/*", ask=_USERS, serve=_NODES),
+    Access("rc/{rc}/vote", ask=_MANAGERS, serve=NODES),
+    Access("rc/{rc}/command/{by}/*", ask=USERS, serve=NODES),
     # Who asks may ask for a promise: a leader's right.
-    Access("rc/{rc}/state", ask=_MANAGERS, serve=_NODES, publish=_NODES, subscribe=_ALL),
-    Access("rc/{rc}/frame", publish=_NODES, subscribe=_ALL),
-    Access("host/{at}/load", publish=_NODES, subscribe=_ALL),
-    Access("host/{at}/component/{by}/*", ask=_ALL, serve=_NODES),
+    Access("rc/{rc}/state", ask=_MANAGERS, serve=NODES, publish=NODES, subscribe=_ALL),
+    Access("rc/{rc}/frame", publish=NODES, subscribe=_ALL),
+    Access("host/{at}/load", publish=NODES, subscribe=_ALL),
+    Access("host/{at}/component/{by}/*", ask=_ALL, serve=NODES),
     Access("balancer/rank", ask=_ALL, serve=_MANAGERS),
     Access("placer/component/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("placer/placements", publish=_MANAGERS, subscribe=_ALL),
     Access("client/*/*/notice", publish=_MANAGERS, subscribe=_ALL),
-    Access("client/{at}/*/requests", ask=_MANAGERS, serve=_USERS),
-    Access("client/{at}/*/behavior", publish=_USERS, subscribe=_ALL),
+    Access("client/{at}/*/requests", ask=_MANAGERS, serve=USERS),
+    Access("client/{at}/*/behavior", publish=USERS, subscribe=_ALL),
     Access("recorder/{at}/*/recorded", ask=_ALL, serve=_ALL),
-    Access("building/{at}/*/plan", ask=_ALL, serve=_USERS),
-    Access("building/{at}/*/poses", publish=_USERS, subscribe=_ALL),
+    Access("building/{at}/*/plan", ask=_ALL, serve=USERS),
+    Access("building/{at}/*/poses", publish=USERS, subscribe=_ALL),
     *(Access(f"alive/{{at}}/{role}/**", show=_ALL) for role in (Role.CLIENT, Role.RECORDER, Role.SESSION)),
-    *(Access(f"alive/{{at}}/{role}/**", show=_NODES) for role in (Role.NODE, Role.LOAD, Role.COMPONENT)),
+    *(Access(f"alive/{{at}}/{role}/**", show=NODES) for role in (Role.NODE, Role.LOAD, Role.COMPONENT)),
     *(Access(f"alive/{{at}}/{role}/**", show=_MANAGERS) for role in (Role.CANDIDATE, Role.RCM)),
-    Access(f"alive/{{at}}/{Role.RC}/{{rc}}/*", show=_NODES),
+    Access(f"alive/{{at}}/{Role.RC}/{{rc}}/*", show=NODES),
 )
 """Every key of the fleet, with who may do what there. What keys can't tell is checked by who answers."""
 

@@ -21,6 +21,7 @@ from zscout.config.scheduling_policy import SchedulingPolicy
 from zscout.config.strict import DURATIONS, BadInput
 from zscout.types import SECOND
 
+CLOSED = '[security]\nfolder = "k"\n[roles]\nmanager = ["a"]\n'
 SYNTAX = "mend the TOML there or just before"
 
 BAD_FLEETS = {
@@ -38,7 +39,8 @@ BAD_FLEETS = {
     "[limits]\nmax_needed = 1": "limits.max_needed: unknown key; did you mean max_needs or max_queued?",
     "[fleet]\nzzz = 1": "fleet.zzz: unknown key; known here: candidates, min_runtime, name, operator_priority, "
     "patience, preempt, promise, strategy",
-    '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: devices, fleet, limits, mesh, placement, timing',
+    '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: access, ceilings, devices, fleet, '
+    "groups, limits, mesh, placement, quotas, roles, security, timing",
     'fleet = "lab"': 'fleet: is the text "lab"; write a table, under [fleet]',
     "[[fleet]]": "fleet: is a list; write a table, under [fleet]",
     # [fleet]
@@ -124,6 +126,43 @@ BAD_FLEETS = {
     "[placement]\nback_off = 0": "placement.back_off: is 0 s; write 0.05 to 3600 seconds",
     "[placement]\ngain = 0": "placement.gain: is 0; write a number from 0.05 to 100",
     '[placement]\nrebalance = "yes"': 'placement.rebalance: is the text "yes"; write true or false',
+    # Sites
+    '[mesh]\nrelay = ["a"]': 'mesh.relay: joins a to nothing; name the sites, as in ["north", "south"]',
+    '[mesh]\nsite = "a"\nrelay = ["a", "b"]': "mesh.site: a relay is of none of its sites; remove site, or relay",
+    '[mesh]\nsite = "a b"': f'mesh.site: "a b" is not a name; {NAME_RULE}',
+    # Security
+    "[security]": "security.folder: is missing; add it",
+    '[security]\nfolder = ""': 'security.folder: "" is no folder; name one, as in folder = "/etc/zscout/keys"',
+    '[security]\nfolder = "k"': (
+        'roles: [security] is there, and no host may lead; write manager = ["anvil"] under [roles]'
+    ),
+    CLOSED + '[mesh]\nlisten = ["tcp/0.0.0.0:7447"]': (
+        'mesh.listen[0]: "tcp/0.0.0.0:7447" is not TLS; write tls/host:port, or remove [security]'
+    ),
+    CLOSED + '[fleet]\ncandidates = ["b"]': "fleet.candidates[0]: b is no manager; name it so under [roles]",
+    CLOSED + '[devices]\nb = ["robot/x"]': "devices.b: b may not serve robot/x; name it under [roles.node], b",
+    '[roles]\nviewer = ["a"]\nclient = ["a"]': (
+        'roles.client: "a" is viewer already; a name has one role: make it one of the two'
+    ),
+    '[roles]\noperator = ["a"]\nmanager = ["a"]': (
+        'roles.manager: "a" is operator already; a name has one role: make it a machine or a person'
+    ),
+    '[roles.node]\na = ["robot"]': (
+        'roles.node.a[0]: "robot" names no RC; '
+        'write kind/name with * for any part, as in "robot/scout33" or "robot/arm*"'
+    ),
+    '[groups]\narms = ["a"]': 'groups.arms[0]: "a" has no role; name it under [roles], or mend the name',
+    '[roles]\nclient = ["a"]\n[groups]\na = ["a"]': ('groups.a: "a" is a name with a role; call the group otherwise'),
+    '[access]\n"robot/x" = ["arms"]': (
+        'access."robot/x"[0]: "arms" has no role; name it under [roles], or mend the name'
+    ),
+    "[quotas]\na = { rcs = 1 }": 'quotas[0]: "a" has no role; name it under [roles], or mend the name',
+    '[roles]\nclient = ["a"]\n[quotas]\na = { rcs = -1 }': (
+        "quotas.a.rcs: is -1; write a whole number from 0 to 100000"
+    ),
+    "[ceilings.viewer]\npriority = 1": (
+        'ceilings.viewer: only ARCs of clients and operators have a ceiling; write "client"'
+    ),
 }
 
 

@@ -34,7 +34,7 @@ BAD_NODES = {
         'node.labels[1]: "gpu" stands at node.labels[0] already; rename or remove one of the two'
     ),
     f"[node]\nlabels = {['a'] * 33}": "node.labels: has 33 entries; at most 32 are allowed",
-    "[mesh]\nlease = 1": "mesh.lease: unknown key; known here: connect, interface, listen",
+    "[mesh]\nlease = 1": "mesh.lease: unknown key; known here: connect, interface, listen, relay, site",
     '[mesh]\nconnect = ["anvil"]': f'mesh.connect[0]: "anvil" is not an endpoint; {ENDPOINT_RULE}',
     '[mesh]\ninterface = "a b"': 'mesh.interface: "a b" names no interface; write "auto", or as in "eth0"',
     '[rc]\nname = "robot/a"': "rc: is a table; write tables, each under [[rc]]",

@@ -151,9 +151,9 @@ def _sorted(table: dict[str, Any]) -> list[tuple[str, Any]]:
 # Keys
 
 
-def keys() -> list[str]:
+def keys(*, closed: bool = False) -> list[str]:
     """Every key and key expression of a fleet, and a token of each role."""
-    made = keyexpr.Keys("FLEET")
+    made = keyexpr.Keys("FLEET", closed=closed)
     roles = sorted(value for name, value in vars(keyexpr.Role).items() if name.isupper())
     samples: dict[str, Any] = {
         "Sender": keyexpr.Sender("HOST", "CLIENT"),
@@ -164,14 +164,18 @@ def keys() -> list[str]:
     tokens = [keyexpr.Token("HOST", role, "KIND/NAME" if role == "rc" else "NAME", "INSTANCE") for role in roles]
     found = {made.alive(token) for token in tokens} | {made.alive_any(role) for role in roles}
     for name, value in vars(keyexpr.Keys).items():
-        if hasattr(value, "__get__") and not callable(value) and name != "fleet":
+        if hasattr(value, "__get__") and not callable(value) and name not in ("fleet", "closed"):
             found.add(getattr(made, name))
         elif (
-            callable(value) and not name.startswith("_") and name not in ("alive", "fleet") and not name.endswith("_of")
+            callable(value)
+            and not name.startswith("_")
+            and name not in ("alive", "fleet", "closed")
+            and not name.endswith("_of")
         ):
             params = list(inspect.signature(value).parameters.values())[1:]
             given = [samples.get(str(param.annotation), samples.get(param.name)) for param in params]
-            found.add(getattr(made, name)(*given))
+            made_of_it = getattr(made, name)(*given)
+            found |= {made_of_it} if isinstance(made_of_it, str) else {*made_of_it}
     return sorted(found)
 
 

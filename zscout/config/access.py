@@ -20,6 +20,8 @@ MAX_NAMES: Final = 1_000
 """Names of one role or group; groups, patterns and quotas of one file."""
 MAX_PATTERNS: Final = 1_000
 """RCs, or patterns of them, that one host may serve."""
+MAX_TOLD: Final = 4
+"""Names that a refusal lists of those who could."""
 _RC: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}/[A-Za-z0-9_.*-]{1,64}")
 
 Names = Annotated[tuple[str, ...], Meta(max_length=MAX_NAMES)]
@@ -115,6 +117,19 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         ranks = self.ranks_of(name)
         rank: Rank = "operator" if "operator" in ranks else "client"
         return self.ceilings.get(rank, Ceiling())
+
+    def refusal(self, name: str, what: str, needed: Collection[Rank]) -> str:
+        """Why this name may not do `what`, which takes one of these ranks: who could. Empty: it may."""
+        if self.ranks_of(name) & {*needed}:
+            return ""
+        return self.told(name, what, [one for one, ranks in self.ranks.items() if ranks & {*needed}])
+
+    def told(self, name: str, what: str, could: Collection[str]) -> str:
+        """That `name` may not do `what`, and who could."""
+        ranks, names = self.ranks_of(name), sorted(could)
+        title = f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, who has no role here,"
+        more = f" and {len(names) - MAX_TOLD} more" if len(names) > MAX_TOLD else ""
+        return f"{title} may not {what}; {', '.join(names[:MAX_TOLD]) + more or 'nobody'} may"
 
 
 def check_access(policy: AccessPolicy, at: Where) -> None:

@@ -42,12 +42,12 @@ class SchedulingPolicy:
     `all`, what a due ARC is granted at last is not preempted within its minimum runtime either."""
     max_running_per_host: int | None = None
     """ARCs that the clients of one host may have running at one time; None: any number."""
+    max_runtime: Ns | None = None
+    """Time in ns after which every hold ends as completed, kept or not, whoever's it is; None: never."""
     rc_quotas: Mapping[str, tuple[RcQuota, ...]] = field(default_factory=lambda: MappingProxyType({}))
     """By owner: the quotas that bind it."""
     barred: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: MappingProxyType({}))
     """By owner: patterns of the RCs that no need of its ARCs is bound to."""
-    max_runtime: Ns | None = None
-    """Time in ns after which every hold ends as completed, kept or not, whoever's it is; None: never."""
 
 
 DEFAULT: Final = SchedulingPolicy()

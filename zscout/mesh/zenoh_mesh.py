@@ -22,6 +22,7 @@ from zenoh.handlers import Callback, RingChannel
 from zscout import messages
 from zscout.config.certificates import Certificates, read_certificates
 from zscout.config.fleet import Fleet, MeshConfig
+from zscout.config.strict import BadInput
 from zscout.keyexpr import Keys, Member, Sender, access_control
 from zscout.mesh.exchange import MeshError
 from zscout.mesh.relinking import MEETING, Relinking
@@ -148,6 +149,8 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
     assert fleet.security is not None  # noqa: S101 - its caller has looked
     own = read_certificates(fleet.security)
     own.check(datetime.now(UTC), me.host)
+    if not fleet.access.ranks_of(me.host):
+        raise BadInput(f"{own.cert}: {me.host} has no role in fleet {fleet.name}; name it under [roles] of its file")
     return Security(own, keys, tuple(fleet.access.members()))
 
 

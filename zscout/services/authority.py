@@ -7,17 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
+from typing import Final
 
-from zscout.config.access import AccessPolicy
 from zscout.config.fleet import Fleet
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy
-from zscout.keyexpr import Rank, Sender, as_pattern, is_pattern
+from zscout.keyexpr import NODES, USERS, Rank, Sender, as_pattern, is_pattern
 from zscout.mesh import Refused
 from zscout.messages import Ask, Foresee, duration
 from zscout.types import ClientId, RcName
 
-MAX_NAMED = 4
-"""Names that a refusal lists of those who could."""
+OPERATORS: Final[frozenset[Rank]] = frozenset({"operator"})
 
 
 class Authority:
@@ -55,20 +54,20 @@ class Authority:
         if not self._enforced:
             return
         name = sender.host
-        self._check_rank(name, "ask for an ARC", ("client", "operator", "node", "manager"))
+        self._check_rank(name, "ask for an ARC", USERS)
         ceiling, most = self._policy.ceiling(name), None
         if "operator" not in self._policy.ranks_of(name):
             most = self._operator_priority - 1
         if ceiling.priority is not None:
             most = ceiling.priority if most is None else min(most, ceiling.priority)
         if most is not None and ask.priority > most:
-            raise self._refused(name, f"ask for priority {ask.priority}; at most {most}", ("operator",))
+            raise self._refused(name, f"ask for priority {ask.priority}; at most {most}")
         if ceiling.runtime:
             if ask.keep:
-                raise self._refused(name, "keep a hold", ("operator",))
+                raise self._refused(name, "keep a hold")
             if duration(ask.min_runtime, "min_runtime") > ceiling.runtime:
                 what = f"ask for {ask.min_runtime} s; at most {ceiling.runtime / 1e9:g}"
-                raise self._refused(name, what, ("operator",))
+                raise self._refused(name, what)
         for need in ask.needs:
             if not is_pattern(need) and not self.may_hold(name, need):
                 raise self._not_its(name, need)
@@ -81,7 +80,7 @@ class Authority:
     def check_hand_over(self, to: Sender, rcs: Iterable[RcName]) -> None:
         """Raises Refused where the new client may not hold what it is given."""
         if self._enforced:
-            self._check_rank(to.host, "take over an ARC", ("client", "operator", "node", "manager"))
+            self._check_rank(to.host, "take over an ARC", USERS)
             for rc in rcs:
                 if not self.may_hold(to.host, rc):
                     raise self._not_its(to.host, rc)
@@ -89,17 +88,17 @@ class Authority:
     def check_operator(self, sender: Sender, what: str) -> None:
         """Raises Refused for all but operators. `what` stands behind `may not`."""
         if self._enforced:
-            self._check_rank(sender.host, what, ("operator",))
+            self._check_rank(sender.host, what, OPERATORS)
 
     def check_user(self, sender: Sender, what: str) -> None:
         """Raises Refused for who may only look."""
         if self._enforced:
-            self._check_rank(sender.host, what, ("client", "operator", "node", "manager"))
+            self._check_rank(sender.host, what, USERS)
 
     def check_machine(self, sender: Sender, what: str) -> None:
         """Raises Refused for all but the placer, and components that move."""
         if self._enforced:
-            self._check_rank(sender.host, what, ("manager", "node"))
+            self._check_rank(sender.host, what, NODES)
 
     def may_hold(self, name: str, rc: RcName) -> bool:
         holders = self._policy.holders(rc) if self._enforced else None
@@ -114,29 +113,16 @@ class Authority:
     def is_removed(self, client: ClientId) -> bool:
         """Whether this client's name has no role any more that lets it hold anything."""
         ranks = self._policy.ranks_of(client.partition("/")[0])
-        return self._enforced and not ranks & {"client", "operator", "node", "manager"}
+        return self._enforced and not ranks & USERS
 
-    def _check_rank(self, name: str, what: str, needed: tuple[Rank, ...]) -> None:
-        if not self._policy.ranks_of(name) & {*needed}:
-            raise self._refused(name, what, needed)
+    def _check_rank(self, name: str, what: str, needed: Collection[Rank]) -> None:
+        if why := self._policy.refusal(name, what, needed):
+            raise Refused("not_allowed", why)
 
     def _not_its(self, name: str, rc: RcName) -> Refused:
-        who = _listed(sorted(self._policy.holders(rc) or ()))
-        return Refused("not_allowed", f"{_titled(self._policy, name)} may not hold {rc}; {who} may")
+        return Refused("not_allowed", self._policy.told(name, f"hold {rc}", self._policy.holders(rc) or ()))
 
-    def _refused(self, name: str, what: str, needed: tuple[Rank, ...]) -> Refused:
-        could = sorted(one for one, ranks in self._policy.ranks.items() if ranks & {*needed})
-        who = f"{_listed(could)} may" if could else f"nobody may: no {needed[0]} is named under [roles]"
-        return Refused("not_allowed", f"{_titled(self._policy, name)} may not {what}; {who}")
-
-
-def _titled(policy: AccessPolicy, name: str) -> str:
-    ranks = policy.ranks_of(name)
-    return f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, who has no role,"
-
-
-def _listed(names: list[str]) -> str:
-    if not names:
-        return "nobody"
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more
+    def _refused(self, name: str, what: str) -> Refused:
+        """Of what operators may."""
+        could = [one for one, ranks in self._policy.ranks.items() if "operator" in ranks]
+        return Refused("not_allowed", self._policy.told(name, what, could))

@@ -13,7 +13,7 @@ import msgspec
 
 from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStore
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import RANDOM, Role, Token
+from zscout.keyexpr import RANDOM, USERS, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
 from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
@@ -181,6 +181,10 @@ class RcmLink:
 
     async def submit(self, arc: OpenArc) -> None:
         """Asks until the RCM has answered; not while the client is paused. Raises RequestRefused."""
+        if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "ask for an ARC", USERS)):
+            # Access control lets no such question through: nobody would answer it.
+            arc.state = "refused"
+            raise RequestRefused(Problem("not_allowed", why))
         pause, longest = BACKOFF
         while arc.state == "asking":
             await self.store.resumed.wait()
