@@ -134,7 +134,7 @@ def test_a_node_that_is_told_to_stop_stops_in_peace(node: Node) -> None:
 
 
 def test_a_node_that_can_not_go_on_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def failing(_node: Node) -> None:
+    async def failing(*_: object) -> None:
         raise NodeFailed("a service failed: KeyError('x'); see the log")
 
     monkeypatch.setattr(node_module, "_main", failing)

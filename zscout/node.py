@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
 
@@ -30,8 +31,11 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.mesh.supervision import StallWatch
+from zscout.services.authority import Authority
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.node.load_reporter import LoadReporter
+from zscout.services.node.reload import Reload
+from zscout.services.node.service_manager import ServiceManager
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.recorder.process import RecorderProcess
 from zscout.types import SECOND
@@ -50,17 +54,22 @@ class NodeFailed(Exception):
     """A service of the node failed, and the node can't go on without it. It has been logged."""
 
 
-async def run_node(node: Node, stop: asyncio.Event) -> None:
+async def run_node(
+    node: Node, stop: asyncio.Event, reload: Reload | None = None, manager: ServiceManager | None = None
+) -> None:
     """Runs a node until `stop`. Raises MeshError where it can't begin, NodeFailed where it can't go on."""
     async with await ZenohMesh.open(node.fleet, Sender(node.host, "node")) as mesh:
-        await run_services(node, mesh, stop)
+        await run_services(node, mesh, stop, reload, manager)
 
 
-async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
+async def run_services(
+    node: Node, mesh: Mesh, stop: asyncio.Event, reload: Reload | None = None, manager: ServiceManager | None = None
+) -> None:
     """The services of a node, until `stop` or until one fails. The recorder, the load reporter and the
     candidate start again by themselves; an RC and the component host end the node, and all in order. Raises BadInput
     before anything begins where an RC's driver can't be had."""
     me, failures = mesh.me, list[Exception]()
+    manager = manager or ServiceManager()
     drivers = {spec.name: driver_for(spec) for spec in node.rcs}
 
     def fail(error: Exception) -> None:
@@ -102,7 +111,8 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
                 raise NodeFailed(f"{spec.name} can't be opened: {error!r}; see the log") from error
             stack.push_async_callback(rc.stop)
             log.info("runs %s (%s)", spec.name, driver_name(spec))
-        components = ComponentHost(mesh, node.fleet, node.components, fail)
+        authority = Authority(node.fleet)
+        components = ComponentHost(mesh, node.fleet, node.components, fail, authority=authority)
         if node.load:
             reporter = LoadReporter(mesh, node.labels, components.running, tree=node.load == "tree")
             reporter.start()
@@ -111,18 +121,35 @@ async def run_services(node: Node, mesh: Mesh, stop: asyncio.Event) -> None:
             recorder = RecorderProcess(node.recorder, node.fleet, node.host)
             await recorder.start()
             stack.push_async_callback(recorder.stop)
+        candidate = None
         if node.candidate:
-            candidate = Candidate(mesh, node.fleet, kept)
+            candidate = Candidate(mesh, node.fleet, kept, authority)
             candidate.start()
             stack.push_async_callback(candidate.stop)
         await components.start()
         # Before all else: they give back their ARCs while there is an RCM and while there are RCs.
         stack.push_async_callback(components.stop)
-        log.info("%s is on the mesh of fleet %s", node.host, node.fleet.name)
+        status = f"{node.host} is on the mesh of fleet {node.fleet.name}"
+        log.info(status)
+        if reload is not None:
+            reload.takes("components", lambda new: components.take(new.components))
+
+            def take_rights(new: Node) -> None:
+                authority.reload(new.fleet)
+                if candidate is not None:
+                    candidate.on_reload()
+                mesh.admit(new.fleet.access.members())
+
+            for table in ("roles", "groups", "access", "quotas", "ceilings"):
+                reload.takes(table, take_rights)
+            reloading = asyncio.create_task(reload.serve(manager, status))
+            stack.callback(reloading.cancel)
+        manager.ready(status)
         alone = asyncio.get_running_loop().call_later(ALONE_AFTER, _say_if_alone, mesh)
         stack.callback(alone.cancel)
         await stop.wait()
         log.info("stopping")
+        manager.stopping("ends in order")
     if failures:
         raise NodeFailed(f"a service failed: {failures[0]!r}; see the log") from failures[0]
 
@@ -135,14 +162,17 @@ def _say_if_alone(mesh: Mesh) -> None:
         )
 
 
-async def _main(node: Node) -> None:
-    stop = asyncio.Event()
+async def _main(node: Node, read: Callable[[], Node], manager: ServiceManager) -> None:
+    stop, reload = asyncio.Event(), Reload(node, read)
+    reload.on_hangup()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     try:
-        await run_node(node, stop)
+        await run_node(node, stop, reload, manager)
     finally:
+        # Python puts back its handlers as it ends, and would be ended by a late one.
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
         # The interpreter waits for threads, and one of a driver may hang in its device.
         last = threading.Timer(THREADS_END, _end)
         last.daemon = True
@@ -172,10 +202,15 @@ def main(file: Path | None, log_level: str) -> None:
       zscout-node lab.toml
     """
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    manager = ServiceManager.from_env()
+
+    def read() -> Node:
+        return load_node(file) if file is not None else default_node()
+
     try:
-        node = load_node(file) if file is not None else default_node()
-        uvloop.run(_main(node))
+        uvloop.run(_main(read(), read, manager))
     except (BadInput, MeshError, NodeFailed) as error:
+        manager.stopping(str(error))
         click.echo(f"zscout-node: {error}", err=True)
         sys.exit(2 if isinstance(error, BadInput) else 1)
 

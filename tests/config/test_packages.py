@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from zscout.config.packages import MODULES, how_to_get
+from zscout.config.packages import EXTRAS, MODULES, how_to_get
 
 ROOT = Path(__file__).parents[2]
 
@@ -44,10 +44,11 @@ def test_its_versions_are_those_that_are_tested() -> None:
         ("cv2", "'opencv-python-headless>=4.12'"),
         ("numpy.typing", "'numpy>=2'"),
         ("rerun.blueprint", "'rerun-sdk==0.41.*'"),
+        ("cryptography.x509", "'cryptography>=46'"),
     ],
 )
 def test_what_is_missing_is_named_with_the_command_that_brings_it(module: str, requirement: str) -> None:
-    package = MODULES[module.partition(".")[0]]
+    package = (MODULES | EXTRAS)[module.partition(".")[0]]
     said = how_to_get(ModuleNotFoundError(f"No module named {module!r}", name=module))
     command = f"{sys.executable} -m pip install {requirement}"
     assert said == f"needs {package}, which is not installed here; {command} brings it"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -42,11 +41,8 @@ def authority(folder: Path, text: str = FILE) -> Authority:
     return Authority(load_fleet(folder / "fleet.toml"))
 
 
-def ask(*needs: str, **how: Any) -> Ask:
-    return Ask(
-        **({"id": "q1", "arc": "survey", "priority": 1, "min_runtime": Decimal(5)} | how),
-        needs={need: {} for need in needs},
-    )
+def ask(*needs: str, priority: int = 1, keep: bool = False, min_runtime: int = 5) -> Ask:
+    return Ask("q1", "survey", {need: {} for need in needs}, priority, Decimal(min_runtime), keep)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +50,7 @@ def ask(*needs: str, **how: Any) -> Ask:
     [
         ("bob", ask("robot/scout1", priority=9), ""),
         ("bob", ask("robot/scout1", priority=10), "bob (client) may not ask for priority 10; at most 9; ada may"),
-        ("ada", ask("robot/scout1", priority=10, keep=True, min_runtime=Decimal(600)), ""),
+        ("ada", ask("robot/scout1", priority=10, keep=True, min_runtime=600), ""),
         ("anvil", ask("robot/scout1", priority=10), "anvil (manager) may not ask for priority 10; at most 9; ada may"),
         ("wall", ask("robot/scout1"), "wall (viewer) may not ask for an ARC; ada, anvil, bellows, bob and 1 more may"),
         (
@@ -66,7 +62,7 @@ def ask(*needs: str, **how: Any) -> Ask:
         ("eve", ask("robot/arm1"), ""),
         ("bob", ask("robot/*"), ""),
         ("bob", ask("robot/scout1", keep=True), "bob (client) may not keep a hold; ada may"),
-        ("bob", ask("robot/scout1", min_runtime=Decimal(61)), "bob (client) may not ask for 61 s; at most 60; ada may"),
+        ("bob", ask("robot/scout1", min_runtime=61), "bob (client) may not ask for 61 s; at most 60; ada may"),
         ("eve", ask("a/1", "a/2", "a/3", "a/4"), "arms may hold 3 RCs at one time, and this asks for more"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What a light installation leaves out (requirements/light.txt), and the command that brings it."""
+"""What an installation may lack (requirements/light.txt leaves it out, or an extra brings it), and how to get it."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ from importlib import metadata
 from typing import Final
 
 MODULES: Final = {"cv2": "opencv-python-headless", "numpy": "numpy", "rerun": "rerun-sdk"}
-"""The package that each module comes with."""
+"""What a light installation leaves out: the package that each module comes with."""
+EXTRAS: Final = {"cryptography": "cryptography"}
+"""The same of what only an extra brings."""
 
 
 def how_to_get(error: ImportError) -> str:
     """What is missing where this import failed, with the command that brings it, to stand behind the name of what needs
     it; empty if it is none of these."""
-    package = MODULES.get((error.name or "").partition(".")[0])
+    package = (MODULES | EXTRAS).get((error.name or "").partition(".")[0])
     if package is None or not isinstance(error, ModuleNotFoundError):
         return ""
     try:
         required = metadata.requires("zscout") or []
     except metadata.PackageNotFoundError:  # run from its sources
         required = []
-    wanted = next((one for one in required if re.split(r"[^\w.-]", one)[0] == package), package)
+    wanted = next((one.partition(";")[0] for one in required if re.split(r"[^\w.-]", one)[0] == package), package)
     command = shlex.join([sys.executable, "-m", "pip", "install", wanted])
     return f"needs {package}, which is not installed here; {command} brings it"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import stat
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -44,11 +45,18 @@ def _top(named: Path | None, env: Mapping[str, str]) -> Path | None:
     return None
 
 
-def write_durably(path: Path, content: bytes) -> None:
-    """Writes a file whole or not at all; it is on disk on return. Raises OSError."""
+def write_durably(path: Path, content: bytes, mode: int | None = None) -> None:
+    """Writes a file whole or not at all; it is on disk on return. With `mode` a new file has this from the first
+    byte on, and one that was there keeps its own, and its owner. Raises OSError."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     new = path.with_name(f".{path.name}.new")
-    with new.open("wb") as file:
+    new.unlink(missing_ok=True)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    with open(os.open(new, flags, 0o666 if mode is None else mode), "wb") as file:  # noqa: PTH123 - a descriptor
+        if mode is not None and path.exists():
+            was = path.stat()
+            os.fchown(file.fileno(), was.st_uid, was.st_gid)
+            os.fchmod(file.fileno(), stat.S_IMODE(was.st_mode))
         file.write(content)
         file.flush()
         os.fsync(file.fileno())

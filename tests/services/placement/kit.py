@@ -178,7 +178,7 @@ class PlacerFleet:
     async def ask(self, operation: PlacerOperation | RankAsk, kind: type[R], timeout: float = 90) -> R:
         """The answer of placer or balancer. Raises Refusal."""
         keys = self.watcher.keys
-        key = keys.rank if isinstance(operation, RankAsk) else keys.placer(self.client.me)
+        key = keys.rank if isinstance(operation, RankAsk) else keys.placer(self.watcher.me)
         reply = await self.watcher.ask_one(key, operation, kind, timeout=timeout)
         assert reply is not None, "no answer"
         if reply.message is None:

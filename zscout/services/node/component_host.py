@@ -77,6 +77,10 @@ class ComponentHost:
             served.close()
         await self.supervisor.close()
 
+    def take(self, rules: ComponentsConfig) -> None:
+        """What may be started from now on; what runs goes on."""
+        self._rules = rules
+
     def running(self) -> list[RunningComponent]:
         """For the load report; may be called from any thread."""
         return [

@@ -1,0 +1,50 @@
+#!/usr/bin/env bash
+# A machine of its own: systemd as PID 1, on a copy of this file system that is thrown away. `machine.py` runs it in new
+# namespaces (mounts, hostname, IPC, control groups), with the folder of the machine.
+set -euo pipefail
+folder=$1 project=$2 packages=$3 python=$4
+root=$folder/root
+mount --make-rprivate /
+mkdir -p "$root" "$folder/layer"
+mount -t tmpfs tmpfs "$folder/layer"
+mkdir "$folder/layer/upper" "$folder/layer/work"
+mount -t overlay overlay -o "lowerdir=/,upperdir=$folder/layer/upper,workdir=$folder/layer/work" "$root"
+mount --rbind /dev "$root/dev"
+mount -t sysfs sysfs "$root/sys"
+mount -t cgroup2 cgroup2 "$root/sys/fs/cgroup"
+mount -t tmpfs -o mode=755 tmpfs "$root/run"
+mount -t tmpfs -o mode=1777 tmpfs "$root/tmp"
+
+# Nothing of this machine's own starts there.
+rm -rf "$root"/etc/systemd/system/* "$root"/lib/systemd/system/*.wants "$root"/lib/systemd/system-generators/*
+for target in sysinit basic network-online; do
+  printf '[Unit]\nDefaultDependencies=no\n' >"$root/etc/systemd/system/$target.target"
+done
+printf '[Unit]\nDefaultDependencies=no\nAllowIsolate=yes\n' >"$root/etc/systemd/system/machine.target"
+cp "$project"/deploy/systemd/* "$root/etc/systemd/system/"
+mkdir "$root/etc/systemd/system/service.d"
+printf '[Service]\nStandardOutput=append:/var/log/zscout.log\nStandardError=append:/var/log/zscout.log\n' \
+  >"$root/etc/systemd/system/service.d/log.conf"
+systemd-sysusers --root="$root" "$project/deploy/sysusers.d/zscout.conf"
+
+# The unit sees neither /root, /home nor /tmp, where any of these may be.
+mkdir -p "$root"/opt/zscout/{project,packages,python,current/bin}
+mount --bind "$project" "$root/opt/zscout/project"
+mount --bind "$packages" "$root/opt/zscout/packages"
+mount --bind "$python" "$root/opt/zscout/python"
+cat >"$root/opt/zscout/current/bin/zscout-node" <<'EOF'
+#!/bin/sh
+export PYTHONPATH=/opt/zscout/project:/opt/zscout/packages LD_LIBRARY_PATH=/opt/zscout/python/lib PYTHONDONTWRITEBYTECODE=1
+exec /opt/zscout/python/bin/python3 -m zscout.node "$@"
+EOF
+chmod 755 "$root/opt/zscout/current/bin/zscout-node"
+mkdir -p "$root/etc/zscout"
+cp "$folder"/etc/* "$root/etc/zscout/"
+chmod 755 "$root/etc/zscout"
+chmod 644 "$root"/etc/zscout/*
+
+# shellcheck disable=SC2016 # it is for the inner shell
+exec unshare --pid --fork --kill-child chroot "$root" /bin/sh -c '
+  mount -t proc proc /proc && mount --bind /proc/sys /proc/sys && mount -o remount,ro,bind /proc/sys
+  export container=zscout
+  exec /lib/systemd/systemd --system --unit=machine.target --log-target=console --show-status=no'

@@ -1,0 +1,119 @@
+"""A node that reads its files again: what is taken, what waits for a restart, and what is no settings at all."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.mesh.kit import run
+from zscout.config.node import Node, load_node
+from zscout.services.node.reload import Reload, settings
+
+NODE = """
+[node]
+host = "anvil"
+fleet = "fleet.toml"
+[components]
+max = 3
+[[rc]]
+name = "robot/a"
+driver = "exclusive"
+"""
+FLEET = """
+[fleet]
+name = "lab"
+[mesh]
+lease = 1.5
+[devices]
+anvil = ["robot/a"]
+"""
+
+
+class Files:
+    """A node file and its fleet file, rewritten at will."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file, self._fleet = folder / "anvil.toml", folder / "fleet.toml"
+        self.write(NODE, FLEET)
+        self.reload = Reload(load_node(self.file), lambda: load_node(self.file))
+
+    def write(self, node: str, fleet: str = FLEET) -> None:
+        self.file.write_text(node)
+        self._fleet.write_text(fleet)
+
+    def again(self, node: str, fleet: str = FLEET) -> str:
+        self.write(node, fleet)
+        return run(self.reload.now())
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Files:
+    return Files(tmp_path)
+
+
+def test_what_somebody_takes_is_given_to_it_once(files: Files) -> None:
+    given: list[int] = []
+    files.reload.takes("components", lambda node: given.append(node.components.max))
+    assert files.again(NODE) == "SIGHUP: the files say what they said"
+    new = NODE.replace("max = 3", 'max = 4\nkinds = ["counter"]')
+    assert files.again(new) == "SIGHUP: took components.kinds, components.max"
+    assert files.again(new) == "SIGHUP: the files say what they said"
+    assert given == [4]
+
+
+def test_what_nobody_takes_waits_for_a_restart_and_is_named_until_then(
+    files: Files, caplog: pytest.LogCaptureFixture
+) -> None:
+    files.reload.takes("components", lambda _node: None)
+    node = NODE.replace("max = 3", "max = 4").replace("robot/a", "robot/b")
+    fleet = FLEET.replace("1.5", "2.0") + 'bellows = ["robot/c"]\n[limits]\nmax_runtime = 60\n'
+    later = "restart this node to take devices.bellows, limits.max_runtime, mesh.lease, rc.robot/a, rc.robot/b"
+    caplog.set_level(logging.INFO)
+    assert files.again(node, fleet) == f"SIGHUP: took components.max; {later}"
+    assert files.again(node, fleet) == f"SIGHUP: {later}"
+    assert [(one.levelname, one.message) for one in caplog.records] == [
+        ("WARNING", f"SIGHUP: took components.max; {later}"),
+        ("WARNING", f"SIGHUP: {later}"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda text: text.replace("max = 3", "max = 0"), "components.max: is 0; write a whole number from 1 to 256"),
+        (lambda text: text + "oops = [", "mend the TOML there"),
+        (lambda text: text.replace('"exclusive"', '"laser"'), 'no driver "laser" is installed here'),
+        (lambda text: text.replace("fleet.toml", "none.toml"), "none.toml"),
+    ],
+)
+def test_a_bad_file_changes_nothing_and_is_told(files: Files, spoil: Callable[[str], str], said: str) -> None:
+    given: list[Node] = []
+    files.reload.takes("components", given.append)
+    line = files.again(spoil(NODE.replace("robot/a", "robot/b")))
+    assert line.startswith("SIGHUP: ")
+    assert said in line
+    assert line.endswith("; the settings of before stay")
+    assert "\n" not in line
+    assert files.again(NODE) == "SIGHUP: the files say what they said"
+    assert given == []
+
+
+def test_one_that_fails_to_take_it_keeps_nobody_else_from_it(files: Files, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(_node: Node) -> None:
+        raise KeyError("a fault of its own")
+
+    given: list[Node] = []
+    files.reload.takes("mesh", fail)
+    files.reload.takes("components", given.append)
+    line = files.again(NODE.replace("max = 3", "max = 4"), FLEET.replace("1.5", "2.0"))
+    assert line == "SIGHUP: took components.max; restart this node to take mesh.lease"
+    assert len(given) == 1
+    assert "the new [mesh] can't be taken" in caplog.messages
+
+
+def test_every_setting_of_both_files_has_the_name_that_it_has_there(files: Files) -> None:
+    tables = {key.partition(".")[0] for key in settings(load_node(files.file))}
+    assert tables == {"node", "components", "rc", "fleet", "mesh", "limits", "timing", "placement", "devices"}

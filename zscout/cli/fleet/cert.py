@@ -1,0 +1,226 @@
+"""`zscout cert`: the certificates of a secured fleet, made, renewed and shown."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from zscout import terminal
+from zscout.cli import common
+from zscout.cli.common import F, Parsed
+from zscout.config import strict
+from zscout.config.certificates import (
+    CA,
+    CA_KEY,
+    KEYS_VARIABLE,
+    Certificates,
+    Validity,
+    read_cas,
+    read_certificates,
+    shown,
+)
+from zscout.config.strict import BadInput, quoted
+from zscout.terminal import Table
+
+if TYPE_CHECKING:
+    from zscout.config.certificate_authority import CertificateAuthority
+
+CA_FOLDER: Final = Path("zscout-ca")
+MAX_DAYS: Final = 36_525
+STYLES: Final = {"valid": "green", "ends_soon": "yellow"}
+"""Of those that can be used."""
+FOLDER: Final = click.Path(file_okay=False, path_type=Path)
+
+
+def _lasting(text: str, option: str) -> timedelta:
+    seconds = strict.parse_duration(f"{text}d") or strict.parse_duration(text)
+    if not seconds or not 1 <= seconds <= MAX_DAYS * 86_400:
+        raise BadInput(
+            f"{option}: {quoted(text)} is no time up to {MAX_DAYS:,} days; write days, or a unit, as in 90, 12h, 90s"
+        )
+    return timedelta(seconds=float(seconds))
+
+
+def days_option(default: str) -> Callable[[F], F]:
+    """`--days`; the parameter is `lasts`."""
+    kind = Parsed("days", _lasting)
+    return click.option(
+        "--days", "lasts", type=kind, default=default, help="How long from now on; or with a unit, as 12h."
+    )
+
+
+ca_option = click.option(
+    "--ca", type=FOLDER, default=CA_FOLDER, envvar="ZSCOUT_CA", show_envvar=True, help="The folder of the CA."
+)
+
+
+@click.group()
+def cert() -> None:
+    """Make, renew and show the certificates of a secured fleet.
+
+    A certificate is a folder with ca.pem, cert.pem and key.pem, of a machine or of a person. All but `show` need
+    the package cryptography.
+
+    \b
+    Examples:
+      zscout cert ca
+      zscout cert issue anvil bellows ada
+      zscout cert renew anvil bellows
+      zscout cert show anvil --json
+    """
+
+
+@cert.command()
+@click.argument("folder", type=FOLDER, default=CA_FOLDER)
+@days_option("3650")
+@click.option("--force", is_flag=True, help="Overwrite one that is there: nothing that it issued can be renewed then.")
+def ca(folder: Path, lasts: timedelta, force: bool) -> None:
+    """Make a CA in FOLDER, with a key that is to be kept secret.
+
+    Who has ca-key.pem can issue a certificate to anybody. Keep it on one machine, best none of the fleet's.
+
+    \b
+    Examples:
+      zscout cert ca
+      zscout cert ca vault/zscout-ca --days 1825
+    """
+    from zscout.config.certificate_authority import CertificateAuthority
+
+    with _writing():
+        made = CertificateAuthority.make(folder, lasts, datetime.now(UTC), force=force)
+    terminal.print_line(f"{folder}: {made.name}, until {shown(made.ends)}; keep {folder / CA_KEY} secret")
+
+
+@cert.command()
+@click.argument("name", type=common.NAME, nargs=-1, required=True)
+@ca_option
+@click.option("--to", type=FOLDER, default=Path(), help="Where to make the folder NAME.")
+@days_option("365")
+@click.option("--force", is_flag=True, help="Overwrite a certificate that is there.")
+def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, force: bool) -> None:
+    """Make a folder NAME with a certificate, for each machine or person of this name.
+
+    A machine's is named as its host in the node file, a person's as in the roles of the fleet file. Nobody else
+    can send what says that it is of NAME: no two may have one name.
+
+    \b
+    Examples:
+      zscout cert issue anvil bellows ada
+      zscout cert issue wall --days 30
+    """
+    authority = _authority(ca)
+    for one in name:
+        with _writing():
+            ends = authority.issue(one, to / one, lasts, datetime.now(UTC), force=force)
+        terminal.print_line(f"{to / one}: until {shown(ends)}; copy this folder to {one}, its key to nobody else")
+
+
+@cert.command()
+@click.argument("folders", metavar="FOLDER...", type=FOLDER, nargs=-1, required=True)
+@ca_option
+@days_option("365")
+@click.option("--new-key", is_flag=True, help="Make a new key as well.")
+def renew(folders: tuple[Path, ...], ca: Path, lasts: timedelta, new_key: bool) -> None:
+    """Renew the certificates in these folders in place, expired ones as well.
+
+    The key stays, so that cert.pem and ca.pem are all that need be copied to where they are used; key.pem need not
+    be here. What runs uses the new one for its next links, and keeps those it has.
+
+    \b
+    Examples:
+      zscout cert renew anvil bellows ada
+      zscout cert renew anvil --new-key
+    """
+    authority = _authority(ca)
+    for folder in folders:
+        with _writing():
+            ends = authority.renew(folder, lasts, datetime.now(UTC), new_key=new_key)
+        terminal.print_line(f"{folder}: until {shown(ends)}")
+
+
+@cert.command()
+@click.argument("folders", metavar="[FOLDER]...", type=FOLDER, nargs=-1)
+@common.json_option("Print one JSON object.")
+def show(folders: tuple[Path, ...], as_json: bool) -> int:
+    """Show whose certificates these folders hold, until when, and what is wrong with them.
+
+    Without FOLDER it is the one that $ZSCOUT_KEYS names. Also for the folder of a CA. Exit code 1: one is expired,
+    not valid yet, or can't be used.
+
+    \b
+    Examples:
+      zscout cert show anvil bellows ada
+      zscout cert show zscout-ca
+      zscout cert show anvil --json | jq '.certificates[0].ends_in'
+    """
+    if not folders:
+        named = os.environ.get(KEYS_VARIABLE)
+        if not named:
+            raise BadInput(f"name a folder; ${KEYS_VARIABLE} names none")
+        folders = (Path(named),)
+    now = datetime.now(UTC)
+    found = [one for folder in folders for one in _found(folder, now)]
+    if as_json:
+        terminal.print_json({"certificates": found})
+    else:
+        _print(found)
+    return int(any(one["state"] not in STYLES for one in found))
+
+
+def _found(folder: Path, now: datetime) -> Iterator[dict[str, Any]]:
+    """What `--json` prints of a folder: one object, or one for each CA where it is a CA's."""
+    nothing: dict[str, Any] = dict.fromkeys(("name", "ends", "ends_in", "issuer", "trusted", "problem"))
+    held: list[Certificates] | list[Validity]
+    try:
+        held = read_cas(folder / CA) if (folder / CA_KEY).exists() else [read_certificates(folder)]
+    except BadInput as error:
+        yield {"folder": str(folder), "state": "unusable", **nothing, "problem": str(error)}
+        return
+    for one in held:
+        more = {"issuer": one.issuer, "trusted": one.trusted} if isinstance(one, Certificates) else {}
+        said = {"name": one.name, "ends": one.ends.isoformat(), "ends_in": one.ends_in(now)}
+        yield {"folder": str(folder), "state": _state(one, now), **nothing, **said, **more}
+
+
+def _state(one: Validity, now: datetime) -> str:
+    if now < one.begins:
+        return "not_yet"
+    if now >= one.ends:
+        return "expired"
+    return "ends_soon" if one.soon(now) else "valid"
+
+
+def _print(found: list[dict[str, Any]]) -> None:
+    rows = []
+    for one in found:
+        state = one["state"].replace("_", " ")
+        if one["name"] is None:
+            rows.append((one["folder"], "-", state, "-", "-", one["problem"]))
+            continue
+        ends = shown(datetime.fromisoformat(one["ends"]))
+        left = f"{ends} ({terminal.span(one['ends_in'])})" if one["ends_in"] > 0 else ends
+        about = "CA" if one["trusted"] is None else f"trusts {', '.join(one['trusted'])}"
+        rows.append((one["folder"], one["name"], state, left, one["issuer"] or "-", about))
+    columns = ("FOLDER", "NAME", "STATE", "ENDS", "ISSUER", "ABOUT")
+    Table("", columns, rows, [STYLES.get(one["state"], "red") for one in found], {"ISSUER"}).print()
+
+
+def _authority(folder: Path) -> CertificateAuthority:
+    from zscout.config.certificate_authority import CertificateAuthority
+
+    return CertificateAuthority.read(folder, datetime.now(UTC))
+
+
+@contextmanager
+def _writing() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        raise common.Failed(f"{where}can't be written: {error.strerror}") from None

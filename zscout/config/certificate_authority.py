@@ -1,0 +1,217 @@
+"""A fleet's own CA, a folder with `ca.pem` and `ca-key.pem`: it issues certificates and renews them.
+
+What it issues is for both ends of a link, on the curve P-256, which every TLS library has. Needs the package
+`cryptography` (extra `secure`), on the machine of the CA alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Final, Self
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from zscout.config.certificates import CA, CA_KEY, CERT, KEY, MAX_FILE, Validity, check_mode, shown
+from zscout.config.state_folder import write_durably
+from zscout.config.strict import BadInput, Where, check_name, read_text
+
+PUBLIC, PRIVATE = 0o644, 0o600
+BEFORE: Final = timedelta(hours=1)
+"""How long ago a new certificate begins, for hosts whose clocks are late."""
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateAuthority:
+    """One that can issue. Where a file can't be written, its methods raise OSError."""
+
+    folder: Path
+    _certificate: x509.Certificate
+    _key: ec.EllipticCurvePrivateKey
+    _trusted: bytes
+    """All of `ca.pem`, which may hold other CAs beside this one: what those trust whom it issues a certificate."""
+
+    @classmethod
+    def make(cls, folder: Path, lasts: timedelta, now: datetime, *, force: bool = False) -> Validity:
+        """A new one in this folder. Raises BadInput, for one that is there unless with `force`."""
+        _check_free(folder, (CA, CA_KEY), force)
+        key = _new_key()
+        # A name of its own, by which people and programs tell it from the next one.
+        number = x509.SubjectKeyIdentifier.from_public_key(key.public_key()).digest[:4].hex()
+        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"zscout CA {number}")])
+        ends = _whole(now + lasts)
+        certificate = (
+            _builder(name, name, key.public_key(), key.public_key(), now, ends)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_usage(signs=True), critical=True)
+            .sign(key, SHA256())
+        )
+        write_durably(folder / CA_KEY, _private(key), PRIVATE)
+        write_durably(folder / CA, certificate.public_bytes(Encoding.PEM), PUBLIC)
+        return Validity(f"zscout CA {number}", now, ends)
+
+    @classmethod
+    def read(cls, folder: Path, now: datetime) -> Self:
+        """That in this folder. Raises BadInput where it is not whole, open to others or expired."""
+        where, key_where = Where(str(folder / CA)), Where(str(folder / CA_KEY))
+        if not (folder / CA_KEY).exists():
+            raise key_where.bad("there is no such file", "make a CA with `zscout cert ca`, or name its folder by --ca")
+        check_mode(folder / CA_KEY, 0o077, "600")
+        trusted = read_text(folder / CA, max_bytes=MAX_FILE).encode()
+        try:
+            key = load_pem_private_key(read_text(folder / CA_KEY, max_bytes=MAX_FILE).encode(), None)
+        except (ValueError, TypeError, UnsupportedAlgorithm):
+            raise key_where.bad("holds no private key that can be read", _COPY) from None
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise key_where.bad("is not a key on an elliptic curve", "make a CA with `zscout cert ca`")
+        public = _public(key.public_key())
+        own = next((one for one in _parsed(trusted, where) if _public(one.public_key()) == public), None)
+        if own is None:
+            raise key_where.bad(f"is the key of no certificate in {CA}", _COPY)
+        if now >= own.not_valid_after_utc:
+            raise where.bad(
+                f"this CA has ended on {shown(own.not_valid_after_utc)}", "make a new one, as for a change of CA"
+            )
+        return cls(folder, own, key, trusted)
+
+    def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime, *, force: bool = False) -> datetime:
+        """Makes the folder of who has this name; returns when its certificate ends: not after this CA. Raises BadInput,
+        for a folder that has one already unless with `force`."""
+        check_name(name, Where("NAME"))
+        _check_free(folder, (CA, CERT, KEY), force)
+        return self._write(folder, name, lasts, now, _new_key())
+
+    def renew(self, folder: Path, lasts: timedelta, now: datetime, *, new_key: bool = False) -> datetime:
+        """Gives the certificate in this folder, expired or not, a later end, in place; its key, which need not be
+        there, stays unless `new_key`. Raises BadInput where no CA in this one's `ca.pem` has issued it."""
+        where = Where(str(folder / CERT))
+        old = _parsed(read_text(folder / CERT, max_bytes=MAX_FILE).encode(), where)[0]
+        if not any(_has_issued(ca, old) for ca in _parsed(self._trusted, Where(str(self.folder / CA)))):
+            raise where.bad(
+                f"was issued by no CA in {self.folder / CA}", "name the folder of its CA by --ca, or issue it anew"
+            )
+        name = ", ".join(str(one.value) for one in old.subject.get_attributes_for_oid(NameOID.COMMON_NAME))
+        check_name(name, where)
+        if new_key:
+            return self._write(folder, name, lasts, now, _new_key())
+        public = old.public_key()
+        if not isinstance(public, ec.EllipticCurvePublicKey):
+            raise where.bad("is of a key that is on no elliptic curve", "renew it with --new-key")
+        return self._write(folder, name, lasts, now, public)
+
+    def _write(
+        self,
+        folder: Path,
+        name: str,
+        lasts: timedelta,
+        now: datetime,
+        key: ec.EllipticCurvePrivateKey | ec.EllipticCurvePublicKey,
+    ) -> datetime:
+        """One file after the other, each whole. Who reads between them may find no pair, and tries again."""
+        public = key if isinstance(key, ec.EllipticCurvePublicKey) else key.public_key()
+        ends = min(_whole(now + lasts), self._certificate.not_valid_after_utc)
+        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        certificate = (
+            _builder(subject, self._certificate.subject, public, self._key.public_key(), now, ends)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(signs=False), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(both), critical=False)
+            # For programs other than zscout's that dial a host by its name.
+            .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
+            .sign(self._key, SHA256())
+        )
+        write_durably(folder / CA, self._trusted, PUBLIC)
+        if isinstance(key, ec.EllipticCurvePrivateKey):
+            write_durably(folder / KEY, _private(key), PRIVATE)
+        write_durably(folder / CERT, certificate.public_bytes(Encoding.PEM), PUBLIC)
+        return ends
+
+
+_COPY: Final = f"copy {CA} and {CA_KEY} from one folder"
+
+
+def _check_free(folder: Path, names: tuple[str, ...], force: bool) -> None:
+    there = [name for name in names if (folder / name).exists()]
+    if there and not force:
+        raise BadInput(f"{folder}: has {' and '.join(there)} already; name another folder, or overwrite with --force")
+
+
+def _parsed(text: bytes, where: Where) -> list[x509.Certificate]:
+    try:
+        return x509.load_pem_x509_certificates(text)
+    except ValueError:
+        raise where.bad("holds no certificate in PEM that can be read", "copy it anew") from None
+
+
+def _has_issued(ca: x509.Certificate, one: x509.Certificate) -> bool:
+    try:
+        one.verify_directly_issued_by(ca)
+    except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm):
+        return False
+    return True
+
+
+def _new_key() -> ec.EllipticCurvePrivateKey:
+    return ec.generate_private_key(ec.SECP256R1())
+
+
+def _private(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def _public(key: CertificatePublicKeyTypes) -> bytes:
+    return key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+
+
+def _whole(at: datetime) -> datetime:
+    """The next whole second: certificates have no others."""
+    return at if at.microsecond == 0 else at.replace(microsecond=0) + timedelta(seconds=1)
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePublicKey,
+    issuer_key: ec.EllipticCurvePublicKey,
+    now: datetime,
+    ends: datetime,
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - BEFORE)
+        .not_valid_after(ends)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key), critical=False)
+    )
+
+
+def _usage(*, signs: bool) -> x509.KeyUsage:
+    """Signs certificates, or else handshakes."""
+    return x509.KeyUsage(
+        digital_signature=not signs,
+        key_cert_sign=signs,
+        crl_sign=signs,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )

@@ -1,0 +1,219 @@
+"""The folder of a machine's or person's certificate: `ca.pem` (whom it trusts), `cert.pem` and `key.pem`.
+
+It takes the standard library alone to read it, so that nodes and clients need no more. That has no public parser of
+certificates, but TLS: the certificate shakes hands with itself, in memory, as server and as client. Times are left out
+there and looked at here, so that what is expired can be told as such, and shown."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from zscout.config.strict import Where, check_name, quoted, read_text
+
+if TYPE_CHECKING:
+    import ssl
+
+CA: Final = "ca.pem"
+CERT: Final = "cert.pem"
+KEY: Final = "key.pem"
+CA_KEY: Final = "ca-key.pem"
+"""In the folder of a CA, beside its `ca.pem`."""
+KEYS_VARIABLE: Final = "ZSCOUT_KEYS"
+"""Names a person's folder."""
+MAX_FILE: Final = 65_536
+"""Bytes of each file."""
+SOON: Final = timedelta(days=14)
+"""Before an end from when on it is warned of; of a short life the last third."""
+NO_CHECK_TIME: Final = 0x200000
+"""OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which `ssl` passes on and does not name."""
+ROUNDS: Final = 3
+"""Of a handshake in which each side speaks; TLS 1.3 takes two."""
+UNKNOWN_ISSUER: Final = frozenset({2, 7, 18, 19, 20, 21})
+"""OpenSSL's codes for a certificate that no known CA has signed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Validity:
+    """Of whom a certificate is, and for which time."""
+
+    name: str
+    """The common name."""
+    begins: datetime
+    ends: datetime
+
+    def ends_in(self, now: datetime) -> float:
+        """Seconds until its end; negative: since then."""
+        return (self.ends - now).total_seconds()
+
+    def soon(self, now: datetime) -> bool:
+        """Whether its end, not yet there, is near enough to be told."""
+        return timedelta(0) < self.ends - now <= min(SOON, (self.ends - self.begins) / 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Certificates(Validity):
+    """What such a folder holds. It ends with its CA, if not before."""
+
+    folder: Path
+    issuer: str
+    """The common name of its CA."""
+    trusted: tuple[str, ...]
+    """Those of all CAs in `ca.pem`."""
+
+    @property
+    def ca(self) -> Path:
+        return self.folder / CA
+
+    @property
+    def cert(self) -> Path:
+        return self.folder / CERT
+
+    @property
+    def key(self) -> Path:
+        return self.folder / KEY
+
+    def check(self, now: datetime, name: str | None = None) -> None:
+        """That it can be used now, by who has this `name`. Raises BadInput."""
+        where = Where(str(self.cert))
+        if name is not None and self.name != name:
+            raise where.bad(
+                f"is the certificate of {quoted(self.name)}, and this is {quoted(name)}",
+                f"put that of {quoted(name)} there, or mend the name",
+            )
+        if now < self.begins:
+            raise where.bad(f"is valid from {shown(self.begins)} on", "set this host's clock, or wait")
+        if now >= self.ends:
+            raise where.bad(
+                f"has ended on {shown(self.ends)}", "renew it (zscout cert renew), or set this host's clock"
+            )
+
+    def expires_soon(self, now: datetime) -> str:
+        """What to tell people while its end is near, until then; else empty."""
+        if not self.soon(now):
+            return ""
+        return f"{self.cert}: ends on {shown(self.ends)}; renew it (zscout cert renew)"
+
+
+def read_certificates(folder: Path) -> Certificates:
+    """What the folder holds, whether still valid or not. Raises BadInput where a file is missing, broken or open to
+    others, key and certificate are no pair, no CA in `ca.pem` has issued it, or its name is none of zscout's."""
+    import ssl
+
+    cas = read_cas(folder / CA)
+    cert, key = Where(str(folder / CERT)), Where(str(folder / KEY))
+    check_mode(folder / CERT, 0o002, "644")
+    check_mode(folder / KEY, 0o027, "640")
+    if "ENCRYPTED" in read_text(folder / KEY, max_bytes=MAX_FILE):
+        raise key.bad("has a passphrase, and nobody is there to type it", f"write it without one: {_MAKE}")
+    _store(folder / CERT)
+    sides = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        for side in sides:
+            side.load_cert_chain(folder / CERT, folder / KEY)
+    except ssl.SSLError as error:
+        if "MISMATCH" in (error.reason or ""):
+            raise key.bad(
+                f"is not the key of {CERT}", "copy both from one folder that `zscout cert issue` made"
+            ) from None
+        raise key.bad("holds no private key that can be read", _MAKE) from None
+    except OSError as error:
+        raise key.bad(f"can't be read: {error.strerror}", "check its permissions") from None
+    try:
+        told = _shake_hands(*sides, read_text(folder / CA, max_bytes=MAX_FILE))
+    except ssl.SSLCertVerificationError as error:
+        if error.verify_code in UNKNOWN_ISSUER:
+            known = ", ".join(one.name for one in cas)
+            raise cert.bad(f"was issued by no CA in {CA} ({known})", f"copy {CA} and {CERT} from one folder") from None
+        raise cert.bad(f"is not fit for this: {error.verify_message}", _MAKE) from None
+    except ssl.SSLError as error:
+        raise cert.bad(f"can't be used: {error.reason or error}", _MAKE) from None
+    own, issuer = _validity(told, cert), _common_name(told["issuer"])
+    check_name(own.name, cert)
+    last = max((one.ends for one in cas if one.name == issuer), default=own.ends)
+    return Certificates(own.name, own.begins, min(own.ends, last), folder, issuer, tuple(one.name for one in cas))
+
+
+def read_cas(path: Path) -> list[Validity]:
+    """The CAs in a file. Raises BadInput, for a certificate of another kind as well: Zenoh would trust what its owner
+    signs."""
+    check_mode(path, 0o002, "644")
+    store = _store(path)
+    count = store.cert_store_stats()
+    where = Where(str(path))
+    if count["x509"] != count["x509_ca"]:
+        raise where.bad("holds a certificate that is no CA's", f"copy {CA} from the folder of the CA")
+    return [_validity(one, where) for one in store.get_ca_certs()]
+
+
+def check_mode(path: Path, forbidden: int, remedy: str) -> None:
+    """That a file's mode has none of these bits. Raises BadInput."""
+    try:
+        mode = path.stat().st_mode & 0o777
+    except OSError:
+        read_text(path, max_bytes=MAX_FILE)  # says why it can't be
+        raise
+    if mode & forbidden:
+        done = "read" if mode & forbidden & 0o044 else "written" if mode & forbidden & 0o022 else "used"
+        raise Where(str(path)).bad(
+            f"may be {done} by others (mode {mode:03o})", f"chmod {remedy} {shlex.quote(str(path))}"
+        )
+
+
+def shown(at: datetime) -> str:
+    return f"{at:%Y-%m-%d %H:%M} UTC"
+
+
+_MAKE: Final = "make it with `zscout cert issue`"
+
+
+def _store(path: Path) -> ssl.SSLContext:
+    """A context that trusts what stands in the file. Raises BadInput."""
+    import ssl
+
+    text = read_text(path, max_bytes=MAX_FILE)
+    store = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        store.load_verify_locations(cadata=text)
+    except (ssl.SSLError, ValueError):
+        raise Where(str(path)).bad("holds no certificate in PEM that can be read", _MAKE) from None
+    return store
+
+
+def _shake_hands(client: ssl.SSLContext, server: ssl.SSLContext, trusted: str) -> dict[str, Any]:
+    """What the certificate of both says, which each has checked of the other. Raises SSLError."""
+    import ssl
+
+    client.check_hostname = False
+    for side in (client, server):
+        side.verify_mode = ssl.CERT_REQUIRED
+        side.load_verify_locations(cadata=trusted)
+        side.verify_flags |= ssl.VerifyFlags(NO_CHECK_TIME)
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = (client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True))
+    for _ in range(ROUNDS):
+        for end in ends:
+            with suppress(ssl.SSLWantReadError):
+                end.do_handshake()
+    return ends[1].getpeercert() or {}
+
+
+def _validity(told: dict[str, Any], where: Where) -> Validity:
+    from ssl import cert_time_to_seconds
+
+    try:
+        begins, ends = (
+            datetime.fromtimestamp(cert_time_to_seconds(told[key]), UTC) for key in ("notBefore", "notAfter")
+        )
+    except (KeyError, ValueError, OverflowError):
+        raise where.bad("has times that can't be read", _MAKE) from None
+    return Validity(_common_name(told["subject"]), begins, ends)
+
+
+def _common_name(name: tuple[tuple[tuple[str, str], ...], ...]) -> str:
+    """All of them where there are several: a text that is no name."""
+    return ", ".join(value for part in name for key, value in part if key == "commonName")
