@@ -199,7 +199,7 @@ async def _open(config: MeshConfig, security: Security | None) -> Transport:
         raise
 
 
-def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | None) -> Relinking:
+def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | None = None) -> Relinking:
     def meeting(addresses: Sequence[str]) -> zenoh.Config:
         settings = zenoh_config(replace(config, multicast=False, connect=tuple(addresses)), security)
         settings.insert_json5("listen/endpoints", "[]")
