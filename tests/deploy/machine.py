@@ -74,7 +74,7 @@ class Machine:
                         if self._run("systemctl", "is-active", "machine.target").stdout == "active\n":
                             return child.pid
             time.sleep(PAUSE)
-        raise AssertionError(f"systemd does not run:\n{self.log('systemd')}")
+        raise AssertionError(f"systemd does not run:\n{(self._folder / 'systemd.log').read_text()}")
 
     def _run(self, *command: str) -> subprocess.CompletedProcess[str]:
         words = ["nsenter", f"--target={self._pid}", "--mount", "--pid", "--cgroup", "--root", "--wd", *command]
@@ -83,7 +83,7 @@ class Machine:
     def run(self, *command: str) -> str:
         """Runs a program there, as root; returns what it writes."""
         done = self._run(*command)
-        assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}\n{self.log('systemd')}\n{self.log()}"
+        assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}\n{self.log()}"
         return done.stdout
 
     def fails(self, *command: str) -> str:
@@ -91,10 +91,13 @@ class Machine:
         assert done.returncode != 0
         return done.stderr
 
+    def path(self, path: str) -> Path:
+        """A file there, as it is called here."""
+        return Path(f"/proc/{self._pid}/root", path.removeprefix("/"))
+
     def write(self, path: str, text: str) -> None:
-        file = Path(f"/proc/{self._pid}/root", path.removeprefix("/"))
-        file.parent.mkdir(exist_ok=True)
-        file.write_text(text)
+        self.path(path).parent.mkdir(exist_ok=True)
+        self.path(path).write_text(text)
 
     def show(self, unit: str, *names: str) -> dict[str, str]:
         """Properties of a unit, as systemd has them."""
@@ -105,9 +108,16 @@ class Machine:
         """Waits until a unit has these properties."""
         end = time.monotonic() + HANG
         while (found := self.show(unit, *wanted)) != wanted:
-            assert time.monotonic() < end, f"{found}\n{self.log('systemd')}\n{self.log()}"
+            assert time.monotonic() < end, f"{found}\n{self.log()}"
             time.sleep(PAUSE)
         return found
+
+    def until_logged(self, text: str) -> None:
+        """Waits until the services have written it."""
+        end = time.monotonic() + HANG
+        while text not in self.log():
+            assert time.monotonic() < end, self.log()
+            time.sleep(PAUSE)
 
     def process(self, unit: str) -> psutil.Process:
         """The main process of a unit, as this machine sees it."""
@@ -119,9 +129,9 @@ class Machine:
                     return child
         raise AssertionError(f"{unit} has no process {inside}")
 
-    def log(self, name: str = "") -> str:
-        """What the services wrote; "systemd": what systemd did."""
-        file = self._folder / "systemd.log" if name else Path(f"/proc/{self._pid}/root/var/log/zscout.log")
+    def log(self) -> str:
+        """What the services wrote."""
+        file = self.path("/var/log/zscout.log")
         return file.read_text() if file.exists() else ""
 
     def close(self) -> None:

@@ -26,7 +26,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zscout.config.certificates import CA, CA_KEY, CERT, KEY, MAX_FILE, Validity, check_mode, shown
 from zscout.config.state_folder import write_durably
-from zscout.config.strict import BadInput, Where, check_name, read_text
+from zscout.config.strict import Where, check_name, read_text
 
 PUBLIC, PRIVATE = 0o644, 0o600
 BEFORE: Final = timedelta(hours=1)
@@ -44,9 +44,8 @@ class CertificateAuthority:
     """All of `ca.pem`, which may hold other CAs beside this one: what those trust whom it issues a certificate."""
 
     @classmethod
-    def make(cls, folder: Path, lasts: timedelta, now: datetime, *, force: bool = False) -> Validity:
-        """A new one in this folder. Raises BadInput, for one that is there unless with `force`."""
-        _check_free(folder, (CA, CA_KEY), force)
+    def make(cls, folder: Path, lasts: timedelta, now: datetime) -> Validity:
+        """A new one in this folder, in place of one that was there."""
         key = _new_key()
         # A name of its own, by which people and programs tell it from the next one.
         number = x509.SubjectKeyIdentifier.from_public_key(key.public_key()).digest[:4].hex()
@@ -86,11 +85,10 @@ class CertificateAuthority:
             )
         return cls(folder, own, key, trusted)
 
-    def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime, *, force: bool = False) -> datetime:
-        """Makes the folder of who has this name; returns when its certificate ends: not after this CA. Raises BadInput,
-        for a folder that has one already unless with `force`."""
+    def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime) -> datetime:
+        """Makes the folder of who has this name, in place of what was there; returns when its certificate ends: not
+        after this CA. Raises BadInput."""
         check_name(name, Where("NAME"))
-        _check_free(folder, (CA, CERT, KEY), force)
         return self._write(folder, name, lasts, now, _new_key())
 
     def renew(self, folder: Path, lasts: timedelta, now: datetime, *, new_key: bool = False) -> datetime:
@@ -141,12 +139,6 @@ class CertificateAuthority:
 
 
 _COPY: Final = f"copy {CA} and {CA_KEY} from one folder"
-
-
-def _check_free(folder: Path, names: tuple[str, ...], force: bool) -> None:
-    there = [name for name in names if (folder / name).exists()]
-    if there and not force:
-        raise BadInput(f"{folder}: has {' and '.join(there)} already; name another folder, or overwrite with --force")
 
 
 def _parsed(text: bytes, where: Where) -> list[x509.Certificate]:

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from zscout import messages
+from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.transport import Transport, TransportPublisher
 from zscout.messages import MAX_FRAME, FrameHead, Malformed
 from zscout.types import Ns
@@ -67,6 +68,7 @@ class FrameWatch:
 
     def __init__(self, transport: Transport, key: str, deliver: Callable[..., None], now: Callable[[], Ns]) -> None:
         self._deliver, self._now = deliver, now
+        self._strange = SparseLog(log, now)
         self._lock = threading.Lock()
         self._newest: tuple[str, bytes, bytes | None, Ns] | None = None
         self._arrived = asyncio.Event()
@@ -100,7 +102,7 @@ class FrameWatch:
             head: FrameHead = messages.decode(attachment, FrameHead, MAX_HEAD)
         except Malformed as error:
             self.malformed += 1
-            log.warning("ignored a frame on %.200r: %s", key, error)
+            self._strange.warning(key, "ignored a frame on %.200r: %s", key, error)
             return None
         return Frame(key, head, jpeg, arrived)
 

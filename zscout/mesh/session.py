@@ -29,6 +29,7 @@ from zscout.mesh.exchange import (
 )
 from zscout.mesh.frames import FramePublisher, FrameWatch
 from zscout.mesh.renewal import RenewableTransport, Suspicions
+from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.transport import Collector, Quality, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem
 from zscout.types import Ns
@@ -141,6 +142,7 @@ class Mesh:
         """`now()` is in nanoseconds on this host's monotonic clock. Not comparable between hosts."""
         self.suspicions = Suspicions(now, transport.renew)
         self._transport = transport
+        self._strange = SparseLog(log, now)
         self._inbox = Inbox(asyncio.get_running_loop())
         self._shared: dict[tuple[Any, ...], _Subscription] = {}
         self._kept: list[object] = []
@@ -189,8 +191,8 @@ class Mesh:
         may have been carried out or not. Raises MeshError where the query can't be sent."""
         replies: list[Reply[R]] = []
 
-        def on_reply(key: str, payload: bytes, ok: bool) -> bool:
-            reply = _read_reply(key, payload, ok, kind, limit, self.now())
+        def on_reply(of: str, payload: bytes, ok: bool) -> bool:
+            reply = self._read_reply(of or key, payload, ok, kind, limit)
             if reply is None:
                 return False
             replies.append(reply)
@@ -210,12 +212,25 @@ class Mesh:
         """Queries, and calls `then` once with the first reply or None: cheaper than a task that waits."""
         first: Reply[R] | None = None
 
-        def on_reply(key: str, payload: bytes, ok: bool) -> bool:
+        def on_reply(of: str, payload: bytes, ok: bool) -> bool:
             nonlocal first
-            first = _read_reply(key, payload, ok, kind, messages.MAX_STATE, self.now())
+            first = self._read_reply(of or key, payload, ok, kind, messages.MAX_STATE)
             return first is not None
 
         self._get(key, message, timeout, _Collector(self._inbox, on_reply, lambda: then(first)))
+
+    def _read_reply(self, key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -> Reply[R] | None:
+        """`key` is the answer's, or the question's where a problem has none."""
+        now = self.now()
+        try:
+            if ok:
+                return Reply(key, messages.decode(payload, kind, limit), arrived=now)
+            if payload == b"Timeout":
+                return None
+            return Reply("", None, messages.decode(payload, Problem), now)
+        except Malformed as error:
+            self._strange.warning(key, "a reply on %.200r was malformed: %s", key, error)
+            return None
 
     def _get(self, key: str, message: Struct | None, timeout: float, to: Collector) -> None:
         payload = None if message is None else messages.encode(message)
@@ -339,12 +354,18 @@ class Mesh:
             try:
                 message: S = messages.decode(payload, kind, limit)
             except Malformed as error:
-                log.warning("ignored a publication on %.200r: %s", name, error)
+                self._strange.warning(name, "ignored a publication on %.200r: %s", name, error)
                 return
             for handler in tuple(handlers):
-                guarded(handler, name, message)
+                guarded(self._tell, handler, name, message)
 
         return state, handlers, self._transport.subscriber(key, on_sample)
+
+    def _tell(self, handler: Callable[[str, S], None], name: str, message: S) -> None:
+        try:
+            handler(name, message)
+        except BadName as error:
+            self._strange.warning(name, "ignored what came under a bad name: %s", error)
 
     def poll_latest(self, key: str, kind: type[S], *, depth: int = RING_DEPTH) -> PolledSubscription[S]:
         """Keeps the latest `depth` publications on `key`, without waking the event loop, until they are taken."""
@@ -420,7 +441,7 @@ class Mesh:
         try:
             return self.keys.token_of(text)
         except BadName as error:
-            log.warning("ignored a liveliness token: %s", error)
+            self._strange.warning(text, "ignored a liveliness token: %s", error)
             return None
 
 
@@ -447,18 +468,6 @@ class _Collector(Collector):
         if self._open:
             self._open = False
             self._over()
-
-
-def _read_reply(key: str, payload: bytes, ok: bool, kind: type[R], limit: int, now: Ns) -> Reply[R] | None:
-    try:
-        if ok:
-            return Reply(key, messages.decode(payload, kind, limit), arrived=now)
-        if payload == b"Timeout":
-            return None
-        return Reply("", None, messages.decode(payload, Problem), now)
-    except Malformed as error:
-        log.warning("a reply was malformed: %s", error)
-        return None
 
 
 def _refuse(query: TransportQuery, code: str, message: str) -> None:

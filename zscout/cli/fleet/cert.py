@@ -18,6 +18,8 @@ from zscout.config import strict
 from zscout.config.certificates import (
     CA,
     CA_KEY,
+    CERT,
+    KEY,
     KEYS_VARIABLE,
     Certificates,
     Validity,
@@ -92,8 +94,9 @@ def ca(folder: Path, lasts: timedelta, force: bool) -> None:
     """
     from zscout.config.certificate_authority import CertificateAuthority
 
+    _check_free(folder, (CA, CA_KEY), force)
     with _writing():
-        made = CertificateAuthority.make(folder, lasts, datetime.now(UTC), force=force)
+        made = CertificateAuthority.make(folder, lasts, datetime.now(UTC))
     terminal.print_line(f"{folder}: {made.name}, until {shown(made.ends)}; keep {folder / CA_KEY} secret")
 
 
@@ -116,8 +119,10 @@ def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, force: bo
     """
     authority = _authority(ca)
     for one in name:
+        _check_free(to / one, (CA, CERT, KEY), force)
+    for one in name:
         with _writing():
-            ends = authority.issue(one, to / one, lasts, datetime.now(UTC), force=force)
+            ends = authority.issue(one, to / one, lasts, datetime.now(UTC))
         terminal.print_line(f"{to / one}: until {shown(ends)}; copy this folder to {one}, its key to nobody else")
 
 
@@ -215,6 +220,12 @@ def _authority(folder: Path) -> CertificateAuthority:
     from zscout.config.certificate_authority import CertificateAuthority
 
     return CertificateAuthority.read(folder, datetime.now(UTC))
+
+
+def _check_free(folder: Path, names: tuple[str, ...], force: bool) -> None:
+    there = [name for name in names if (folder / name).exists()]
+    if there and not force:
+        raise BadInput(f"{folder}: has {' and '.join(there)} already; name another folder, or overwrite with --force")
 
 
 @contextmanager

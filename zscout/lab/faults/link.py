@@ -169,5 +169,5 @@ def operation_of(payload: bytes | None) -> str:
     """The operation that a query asks for, `hand_over` or the like; "" if there is none in it."""
     try:
         return _decoder.decode(payload or b"{}").op
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, ValueError, RecursionError):
         return ""
