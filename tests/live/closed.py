@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import subprocess
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 import zenoh
 from msgspec.structs import replace
 
+from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.config.certificate_authority import CertificateAuthority
@@ -55,6 +57,17 @@ class ClosedLab(Lab):
 
     def node(self, host: str, *rcs: str, extra: str = "") -> subprocess.Popen[bytes]:
         return super().node(host, *rcs, extra=f'{extra}\n[security]\nfolder = "keys/{host}"')
+
+    async def stop(self) -> None:
+        """Ends all clients and nodes in order."""
+        for client in self.clients:
+            await client.close()
+        for node in self.nodes.values():
+            node.terminate()
+        for node in self.nodes.values():
+            await asyncio.to_thread(node.wait, HANG)
+        self.clients.clear()
+        self.nodes.clear()
 
     def fleet_of(self, name: str) -> Fleet:
         """The fleet as this person or machine joins it."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import signal
 import socket
-from datetime import UTC, datetime
+import time
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from zscout.keyexpr import Role, Sender, valid_name
 from zscout.mesh import ZenohMesh
 
 pytestmark = pytest.mark.live
+SECOND = timedelta(seconds=1)
 
 
 def test_two_persons_and_a_node_on_one_machine(tmp_path: Path) -> None:
@@ -121,5 +123,41 @@ def test_a_certificate_of_another_name_is_told_before_joining(tmp_path: Path) ->
             lab.authority.issue("mallory", tmp_path / "keys" / "mallory", DAY, datetime.now(UTC))
             with pytest.raises(BadInput, match=r"mallory has no role in fleet .*; name it under"):
                 await ZenohMesh.open(lab.fleet_of("mallory"), Sender("mallory", "c1"))
+
+    asyncio.run(story())
+
+
+def test_certificates_that_are_renewed_in_place_end_no_hold(tmp_path: Path) -> None:
+    """Past the end of those by which all links were made, the hold goes on and a newcomer is let in."""
+
+    async def story() -> None:
+        async with ClosedLab(tmp_path) as lab:
+            # So short a life that it ends in this test, and longer than this machine takes to start all.
+            began = time.monotonic()
+            lab.node("cart", "radio/r")
+            lab.node("anvil", "robot/a")
+            await lab.ready(await lab.person("ada"), "robot/a", "radio/r")
+            life = timedelta(seconds=max(14.0, 4 * (time.monotonic() - began)))
+            await lab.stop()
+            for name in ("anvil", "cart", "bob", "eve"):
+                lab.authority.renew(tmp_path / "keys" / name, life, datetime.now(UTC))
+            ends = datetime.now(UTC) + life
+            lab.node("cart", "radio/r")
+            lab.node("anvil", "robot/a")
+            bob = await lab.person("bob")
+            await lab.ready(bob, "robot/a", "radio/r")
+            needs: dict[str, dict[str, float]] = {"robot/a": {}, "radio/r": {}}
+            async with hold(bob, "survey", needs, min_runtime=600) as held:
+                assert datetime.now(UTC) < ends
+                for name in ("anvil", "cart", "bob", "eve"):
+                    lab.authority.renew(tmp_path / "keys" / name, DAY, datetime.now(UTC))
+                while datetime.now(UTC) < ends + 4 * SECOND:
+                    await asyncio.sleep(0.1)
+                state = await lab.state(bob, lambda state: bool(state.holds))
+                assert [(view.arc, view.grant) for view in state.holds] == [("survey", held.grant)]
+            eve = await lab.person("eve")
+            await lab.ready(eve, "robot/a", "radio/r")
+            async with hold(eve, "newcomer", needs):
+                pass
 
     asyncio.run(story())

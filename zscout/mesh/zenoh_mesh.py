@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, NoReturn, Self, TypeVar
 
 import zenoh
 from msgspec.structs import replace
@@ -49,6 +49,8 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
 }
 MAX_MESSAGE = 17_000_000
 """Bytes: a little more than any message of zscout's has."""
+LOOK_AT_CERTIFICATES = 2.0
+"""Seconds from one look at whether they were renewed to the next."""
 ANY_TLS = "tls/0.0.0.0:0"
 T = TypeVar("T")
 _PORT = re.compile(r":\d+$")
@@ -136,6 +138,7 @@ class ZenohMesh(Mesh):
     """The mesh over a Zenoh session of this process."""
 
     _door: _Door
+    _watching: asyncio.Task[NoReturn] | None = None
 
     @classmethod
     async def open(cls, fleet: Fleet, me: Sender) -> Self:
@@ -154,7 +157,38 @@ class ZenohMesh(Mesh):
             openings.insert(0, lambda: _open(beside, door.security))
         mesh = cls(RenewableTransport(await _open(config, security), openings), keys, me, clock.now)
         mesh._door = door
+        if security is not None:
+            mesh._watching = asyncio.create_task(mesh._watch_certificates(security.certificates))
         return mesh
+
+    async def close(self) -> None:
+        if self._watching is not None:
+            self._watching.cancel()
+        await super().close()
+
+    async def _watch_certificates(self, known: Certificates) -> NoReturn:
+        """Joins anew when they were renewed: a session that listens goes on showing what it was opened with, and who
+        comes when that has ended would not link to it. Says when an end is near."""
+        told: str | None = None
+        warned = ""
+        while True:
+            await asyncio.sleep(LOOK_AT_CERTIFICATES)
+            try:
+                reading = _in_thread("reads certificates", functools.partial(read_certificates, known.folder))
+                fresh = await asyncio.wrap_future(reading)
+                fresh.check(datetime.now(UTC), known.name)
+            except BadInput as error:  # they may be half written
+                if told != str(error):
+                    log.warning("%s", error)
+                told = str(error)
+                continue
+            told = None
+            if fresh.ends != known.ends:
+                log.info("%s was renewed: this process joins the mesh anew", fresh.cert)
+                known = fresh
+                self._transport.renew()
+            if (soon := fresh.expires_soon(datetime.now(UTC))) and soon != warned:
+                log.warning("%s", warned := soon)
 
     def admit(self, members: Iterable[Member]) -> None:
         # The rules of a session can't be changed.
