@@ -299,7 +299,7 @@ class Fleet:
             while (grant := await client.granted(arc)) is not None:
                 done = await client.command("robot/a", grant, {"name": "echo", "value": self._asked})
                 await client.end(arc)
-                return done.result == self._asked
+                return bool(done.result == self._asked)
         except (RequestRefused, CommandRefused):
             pass  # of a leader that is about to go: it asks again
         return False
