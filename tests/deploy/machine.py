@@ -45,16 +45,15 @@ def _unified() -> Path:
 
 
 class Machine:
-    """`etc`: what stands in its /etc/zscout. All that runs there ends with it."""
+    """`folder` is its own. `installed`: with the units of this tree, which run zscout from its source; else there are
+    only a Python in /opt/zscout/python and this tree in /opt/zscout/project. All that runs there ends with it."""
 
-    def __init__(self, folder: Path, etc: dict[str, str]) -> None:
+    def __init__(self, folder: Path, *, installed: bool = True) -> None:
         self._folder = folder
-        (folder / "etc").mkdir()
-        for name, text in etc.items():
-            (folder / "etc" / name).write_text(text)
         self._group = _unified() / f"zscout-machine-{os.getpid()}"
         self._group.mkdir()
         program = [str(HERE / "machine.sh"), str(folder), str(PROJECT), site.getsitepackages()[0], sys.base_prefix]
+        program.append("yes" if installed else "no")
         enter = f'echo $$ >{self._group}/cgroup.procs && exec unshare --mount --uts --ipc --cgroup bash "$@"'
         with (folder / "systemd.log").open("wb") as log:
             self._process = subprocess.Popen(["sh", "-c", enter, "sh", *program], stdout=log, stderr=log)
@@ -76,18 +75,19 @@ class Machine:
             time.sleep(PAUSE)
         raise AssertionError(f"systemd does not run:\n{(self._folder / 'systemd.log').read_text()}")
 
-    def _run(self, *command: str) -> subprocess.CompletedProcess[str]:
+    def _run(self, *command: str, timeout: float = HANG) -> subprocess.CompletedProcess[str]:
         words = ["nsenter", f"--target={self._pid}", "--mount", "--pid", "--cgroup", "--root", "--wd", *command]
-        return subprocess.run(words, capture_output=True, text=True, check=False, timeout=HANG)
+        return subprocess.run(words, capture_output=True, text=True, check=False, timeout=timeout)
 
-    def run(self, *command: str) -> str:
+    def run(self, *command: str, timeout: float = HANG) -> str:
         """Runs a program there, as root; returns what it writes."""
-        done = self._run(*command)
+        done = self._run(*command, timeout=timeout)
         assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}\n{self.log()}"
         return done.stdout
 
-    def fails(self, *command: str) -> str:
-        done = self._run(*command)
+    def fails(self, *command: str, timeout: float = HANG) -> str:
+        """Runs a program that has to fail; returns what it says of it."""
+        done = self._run(*command, timeout=timeout)
         assert done.returncode != 0
         return done.stderr
 
@@ -96,7 +96,7 @@ class Machine:
         return Path(f"/proc/{self._pid}/root", path.removeprefix("/"))
 
     def write(self, path: str, text: str) -> None:
-        self.path(path).parent.mkdir(exist_ok=True)
+        self.path(path).parent.mkdir(exist_ok=True, parents=True)
         self.path(path).write_text(text)
 
     def show(self, unit: str, *names: str) -> dict[str, str]:

@@ -2,7 +2,7 @@
 # A machine of its own: systemd as PID 1, on a copy of this file system that is thrown away. `machine.py` runs it in new
 # namespaces (mounts, hostname, IPC, control groups), with the folder of the machine.
 set -euo pipefail
-folder=$1 project=$2 packages=$3 python=$4
+folder=$1 project=$2 packages=$3 python=$4 installed=$5
 root=$folder/root
 mount --make-rprivate /
 mkdir -p "$root" "$folder/layer"
@@ -21,27 +21,32 @@ for target in sysinit basic network-online; do
   printf '[Unit]\nDefaultDependencies=no\n' >"$root/etc/systemd/system/$target.target"
 done
 printf '[Unit]\nDefaultDependencies=no\nAllowIsolate=yes\n' >"$root/etc/systemd/system/machine.target"
-cp "$project"/deploy/systemd/* "$root/etc/systemd/system/"
 mkdir "$root/etc/systemd/system/service.d"
-printf '[Service]\nStandardOutput=append:/var/log/zscout.log\nStandardError=append:/var/log/zscout.log\n' \
-  >"$root/etc/systemd/system/service.d/log.conf"
-systemd-sysusers --root="$root" "$project/deploy/sysusers.d/zscout.conf"
+cat >"$root/etc/systemd/system/service.d/machine.conf" <<'EOF'
+[Service]
+StandardOutput=append:/var/log/zscout.log
+StandardError=append:/var/log/zscout.log
+# Where Python's own library was, the unit sees nothing.
+Environment=LD_LIBRARY_PATH=/opt/zscout/python/lib
+EOF
 
 # The unit sees neither /root, /home nor /tmp, where any of these may be.
-mkdir -p "$root"/opt/zscout/{project,packages,python,current/bin}
+mkdir -p "$root"/opt/zscout/{project,packages,python}
 mount --bind "$project" "$root/opt/zscout/project"
 mount --bind "$packages" "$root/opt/zscout/packages"
 mount --bind "$python" "$root/opt/zscout/python"
-cat >"$root/opt/zscout/current/bin/zscout-node" <<'EOF'
+if [ "$installed" = yes ]; then
+  cp "$project"/deploy/systemd/* "$root/etc/systemd/system/"
+  systemd-sysusers --root="$root" "$project/deploy/sysusers.d/zscout.conf"
+  mkdir -p "$root/opt/zscout/current/bin"
+  cat >"$root/opt/zscout/current/bin/zscout-node" <<'EOF'
 #!/bin/sh
-export PYTHONPATH=/opt/zscout/project:/opt/zscout/packages LD_LIBRARY_PATH=/opt/zscout/python/lib PYTHONDONTWRITEBYTECODE=1
+export PYTHONPATH=/opt/zscout/project:/opt/zscout/packages PYTHONDONTWRITEBYTECODE=1
 exec /opt/zscout/python/bin/python3 -m zscout.node "$@"
 EOF
-chmod 755 "$root/opt/zscout/current/bin/zscout-node"
-mkdir -p "$root/etc/zscout"
-cp "$folder"/etc/* "$root/etc/zscout/"
-chmod 755 "$root/etc/zscout"
-chmod 644 "$root"/etc/zscout/*
+  chmod 755 "$root/opt/zscout/current/bin/zscout-node"
+  mkdir -p "$root/etc/zscout"
+fi
 
 # shellcheck disable=SC2016 # it is for the inner shell
 exec unshare --pid --fork --kill-child chroot "$root" /bin/sh -c '

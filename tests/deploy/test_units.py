@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,6 @@ from contextlib import closing
 from pathlib import Path
 
 import cv2
-import psutil
 import pytest
 
 from tests.cli import tools
@@ -96,11 +96,10 @@ def machine(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mach
         pytest.skip(why)
     folder = tmp_path_factory.mktemp("machine")
     folder.chmod(0o755)
-    port = 20_000 + psutil.Process().pid % 10_000
-    etc = {"fleet.toml": lab.fleet_file.read_text(), "node.toml": NODE % port}
-    with Machine(folder, etc) as machine:
+    with Machine(folder) as machine:
+        machine.write("/etc/zscout/fleet.toml", lab.fleet_file.read_text())
+        machine.write("/etc/zscout/node.toml", NODE % (20_000 + os.getpid() % 10_000))
         film(machine.path("/etc/zscout/film.avi"))
-        machine.path("/etc/zscout/film.avi").chmod(0o644)
         yield machine
 
 

@@ -15,10 +15,10 @@ from typing import Any, Final
 
 from msgspec import inspect
 
-LONG: Final = 2_000
+LONG: Final = (300, 100_000)
 """Entries of a list or table that is much too long."""
 DEEP: Final = 20_000
-LARGE: Final = 100_000
+LARGE: Final = 300_000
 """Bytes."""
 
 TEXTS: Final = (
@@ -59,7 +59,7 @@ def write(value: Any) -> str:
             return json.dumps(value)
 
 
-def many(value: Any, number: int = LONG, *, named: bool = False) -> Raw:
+def many(value: Any, number: int, *, named: bool = False) -> Raw:
     """A list of `number` times this value, or a table with it under as many names; fewer, where it is LARGE."""
     one = write(value)
     number = max(2, min(number, LARGE // len(one)))
@@ -199,10 +199,17 @@ class Hostile:
             case Table():
                 some = value[0][1] if value else None
                 return rng.choice(
-                    (Table(), many(some, named=True), Table((text, some) for text in TEXTS), self._deep())
+                    (
+                        Table(),
+                        many(some, rng.choice(LONG), named=True),
+                        Table((text, some) for text in TEXTS),
+                        self._deep(),
+                    )
                 )
             case list():
-                return rng.choice(([], value[:1], value * 2, many(value[0] if value else None), self._deep()))
+                return rng.choice(
+                    ([], value[:1], value * 2, many(value[0] if value else None, rng.choice(LONG)), self._deep())
+                )
             case bool():
                 return not value
             case str() if not isinstance(value, Raw):

@@ -1,5 +1,6 @@
 """`python -m tests.install`: the wheel of this tree in clean environments, with pip, pipx and uv, and the light
-installation of it. Each has to run a node and a request; prints how long it took and what it takes on disk.
+installation of it. Each has to run a node and a request; prints how long it took and what it takes on disk. `host`: by
+`deploy/install-host`, on a machine with a systemd of its own.
 
 Packages come from the index that pip is configured with. Where pipx and uv can't be had they are skipped."""
 
@@ -17,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from tests.deploy.machine import Machine, missing
 from tests.docs.test_tutorial_device import files
 from tests.hang import HANG
 from zscout.keyexpr import new_instance
@@ -229,6 +231,35 @@ def check_light(programs: Path, folder: Path) -> None:
         expect(done.returncode != 0 and package in last and "pip install" in last, f"{args}: {done.stderr}")
 
 
+def check_host(wheel: Path, folder: Path) -> None:
+    """`deploy/install-host`: its node runs under its unit, and once more it changes nothing."""
+    folder.mkdir(mode=0o755)
+    with Machine(folder, installed=False) as host:
+        host.path("/srv/new").mkdir()
+        host.path(f"/srv/new/{wheel.name}").write_bytes(wheel.read_bytes())
+        host.write("/srv/new/fleet.toml", f'[fleet]\nname = "{new_instance()}"\n[mesh]\ninterface = "lo"\n')
+        host.write("/srv/new/anvil.toml", '[node]\nhost = "anvil"\nfleet = "fleet.toml"\n[components]\nmax = 0\n')
+        words = ["/opt/zscout/project/deploy/install-host", "--python", "/opt/zscout/python/bin/python3"]
+        words += ["--wheel", f"/srv/new/{wheel.name}"]
+        words += ["--fleet", "/srv/new/fleet.toml", "--node", "/srv/new/anvil.toml"]
+        refused = host.fails(*words, timeout=INSTALL)
+        expect("components.max: is 0" in refused, f"a bad node file is taken: {refused}")
+        expect(not host.path("/etc/zscout").exists(), "a bad node file leaves something in /etc")
+        host.write("/srv/new/anvil.toml", '[node]\nhost = "anvil"\nfleet = "fleet.toml"\n')
+        said = host.run(*words, timeout=INSTALL)
+        expect("/etc/zscout/node.toml" in said and "/etc/systemd/system/zscout-node.service" in said, said)
+        host.until("zscout-node", ActiveState="active", SubState="running", UnitFileState="enabled")
+        host.until("zscout-cert-renew.timer", ActiveState="active", UnitFileState="enabled")
+        status = host.run("sh", "-c", "ZSCOUT_FLEET=/etc/zscout/fleet.toml zscout status")
+        expect("anvil" in status, f"status says {status}")
+        modes = host.run("stat", "-c", "%a %U:%G", "/etc/zscout", "/etc/zscout/keys", "/etc/zscout/renew-certificate")
+        expect(modes.splitlines() == ["755 root:root", "750 root:zscout", "755 root:root"], f"modes are {modes}")
+        before = host.show("zscout-node", "MainPID")
+        again = host.run(*words, timeout=INSTALL)
+        expect("new or changed" not in again, f"the second time it says {again}")
+        expect(host.show("zscout-node", "MainPID") == before, "the second time it restarts the node")
+
+
 def main() -> int:
     failed = 0
     rows: list[tuple[str, str, str]] = []
@@ -244,7 +275,10 @@ def main() -> int:
             "pipx": lambda wheel, home: by_pipx(tools / "bin", wheel, home),
             "uv": lambda wheel, home: by_uv(tools / "bin", wheel, home),
         }
-        wanted = [way for way in sys.argv[1:] if way in ways] or list(ways)
+        wanted = [way for way in sys.argv[1:] if way in (*ways, "host")] or [*ways, "host"]
+        if "host" in wanted and (why := missing()):
+            print(f"host is skipped: {why}", flush=True)
+            wanted.remove("host")
         if {"pipx", "uv"} & set(wanted):
             try:
                 make_environment(tools)
@@ -256,6 +290,9 @@ def main() -> int:
         for way in wanted:
             print(f"{way} ...", flush=True)
             try:
+                if way == "host":
+                    check_host(wheel, folder / way)
+                    continue
                 began = time.monotonic()
                 programs = ways[way](wheel, folder / way)
                 seconds, size = time.monotonic() - began, megabytes(folder / way)
@@ -263,7 +300,7 @@ def main() -> int:
                 if way == "light":
                     expect(size < LIGHT_MB, f"it takes {size:.0f} MB, more than {LIGHT_MB}")
                 (check_light if way == "light" else check_whole)(programs, folder / f"{way}-fleet")
-            except (CheckFailed, OSError, subprocess.TimeoutExpired) as error:
+            except (CheckFailed, AssertionError, OSError, subprocess.TimeoutExpired) as error:
                 failed += 1
                 print(f"{way} FAILED: {error}", flush=True)
     _print_table([("installed", "seconds", "MB"), *rows])

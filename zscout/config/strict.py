@@ -91,8 +91,8 @@ def quoted(text: str) -> str:
     return f'"{_one_line(escaped)}"'
 
 
-def read_text(path: Path, *, max_bytes: int) -> str:
-    """The text of a regular UTF-8 file of at most `max_bytes` bytes. Raises BadInput."""
+def read_bytes(path: Path, *, max_bytes: int) -> bytes:
+    """What is in a regular file of at most `max_bytes` bytes. Raises BadInput."""
     where = Where(str(path))
     try:
         # O_NONBLOCK: a FIFO without a writer would block here for ever.
@@ -113,11 +113,17 @@ def read_text(path: Path, *, max_bytes: int) -> str:
         raise where.bad("is not a file name", "check the path") from None
     if len(data) > max_bytes:
         raise where.bad(f"has more than {max_bytes:,} bytes", "shorten or split it")
+    return data
+
+
+def read_text(path: Path, *, max_bytes: int) -> str:
+    """The text of a regular UTF-8 file of at most `max_bytes` bytes. Raises BadInput."""
+    data = read_bytes(path, max_bytes=max_bytes)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise where.bad(f"line {line} is not UTF-8", "save the file as UTF-8") from None
+        raise Where(str(path)).bad(f"line {line} is not UTF-8", "save the file as UTF-8") from None
 
 
 def read_toml(path: Path, type: type[T], *, max_bytes: int = 1_000_000) -> T:  # noqa: A002 - msgspec's word

@@ -128,7 +128,7 @@ class PolledSubscription(Declaration, Generic[S]):
                 return
             key, payload = sample
             try:
-                message: S = messages.decode(payload, self._kind, messages.MAX_STATE)
+                message: S = messages.decode_told(payload, self._kind)
             except Malformed:
                 continue
             yield key, message

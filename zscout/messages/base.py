@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import msgspec
+from msgspec import inspect
 
 from zscout.types import NO_TERM, SECOND, Ns, Params, Term
 
@@ -112,6 +113,49 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
         name = getattr(kind, "__name__", "operation")
         raise Malformed(f"not a valid {name}: {str(error)[:MAX_ERROR]}") from None
     return message
+
+
+def decode_told(payload: bytes, kind: type[T] | Any, limit: int = MAX_STATE) -> T:
+    """The same of what is published or answered, and may be passed on: it holds no decimal that is no number, or of
+    implausible size, which others could not read again. (An operation is refused for one in words of its own.)"""
+    message: T = decode(payload, kind, limit)
+    check: Callable[[Any], bool] = _plausible(kind)
+    if not check(message):
+        raise Malformed(f"not a valid {kind.__name__}: a decimal in it is no number, or beyond 1e{MAX_EXPONENT}")
+    return message
+
+
+def _check_of(kind: inspect.Type) -> Callable[[Any], bool] | None:
+    """None: there are no decimals in it."""
+    match kind:
+        case inspect.DecimalType():
+            return lambda value: value.is_finite() and (not value or abs(value.adjusted()) <= MAX_EXPONENT)
+        case inspect.Metadata(type=of):
+            return _check_of(of)
+        case inspect.StructType(fields=fields):
+            checks = [(one.name, check) for one in fields if (check := _check_of(one.type)) is not None]
+            return (lambda value: all(check(getattr(value, name)) for name, check in checks)) if checks else None
+        case inspect.ListType(item_type=of) | inspect.VarTupleType(item_type=of):
+            return _check_of_each(of, iter)
+        case inspect.DictType(value_type=of):
+            return _check_of_each(of, dict.values)
+        case inspect.UnionType(types=types):  # of messages that are told only X | None
+            item = next(filter(None, map(_check_of, types)), None)
+            return (lambda value: value is None or item(value)) if item is not None else None
+    return None
+
+
+def _check_of_each(kind: inspect.Type, values: Callable[[Any], Iterable[Any]]) -> Callable[[Any], bool] | None:
+    if (found := _check_of(kind)) is None:
+        return None
+    check = found
+    return lambda value: all(map(check, values(value)))
+
+
+# A check of all decimals in a message of that kind.
+_plausible: Callable[[Any], Callable[[Any], bool]] = cache(
+    lambda kind: _check_of(inspect.type_info(kind)) or (lambda _: True)
+)
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -70,11 +70,14 @@ class ExpectedDevices:
     def __init__(self, declared: Mapping[HostName, Collection[RcName]]) -> None:
         self._devices: dict[RcName, _Device] = {}
         self._living: dict[HostName, set[Token]] = {}
+        self._count = 0
+        """Homes of all devices."""
         self.version = 0
         """Grows with whatever is worth remembering."""
         for host, rcs in declared.items():
             for rc in rcs:
                 self._devices.setdefault(rc, _Device()).homes[host] = Home(declared=True)
+                self._count += 1
 
     # In
 
@@ -100,13 +103,13 @@ class ExpectedDevices:
 
     def said(self, state: RcState) -> None:
         """What an RC reports of itself."""
-        if self._home(state.rc, state.host) is not None:
+        if _is_name(state.rc, state.host) and self._home(state.rc, state.host) is not None:
             device = self._devices[state.rc]
             device.sharable, device.parameters = state.sharable, state.parameters
 
     def stopped(self, rc: RcName, host: HostName) -> None:
         """Its last word: it left in order."""
-        if (home := self._home(rc, host)) is not None:
+        if _is_name(rc, host) and (home := self._home(rc, host)) is not None:
             home.why, home.stopped = f"it is stopped at {host}", True
             self.version += 1
 
@@ -138,8 +141,9 @@ class ExpectedDevices:
         """Made known where it was not; None: there are too many."""
         device = self._devices.get(rc)
         home = device.homes.get(host) if device is not None else None
-        if home is None and sum(len(one.homes) for one in self._devices.values()) < MAX_HOMES:
+        if home is None and self._count < MAX_HOMES:
             home = Home()
+            self._count += 1
             self._devices.setdefault(rc, _Device()).homes[host] = home
         return home
 
@@ -151,6 +155,7 @@ class ExpectedDevices:
                 moved = home.stopped and any(one.instances for one in device.homes.values())
                 if not home.instances and not home.declared and (old or moved):
                     del device.homes[host]
+                    self._count -= 1
             if not device.homes:
                 del self._devices[rc]
 

@@ -10,17 +10,18 @@ import logging
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 from msgspec import structs
 
 from zscout.config.fleet import Fleet
 from zscout.config.state_folder import write_durably
+from zscout.config.strict import BadInput, read_bytes
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import MAX_STATE, Malformed, RcmState, RcState, StateAsk, decode, encode
+from zscout.messages import MAX_STATE, Malformed, RcmState, RcState, StateAsk, decode_told, encode
 from zscout.services.rcm.devices import ExpectedDevices, SeenHome, homes_in
 from zscout.types import SECOND, Ns
 
@@ -38,7 +39,7 @@ SAVE_EVERY: Final = 300.0
 class _DeviceFile(msgspec.Struct):
     """What is kept on disk. `written` is in seconds since 1970: a host's own clock ends with it."""
 
-    written: float
+    written: Annotated[float, msgspec.Meta(ge=0, le=1e11)]
     homes: list[SeenHome] = []
 
 
@@ -102,13 +103,11 @@ class Inventory:
     # On disk
 
     def _load(self) -> None:
-        if self._file is None:
+        if self._file is None or not self._file.exists():
             return
         try:
-            kept: _DeviceFile = decode(self._file.read_bytes(), _DeviceFile, MAX_STATE)
-        except FileNotFoundError:
-            return
-        except (OSError, Malformed) as error:
+            kept: _DeviceFile = decode_told(read_bytes(self._file, max_bytes=MAX_STATE), _DeviceFile)
+        except (BadInput, Malformed) as error:
             log.warning("%s can't be read, and is not used: %s", self._file, error)
             return
         # A clock that was set back makes nothing younger than it was.

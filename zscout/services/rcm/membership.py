@@ -448,7 +448,7 @@ class Membership:
                         self.on_disbelieved(token.name, reply.problem.term)
                 match reply.message:
                     # One of a lower term is from before the promise.
-                    case RcState(instance=token.instance, term=term) as state if term >= self.term:
+                    case RcState(rc=token.name, instance=token.instance, term=term) as state if term >= self.term:
                         if self._is_wanted(token):
                             self._answered(state)
                             return
@@ -525,6 +525,8 @@ class Membership:
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
         name = self.mesh.keys.rc_of(key)
+        if name != state.rc:
+            return
         self.see(state.term, obeyed_by=name if state.instance in self._rc_tokens.get(name, {}) else None)
         if name in self._pending and self._pending[name].state.instance == state.instance:
             self._pending[name].state, self._pending[name].since = state, self.mesh.now()

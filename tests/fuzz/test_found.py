@@ -1,0 +1,126 @@
+"""What the fuzzer has found, each by itself."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import pytest
+from msgspec import structs
+
+from tests.mesh.kit import run
+from tests.services.rcm.kit import FakeFleet
+from zscout.config.fleet import default_fleet
+from zscout.keyexpr import Sender
+from zscout.lab.faults.memory import MemoryNetwork
+from zscout.messages import RcState, RcView
+from zscout.services.rcm.devices import ExpectedDevices, SeenHome, homes_in
+from zscout.services.rcm.inventory import FILE, Inventory
+
+
+def state(**fields: Any) -> bytes:
+    said = {"rc": "robot/a", "host": "devices", "instance": "i1", "sharable": False, "term": [1, "rcm"], "seq": 1}
+    return json.dumps(said | fields).encode()
+
+
+@pytest.mark.parametrize("number", ["NaN", "sNaN", "-Infinity", "1e999999", "1E-999999"])
+def test_what_is_no_number_is_not_passed_on(number: str) -> None:
+    """A leader repeats what RCs say of their parameters: with a NaN nobody could read its state any more."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"))
+        transport = fleet.mesh("x", "stranger")._transport
+        for bound in (number, "7"):
+            parameters = [{"name": "speed", "bound": bound}]
+            transport.put(fleet.watcher.keys.rc_state("robot/a"), state(parameters=parameters), RcState)
+            await asyncio.sleep(0.1)
+            (view,) = (await fleet.state()).rcs
+            assert view.parameters is None or str(view.parameters[0].bound) == "7"
+        assert view.parameters is not None
+
+    run(story())
+
+
+def test_an_rc_that_answers_under_anothers_name_takes_nobodys_place() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"))
+        thief = fleet.rc("robot/x", instance="i2")
+        thief.name = "robot/a"
+        await asyncio.sleep(0.1)
+        thief.publish()
+        await asyncio.sleep(0.1)
+        real = rcm.membership.reported("robot/a")
+        assert real is not None
+        assert real.instance == "i1"
+        assert rcm.membership.reported("robot/x") is None
+
+    run(story())
+
+
+def test_a_host_without_a_name_is_not_remembered() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        rcm = fleet.rcm()
+        rc = fleet.rc("robot/a")
+        await fleet.joined(rc)
+        for leaving in (False, True):
+            rc.publisher.put(structs.replace(rc.state(), host="*" * 1_000_000, leaving=leaving))
+            await asyncio.sleep(0.1)
+        assert [*rcm.inventory.devices._devices["robot/a"].homes] == ["devices"]
+
+    run(story())
+
+
+def test_a_leaders_list_of_devices_takes_no_more_than_its_length() -> None:
+    def calls(number: int) -> int:
+        views = [RcView(f"robot/x{count}", True, False, host="h") for count in range(number)]
+        devices, called = ExpectedDevices({}), 0
+
+        def count(_frame: FrameType, event: str, _arg: object) -> None:
+            nonlocal called
+            called += event == "call"
+
+        sys.setprofile(count)
+        try:
+            devices.remember(homes_in(views), 0)
+        finally:
+            sys.setprofile(None)
+        return called
+
+    few = calls(200)
+    assert calls(800) < 6 * few
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b'{"written":-1e308,"homes":[{"rc":"robot/a","host":"h"}]}',
+        b'{"written":1e308,"homes":[{"rc":"robot/a","host":"h","ago":1e9}]}',
+        b'{"written":0,"homes":[{"rc":"robot/a","host":"h","parameters":[{"name":"x","bound":"NaN"}]}]}',
+        b'{"written":0,"homes":' + b"[" * 100_000,
+        b"\xff\0",
+        b"",
+    ],
+)
+def test_a_file_of_devices_that_is_none_is_not_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, content: bytes
+) -> None:
+    (tmp_path / FILE).write_bytes(content)
+
+    async def story() -> list[SeenHome]:
+        mesh = MemoryNetwork().open("f", Sender("h", "node"))
+        return Inventory(mesh, default_fleet(), tmp_path).devices.homes(mesh.now())
+
+    assert run(story()) == []
+    (warning,) = caplog.records
+    assert warning.levelno == logging.WARNING
+    assert "\n" not in warning.getMessage()
