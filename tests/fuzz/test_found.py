@@ -85,6 +85,23 @@ def test_an_instance_that_was_told_to_stand_by_serves_again() -> None:
     assert not errors
 
 
+def test_an_rc_is_as_sharable_as_it_says_now() -> None:
+    """Somebody may have answered in its place as it joined: then it was asked for votes for ever, and gave none."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        rc = fleet.rc("radio/r", accept=None)
+        await fleet.joined(rc)
+        rc.sharable = False
+        rc.publish()
+        await asyncio.sleep(0.1)
+        assert (await fleet.client("one").ask("arc", "radio/r")).state == "running"
+        assert not rc.proposals
+
+    run(story())
+
+
 def test_a_host_without_a_name_is_not_remembered() -> None:
     async def story() -> None:
         fleet = FakeFleet()

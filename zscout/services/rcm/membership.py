@@ -543,7 +543,7 @@ class Membership:
             if known.health != state.health:
                 self._emit(_as_it_is(state))
             return
-        if known.health != "ok":
+        if known.health != "ok" or known.sharable != state.sharable:
             self._emit(_as_it_is(state))
         if state.rules != known.rules:
             self._emit(RcReported(name, rules_changed=True))
