@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -45,13 +45,18 @@ class Row:
 def read_rows(document: str) -> list[Row]:
     """All rows of the key table, in its order. Raises ValueError for one that does not say what crosses there."""
     table = document[document.index("| key | kind |") :].partition("\n\n")[0]
-    return [_row(*re.split(r"(?<!\\) \| ", line.strip("| \n"))[:2]) for line in table.splitlines()[2:]]
+    rows: list[Row] = []
+    for line in table.splitlines()[2:]:
+        key, kind = re.split(r"(?<!\\) \| ", line.strip("| \n"))[:2]
+        rows.append(_row(key.strip("`").removeprefix("zscout/<fleet>/"), kind, rows))
+    return rows
 
 
-def _row(key: str, kind: str) -> Row:
-    below = key.strip("`").removeprefix("zscout/<fleet>/")
+def _row(key: str, kind: str, before: list[Row]) -> Row:
     if kind == "liveliness token":
-        return Row(below)
+        return Row(key)
+    if kind.startswith("the same"):
+        return replace(next(row for row in before if key.startswith(f"{row.key}/")), key=key)
     asked, answers, published = list[type](), list[type](), list[type]()
     attached = "attached" in kind
     for part in kind.split(";"):
@@ -66,7 +71,7 @@ def _row(key: str, kind: str) -> Row:
             published += _structs(first)
     if not (asked and answers) and not published:
         raise ValueError(f"the row of {key} names no message: {kind}")
-    return Row(below, tuple(asked), tuple(answers), tuple(published), attached)
+    return Row(key, tuple(asked), tuple(answers), tuple(published), attached)
 
 
 def _structs(text: str) -> list[type]:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 
+from tests.fuzz.fleet import Fleet, in_fleet
 from tests.mesh.kit import run
 from tests.services.rcm.kit import FakeFleet
 from zscout.config.fleet import default_fleet
@@ -62,6 +63,41 @@ def test_an_rc_that_answers_under_anothers_name_takes_nobodys_place() -> None:
         assert real is not None
         assert real.instance == "i1"
         assert rcm.membership.reported("robot/x") is None
+
+    run(story())
+
+
+def test_an_instance_that_was_told_to_stand_by_serves_again() -> None:
+    """One forged publication names another instance of radio/r, that does not exist: its leader goes on to mean this
+    one, and is to say so."""
+
+    async def story(fleet: Fleet) -> None:
+        (leader,) = fleet.leaders
+        assert leader.rcm is not None
+        said = {"term": leader.rcm.term, "seq": leader.rcm.seq, "prev": leader.rcm.seq, "every": 0.5}
+        said |= {"rcs": {"radio/r": []}, "instances": {"radio/r": "forged"}}
+        fleet.stranger.put(fleet.stranger.mesh.keys.grants, json.dumps(said).encode())
+        await asyncio.sleep(0.1)
+        fleet.leave()
+        await fleet.serves()
+
+    errors, _ = in_fleet(story)
+    assert not errors
+
+
+def test_an_rc_is_as_sharable_as_it_says_now() -> None:
+    """Somebody may have answered in its place as it joined: then it was asked for votes for ever, and gave none."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        rc = fleet.rc("radio/r", accept=None)
+        await fleet.joined(rc)
+        rc.sharable = False
+        rc.publish()
+        await asyncio.sleep(0.1)
+        assert (await fleet.client("one").ask("arc", "radio/r")).state == "running"
+        assert not rc.proposals
 
     run(story())
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -97,23 +98,26 @@ async def misbehave_idly(fleet: Fleet, some: Sequence[Deed]) -> list[str]:
 
 def test_every_key_of_the_key_space_has_a_row() -> None:
     """What `Keys` builds, or subscribes to, stands in the document: so it is fuzzed."""
-    keys, sender = Keys("zscout"), Sender("h", "c")
-    arguments = {
+    sender = Sender("h", "c")
+    arguments: dict[str, tuple[Any, ...]] = {
         "alive": (Token("h", "node", "node", "i"),),
+        "alive_any": (),
         "alive_rc": ("k/n",),
-        "alive_session": (sender,),
         "command": ("k/n", sender),
+        "component": ("h", sender),
+        "served_placer": (),
         **dict.fromkeys(("vote", "command_any", "rc_state", "frame"), ("k/n",)),
-        **dict.fromkeys(("load", "component"), ("h",)),
+        **dict.fromkeys(("load", "served_component"), ("h",)),
     }
-    no_keys = {"fleet", "base", "everything"}
+    no_keys = {"fleet", "closed", "base", "everything"}
     built: dict[str, str] = {}
-    for name in [one for one in dir(Keys) if not one.startswith("_") and one not in no_keys]:
-        member = getattr(keys, name)
-        if isinstance(member, str):
-            built[name] = member
-        elif not name.endswith("_of"):
-            built[name] = member(*arguments.get(name, () if name == "alive_any" else (sender,)))
+    for keys in (Keys("zscout"), Keys("zscout", closed=True)):
+        for name in [one for one in dir(Keys) if not one.startswith("_") and one not in no_keys]:
+            member = getattr(keys, name)
+            if not isinstance(member, str) and not name.endswith("_of"):
+                member = member(*arguments.get(name, (sender,)))
+            for key in (member,) if isinstance(member, str) else member if isinstance(member, tuple) else ():
+                built[f"{name} {key}"] = key
     assert len(built) > 25
     rows = [f"zscout/zscout/{row.expression}" for row in ROWS] + ["zscout/zscout/alive/*/rc/*/*/*"]
     without = {name: key for name, key in built.items() if not any(intersects(key, row) for row in rows)}

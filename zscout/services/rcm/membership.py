@@ -543,11 +543,14 @@ class Membership:
             if known.health != state.health:
                 self._emit(_as_it_is(state))
             return
-        if known.health != "ok":
+        if known.health != "ok" or known.sharable != state.sharable:
             self._emit(_as_it_is(state))
         if state.rules != known.rules:
             self._emit(RcReported(name, rules_changed=True))
         self._on_reported(name, state)
+        if state.duplicate_of and self._supervisor.active:
+            # Whoever told it to stand by: it is the one that is meant.
+            self.on_named(name)
 
     def see(self, term: Term, obeyed_by: str | None = None) -> None:
         """A term that somebody has heard of; `obeyed_by` an RC or a client that is seen."""
