@@ -32,7 +32,7 @@ class ServiceManager:
     @classmethod
     def from_env(cls, env: MutableMapping[str, str] = os.environ) -> Self:
         """As systemd tells its services. Takes it out of `env`: what this process starts has nothing to say there."""
-        address = env.pop("NOTIFY_SOCKET", "")
+        address = env.get("NOTIFY_SOCKET", "")
         within, pid = env.pop("WATCHDOG_USEC", ""), env.pop("WATCHDOG_PID", "")
         for_us = within.isdecimal() and pid in ("", str(os.getpid()))
         return cls(address, int(within) / 1e6 if for_us else 0.0)
