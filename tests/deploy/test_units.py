@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from tests.deploy.machine import PROJECT, Machine, missing
 from tests.drivers.mjpeg import numbered
 from tests.hang import HANG
 from tests.live.lab import Lab
+from zscout.config.certificate_authority import CertificateAuthority
 
 UNITS = sorted((PROJECT / "deploy" / "systemd").glob("*.service"))
 EXPOSURE = 2.0
@@ -167,6 +169,26 @@ def test_a_frozen_node_is_started_anew_and_one_with_a_bad_file_is_not(machine: M
     machine.run("systemctl", "start", "zscout-node")
     machine.run("systemctl", "stop", "zscout-node")
     machine.until("zscout-node", ActiveState="inactive", Result="success", ExecMainStatus="0")
+
+
+@pytest.mark.live
+def test_a_certificate_that_ends_soon_is_among_what_failed(machine: Machine, tmp_path: Path) -> None:
+    machine.run("systemctl", "start", "zscout-cert-renew")  # a host of a plain mesh has none
+    now, day, ca = datetime.now(UTC), timedelta(days=1), tmp_path / "ca"
+    CertificateAuthority.make(ca, 300 * day, now - 100 * day)
+    for began, lasts, fails in ((80, 93, True), (80, 170, False), (80, 79, True)):
+        made = tmp_path / str(lasts)
+        CertificateAuthority.read(ca, now).issue("anvil", made, lasts * day, now - began * day)
+        for file in made.iterdir():
+            machine.write(f"/etc/zscout/keys/{file.name}", file.read_text())
+            machine.path(f"/etc/zscout/keys/{file.name}").chmod(0o640)
+        if fails:
+            machine.fails("systemctl", "start", "zscout-cert-renew")
+            machine.until("zscout-cert-renew", ActiveState="failed", ExecMainStatus="1")
+        else:
+            machine.run("systemctl", "start", "zscout-cert-renew")
+            machine.until("zscout-cert-renew", ActiveState="inactive", ExecMainStatus="0")
+    assert "ends soon: renew it" in machine.log()
 
 
 def test_the_keys_of_a_host_are_not_of_the_group_that_people_may_be_in() -> None:
