@@ -106,7 +106,9 @@ def machine(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mach
 
 
 @pytest.mark.live
-def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: Lab) -> None:
+def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: Lab, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
     # Whatever it calls outside the filter of its unit kills it, instead of being refused.
     machine.write("/etc/systemd/system/zscout-node.service.d/strict.conf", "[Service]\nSystemCallErrorNumber=kill\n")
     machine.run("systemctl", "daemon-reload")
@@ -124,10 +126,13 @@ def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: 
         async with lab:
             client = await lab.client()
             await lab.ready(client, *RCS)
+            # The framegrabber publishes while it is held: until a line comes out of the pipe.
+            until = ("--", "sh", "-c", f"read line <{pipe}")
             with closing(client.mesh.frames(client.mesh.keys.frame("framegrabber/f"))) as frames:
-                held = await tools.zscout_soon("request", *RCS, "--", "true", env=lab.env)
-                assert held.returncode == 0, held.stderr
+                holding = asyncio.create_task(tools.zscout_soon("request", *RCS, *until, env=lab.env))
                 assert await frames.next(HANG) is not None
+                await asyncio.to_thread(pipe.write_text, "enough\n")
+                assert (held := await holding).returncode == 0, held.stderr
             started = await tools.zscout_soon("start", "counter", env=lab.env)
             assert started.returncode == 0, started.stderr
 
