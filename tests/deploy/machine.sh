@@ -38,14 +38,16 @@ mount --bind "$python" "$root/opt/zscout/python"
 if [ "$installed" = yes ]; then
   cp "$project"/deploy/systemd/* "$root/etc/systemd/system/"
   systemd-sysusers --root="$root" "$project/deploy/sysusers.d/zscout.conf"
-  mkdir -p "$root/opt/zscout/current/bin"
-  cat >"$root/opt/zscout/current/bin/zscout-node" <<'EOF'
+  mkdir -p "$root/opt/zscout/current/bin" "$root/etc/zscout/keys"
+  cp "$project/deploy/renew-certificate" "$root/etc/zscout/"
+  for program in zscout-node=zscout.node zscout=zscout.cli.main; do
+    cat >"$root/opt/zscout/current/bin/${program%=*}" <<EOF
 #!/bin/sh
 export PYTHONPATH=/opt/zscout/project:/opt/zscout/packages PYTHONDONTWRITEBYTECODE=1
-exec /opt/zscout/python/bin/python3 -m zscout.node "$@"
+exec /opt/zscout/python/bin/python3 -m ${program#*=} "\$@"
 EOF
-  chmod 755 "$root/opt/zscout/current/bin/zscout-node"
-  mkdir -p "$root/etc/zscout"
+    chmod 755 "$root/opt/zscout/current/bin/${program%=*}"
+  done
 fi
 
 # shellcheck disable=SC2016 # it is for the inner shell

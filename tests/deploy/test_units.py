@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from tests.deploy.machine import PROJECT, Machine, missing
 from tests.drivers.mjpeg import numbered
 from tests.hang import HANG
 from tests.live.lab import Lab
+from zscout.config.certificate_authority import CertificateAuthority
 
 UNITS = sorted((PROJECT / "deploy" / "systemd").glob("*.service"))
 EXPOSURE = 2.0
@@ -104,7 +106,9 @@ def machine(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mach
 
 
 @pytest.mark.live
-def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: Lab) -> None:
+def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: Lab, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
     # Whatever it calls outside the filter of its unit kills it, instead of being refused.
     machine.write("/etc/systemd/system/zscout-node.service.d/strict.conf", "[Service]\nSystemCallErrorNumber=kill\n")
     machine.run("systemctl", "daemon-reload")
@@ -122,10 +126,13 @@ def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: 
         async with lab:
             client = await lab.client()
             await lab.ready(client, *RCS)
+            # The framegrabber publishes while it is held: until a line comes out of the pipe.
+            until = ("--", "sh", "-c", f"read line <{pipe}")
             with closing(client.mesh.frames(client.mesh.keys.frame("framegrabber/f"))) as frames:
-                held = await tools.zscout_soon("request", *RCS, "--", "true", env=lab.env)
-                assert held.returncode == 0, held.stderr
+                holding = asyncio.create_task(tools.zscout_soon("request", *RCS, *until, env=lab.env))
                 assert await frames.next(HANG) is not None
+                await asyncio.to_thread(pipe.write_text, "enough\n")
+                assert (held := await holding).returncode == 0, held.stderr
             started = await tools.zscout_soon("start", "counter", env=lab.env)
             assert started.returncode == 0, started.stderr
 
@@ -167,6 +174,26 @@ def test_a_frozen_node_is_started_anew_and_one_with_a_bad_file_is_not(machine: M
     machine.run("systemctl", "start", "zscout-node")
     machine.run("systemctl", "stop", "zscout-node")
     machine.until("zscout-node", ActiveState="inactive", Result="success", ExecMainStatus="0")
+
+
+@pytest.mark.live
+def test_a_certificate_that_ends_soon_is_among_what_failed(machine: Machine, tmp_path: Path) -> None:
+    machine.run("systemctl", "start", "zscout-cert-renew")  # a host of a plain mesh has none
+    now, day, ca = datetime.now(UTC), timedelta(days=1), tmp_path / "ca"
+    CertificateAuthority.make(ca, 300 * day, now - 100 * day)
+    for began, lasts, fails in ((80, 93, True), (80, 170, False), (80, 79, True)):
+        made = tmp_path / str(lasts)
+        CertificateAuthority.read(ca, now).issue("anvil", made, lasts * day, now - began * day)
+        for file in made.iterdir():
+            machine.write(f"/etc/zscout/keys/{file.name}", file.read_text())
+            machine.path(f"/etc/zscout/keys/{file.name}").chmod(0o640)
+        if fails:
+            machine.fails("systemctl", "start", "zscout-cert-renew")
+            machine.until("zscout-cert-renew", ActiveState="failed", ExecMainStatus="1")
+        else:
+            machine.run("systemctl", "start", "zscout-cert-renew")
+            machine.until("zscout-cert-renew", ActiveState="inactive", ExecMainStatus="0")
+    assert "ends soon: renew it" in machine.log()
 
 
 def test_the_keys_of_a_host_are_not_of_the_group_that_people_may_be_in() -> None:

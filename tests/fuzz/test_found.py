@@ -17,7 +17,7 @@ from tests.fuzz.fleet import Fleet, in_fleet
 from tests.mesh.kit import run
 from tests.services.rcm.kit import FakeFleet
 from zscout.config.fleet import default_fleet
-from zscout.keyexpr import Sender
+from zscout.keyexpr import Role, Sender, Token
 from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import RcState, RcView
 from zscout.services.rcm.devices import ExpectedDevices, SeenHome, homes_in
@@ -98,6 +98,28 @@ def test_an_rc_is_as_sharable_as_it_says_now() -> None:
         await asyncio.sleep(0.1)
         assert (await fleet.client("one").ask("arc", "radio/r")).state == "running"
         assert not rc.proposals
+
+    run(story())
+
+
+def test_an_instance_that_two_hosts_show_is_that_of_the_first() -> None:
+    """The second token that went ended the RCM; one that went made the RC be gone."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        rc = fleet.rc("robot/a")
+        await fleet.joined(rc)
+        forged = [fleet.mesh(host, "stranger").alive(Token(host, Role.RC, rc.name, rc.instance)) for host in "xy"]
+        await asyncio.sleep(0.1)
+        for token in forged:
+            token.close()
+        await asyncio.sleep(1)
+        assert [view.present for view in (await fleet.state()).rcs] == [True]
+        rc.token.close()
+        await asyncio.sleep(1)
+        assert [view.present for view in (await fleet.state()).rcs] == [False]
+        assert not fleet.failures
 
     run(story())
 

@@ -328,7 +328,10 @@ class Membership:
         return self._awaited.get(arc)
 
     def _on_rc_token(self, token: Token, alive: bool) -> None:
-        tokens = self._rc_tokens.setdefault(token.name, {})
+        tokens = self._rc_tokens.get(token.name, {})
+        if tokens.get(token.instance, token if alive else None) != token:
+            return  # a second host shows this instance, or does so no more: that is the first one's
+        self._rc_tokens[token.name] = tokens
         current = self._joined.get(token.name)
         if alive:
             tokens[token.instance] = token
