@@ -392,7 +392,7 @@ _READ: Final = ("liveliness_query", "declare_liveliness_subscriber")
 _EVERYTHING: Final = [*(kind for kinds in _SENT.values() for kind in kinds), "delete", "declare_subscriber", *_READ]
 
 
-class Member(NamedTuple):
+class FleetMember(NamedTuple):
     """Somebody of a fleet: the name of a machine or a person, and the RCs, or patterns of RCs, that it may serve."""
 
     name: str
@@ -400,7 +400,7 @@ class Member(NamedTuple):
     rcs: tuple[str, ...] = ()
 
 
-def access_control(keys: Keys, members: Collection[Member]) -> dict[str, Any]:
+def access_control(keys: Keys, members: Collection[FleetMember]) -> dict[str, Any]:
     """Zenoh's `access_control` for a session of this fleet: whoever has no certificate of a member's name may send
     nothing, a member what its ranks say, under its own name. (Rules have no templates: each name has its own.)"""
     out = {"id": "out", "permission": "allow", "flows": ["egress"], "messages": _EVERYTHING}
@@ -420,7 +420,7 @@ def access_control(keys: Keys, members: Collection[Member]) -> dict[str, Any]:
     return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
 
 
-def _rules(keys: Keys, member: Member) -> Iterable[dict[str, Any]]:
+def _rules(keys: Keys, member: FleetMember) -> Iterable[dict[str, Any]]:
     for act, kinds in _SENT.items():
         if "relay" in member.ranks:
             # What others send comes to a site under the name of the relay, which checks it.
@@ -442,7 +442,7 @@ def _rules(keys: Keys, member: Member) -> Iterable[dict[str, Any]]:
             }
 
 
-def _keys_of(row: Access, member: Member, *, asks: bool) -> list[str]:
+def _keys_of(row: Access, member: FleetMember, *, asks: bool) -> list[str]:
     if asks:
         return [_filled(row.key, by=member.name)]
     rcs = map(as_pattern, member.rcs) if "{rc}" in row.key else ["*/*"]

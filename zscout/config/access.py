@@ -13,7 +13,7 @@ from typing import Annotated, Final, get_args
 from msgspec import Meta, Struct
 
 from zscout.config.strict import Where, check_name, check_names, key, quoted, seconds
-from zscout.keyexpr import PEOPLE, Member, Rank, as_pattern, matcher
+from zscout.keyexpr import PEOPLE, FleetMember, Rank, as_pattern, matcher
 from zscout.types import HostName, Ns, RcName
 
 MAX_NAMES: Final = 1_000
@@ -87,9 +87,9 @@ class AccessPolicy(Struct, frozen=True, dict=True):
     def ranks_of(self, name: str) -> frozenset[Rank]:
         return self.ranks.get(name, frozenset())
 
-    def members(self) -> list[Member]:
+    def members(self) -> list[FleetMember]:
         """All names, with the RCs that they may serve."""
-        return [Member(name, ranks, self.roles.node.get(name, ())) for name, ranks in sorted(self.ranks.items())]
+        return [FleetMember(name, ranks, self.roles.node.get(name, ())) for name, ranks in sorted(self.ranks.items())]
 
     def may_serve(self, host: HostName, rc: RcName) -> bool:
         return any(matcher(as_pattern(pattern))(rc) for pattern in self.roles.node.get(host, ()))

@@ -16,7 +16,7 @@ from typing import Any, Self, TypeAlias, TypeVar
 from msgspec import Struct
 
 from zscout import messages
-from zscout.keyexpr import BadName, Keys, Member, Role, Sender, Token
+from zscout.keyexpr import BadName, FleetMember, Keys, Role, Sender, Token
 from zscout.mesh.exchange import (
     QUEUE_DEPTH,
     Backlog,
@@ -163,7 +163,7 @@ class Mesh:
         self._inbox.close()
         await self._transport.close()
 
-    def admit(self, members: Iterable[Member]) -> None:
+    def admit(self, members: Iterable[FleetMember]) -> None:
         """From now on these are let in, with their rights, and nobody else. A mesh without certificates lets in all."""
 
     def after_burst(self, then: Callable[[], None]) -> None:

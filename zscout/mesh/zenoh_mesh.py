@@ -24,7 +24,7 @@ from zscout import messages
 from zscout.config.certificates import Certificates, read_certificates
 from zscout.config.fleet import Fleet, MeshConfig
 from zscout.config.strict import BadInput
-from zscout.keyexpr import Keys, Member, Sender, access_control
+from zscout.keyexpr import FleetMember, Keys, Sender, access_control
 from zscout.mesh.exchange import MeshError
 from zscout.mesh.relinking import MEETING, Relinking
 from zscout.mesh.renewal import RenewableTransport
@@ -61,7 +61,7 @@ class Security(NamedTuple):
 
     certificates: Certificates
     keys: Keys
-    members: tuple[Member, ...]
+    members: tuple[FleetMember, ...]
 
 
 def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.Config:
@@ -190,7 +190,7 @@ class ZenohMesh(Mesh):
             if (soon := fresh.expires_soon(datetime.now(UTC))) and soon != warned:
                 log.warning("%s", warned := soon)
 
-    def admit(self, members: Iterable[Member]) -> None:
+    def admit(self, members: Iterable[FleetMember]) -> None:
         # The rules of a session can't be changed.
         if self._door.security is not None:
             self._door.security = self._door.security._replace(members=tuple(members))
