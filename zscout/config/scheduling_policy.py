@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Final, Literal, TypeAlias
 
 from zscout.types import SECOND, Ns
@@ -44,9 +43,9 @@ class SchedulingPolicy:
     """ARCs that the clients of one host may have running at one time; None: any number."""
     max_runtime: Ns | None = None
     """Time in ns after which every hold ends as completed, kept or not, whoever's it is; None: never."""
-    rc_quotas: Mapping[str, tuple[RcQuota, ...]] = field(default_factory=lambda: MappingProxyType({}))
+    rc_quotas: Mapping[str, tuple[RcQuota, ...]] = field(default_factory=dict)
     """By owner: the quotas that bind it."""
-    barred: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: MappingProxyType({}))
+    barred: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """By owner: patterns of the RCs that no need of its ARCs is bound to."""
 
 
