@@ -106,6 +106,27 @@ def test_a_publication_that_was_never_made_is_believed_for_a_hold_lease() -> Non
     assert seconds < 10
 
 
+def test_who_asks_for_the_last_terms_believes_none_beyond_them() -> None:
+    """Who took one for its own could never lead, nor hear anybody, again."""
+
+    async def story(fleet: Fleet) -> None:
+        (leader,) = fleet.leaders
+        assert leader.rcm is not None
+        name, keys = leader.rcm.term.rcm, fleet.stranger.mesh.keys
+        answer = {"term": [2**64, name], "seq": 1, "host": "a"}
+        fleet.stranger.serve(keys.rcm_state, lambda: (json.dumps(answer).encode(), True))
+        said = {"term": [2**52 - 1, "f"], "seq": 1, "prev": 1, "every": 0.5}
+        fleet.stranger.put(keys.grants, json.dumps(said).encode())
+        await asyncio.sleep(3)
+        fleet.leave()
+        assert max(one.known.counter for one in fleet.candidates) < 100
+        assert max(rc.holds.term.counter for rc in fleet.rcs.values()) < 100
+        await fleet.serves()
+
+    errors, _ = in_fleet(story)
+    assert not errors
+
+
 def test_an_rc_is_as_sharable_as_it_says_now() -> None:
     """Somebody may have answered in its place as it joined: then it was asked for votes for ever, and gave none."""
 
