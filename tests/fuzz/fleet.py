@@ -9,16 +9,15 @@ import logging
 import random
 import re
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import msgspec
-import zenoh
 
-from tests.fuzz.hostile import Hostile, Names
+from tests.fuzz.hostile import Hostile, Names, is_one
 from tests.fuzz.key_table import PROTOCOL, Row, read_rows
 from zscout import messages
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
@@ -35,7 +34,7 @@ from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork, MemoryTransport
 from zscout.lab.faults.virtual_time import Process, VirtualTimeLoop
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.transport import Collector, Quality, TransportQuery
-from zscout.messages import ComponentSpec, Malformed, Problem, Recorded
+from zscout.messages import ComponentSpec, Problem, Recorded
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.recorder.recorder import Recorder
@@ -54,8 +53,6 @@ STRANGER: Final = "x/stranger"
 LAST_TERM: Final = re.compile(rb"45035996273704\d\d")
 """One of the last terms is believed by the word of those whose tokens are seen (docs/protocol.md, "Absurd terms"), and
 after it there are none: without access control, who says so in an answer ends a fleet. No stranger does that here."""
-ODD: Final = ("*", "$*", "r$*", "the boss", "é", "x" * 65, "x" * 3_000, "..", "-", "a:b", "\0", "\n", "@x")
-"""Of a key: what stands there in place of a name, where Zenoh lets it."""
 
 
 class Worker(Component):
@@ -375,22 +372,6 @@ class _Answers(Collector):
         pass
 
 
-def is_one(payload: bytes, kind: type, limit: int) -> bool:
-    """Whether a payload is taken for such a message."""
-    with suppress(Malformed):
-        messages.decode(payload, kind, limit)
-        return True
-    return False
-
-
-def is_key(key: str) -> bool:
-    """Whether the network takes it."""
-    with suppress(zenoh.ZError):
-        zenoh.KeyExpr(key)
-        return True
-    return False
-
-
 # What the stranger says
 
 
@@ -452,14 +433,13 @@ class Script:
     def said(self, row: Row, faults: int, seed: int) -> tuple[str, bytes]:
         """A key and a payload for it."""
         hostile = self.hostile(row, seed)
-        key = self._key(row, hostile.rng, faults)
-        return self.base + key, hostile.payload((*row.asked, *row.published), faults)
+        return self.base + hostile.key(row, faults), hostile.payload((*row.asked, *row.published), faults)
 
     def do(self, row: Row, faults: int, seed: int) -> str:
         """One deed, in words."""
         hostile, stranger = self.hostile(row, seed), self.fleet.stranger
         rng = hostile.rng
-        key = self.base + self._key(row, rng, faults)
+        key = self.base + hostile.key(row, faults)
         ways = [way for way, kinds in (("ask", row.asked), ("put", row.published), ("serve", row.answers)) if kinds]
         way = rng.choice(ways or ["token"])
         words = f"{way} {key[:300]!r}"
@@ -482,18 +462,3 @@ class Script:
             else:
                 stranger.put(key, payload)
         return words
-
-    def _key(self, row: Row, rng: random.Random, faults: int) -> str:
-        kind, _, name = rng.choice(FIELDS["rc"]).partition("/")
-        host, _, client = rng.choice(FIELDS["client"]).partition("/")
-        role = rng.choice([value for word, value in vars(Role).items() if word.isupper()])
-        words = {"kind": kind, "name": name, "client": client, "role": role, "instance": rng.choice(("f", "1-f", "g"))}
-        words["host"] = host if "client" in row.words else rng.choice(HOSTS)
-        if role == Role.RC and row.words[-1:] == ["instance"]:
-            words["name"] = f"{kind}/{name}"
-        elif row.words[-1:] == ["instance"]:
-            words["name"] = rng.choice(("node", "victim", "w1", "stranger"))
-        if faults and rng.randrange(4) == 0 and row.words:
-            words[rng.choice(row.words)] = rng.choice(ODD)
-        key = row.filled(**words)
-        return key if is_key(key) else row.filled(**words | dict.fromkeys(row.words, "x"))

@@ -8,12 +8,19 @@ import base64
 import json
 import random
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cache
 from typing import Any, Final
 
+import zenoh
 from msgspec import inspect
+
+from tests.fuzz.key_table import Row
+from zscout import messages
+from zscout.keyexpr import Role
+from zscout.messages import Malformed
 
 LONG: Final = (300, 100_000)
 """Entries of a list or table that is much too long."""
@@ -35,6 +42,9 @@ NUMBERS: Final = (
     *('"NaN"', '"sNaN"', '"Infinity"', '"-Infinity"', '"1e999999"', '"1E-999999"', "NaN", "Infinity"),
 )
 """As they are written."""
+
+ODD: Final = ("*", "$*", "r$*", "the boss", "é", "x" * 65, "x" * 3_000, "..", "-", "a:b", "\0", "\n", "@x")
+"""Of a key: what stands there in place of a name, where Zenoh lets it."""
 
 
 class Raw(str):
@@ -66,6 +76,22 @@ def many(value: Any, number: int, *, named: bool = False) -> Raw:
     if named:
         return Raw("{" + ",".join(f'"robot/x{number}":{one}' for number in range(number)) + "}")
     return Raw("[" + ",".join([one] * number) + "]")
+
+
+def is_key(key: str) -> bool:
+    """Whether the network takes it."""
+    with suppress(zenoh.ZError):
+        zenoh.KeyExpr(key)
+        return True
+    return False
+
+
+def is_one(payload: bytes, kind: type, limit: int) -> bool:
+    """Whether a payload is taken for such a message."""
+    with suppress(Malformed):
+        messages.decode(payload, kind, limit)
+        return True
+    return False
 
 
 @dataclass(slots=True)
@@ -103,6 +129,21 @@ class Hostile:
                 return bytes(spoilt)
             case _:
                 return self._message(kinds, faults) if kinds else rng.randbytes(rng.choice((0, 9, 500)))
+
+    def key(self, row: Row, faults: int) -> str:
+        """One of a row's keys, below `zscout/<fleet>/`; with `faults` maybe one where no name stands."""
+        rng, known = self.rng, self.names.by_field
+        kind, _, name = rng.choice(known["rc"]).partition("/")
+        host, _, client = rng.choice(known["client"]).partition("/")
+        role = rng.choice([value for word, value in vars(Role).items() if word.isupper()])
+        words = {"kind": kind, "name": name, "client": client, "role": role, "instance": rng.choice(("f", "1-f", "g"))}
+        words["host"] = host if "client" in row.words else rng.choice(known["host"])
+        if "role" in row.words:
+            words["name"] = f"{kind}/{name}" if role == Role.RC else rng.choice(("node", client, "w1"))
+        if faults and row.words and rng.randrange(4) == 0:
+            words[rng.choice(row.words)] = rng.choice(ODD)
+        key = row.filled(**words)
+        return key if is_key(key) else row.filled(**words | dict.fromkeys(row.words, "x"))
 
     def _message(self, kinds: Sequence[type], faults: int) -> bytes:
         tree = [self._plausible(_type_info(self.rng.choice(kinds)), "")]

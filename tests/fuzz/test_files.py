@@ -92,7 +92,7 @@ def spoilt(text: str, faults: int, rng: random.Random) -> bytes:
     return bytes(data)
 
 
-@settings(max_examples=times(60), suppress_health_check=list(HealthCheck))
+@settings(max_examples=times(60), derandomize=FACTOR == 1, suppress_health_check=list(HealthCheck))
 @given(st.sampled_from(sorted(FILES)), st.integers(0, 4), st.integers(0, 2**32 - 1))
 def test_a_file_is_read_or_refused_in_one_line(tmp_path: Path, kind: str, faults: int, seed: int) -> None:
     read, example = FILES[kind]
@@ -155,7 +155,7 @@ def test_what_is_no_file_or_too_large_is_refused_unread(tmp_path: Path, kind: st
 # What a node keeps for itself
 
 
-@settings(max_examples=times(40), suppress_health_check=list(HealthCheck))
+@settings(max_examples=times(40), derandomize=FACTOR == 1, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 2**32 - 1))
 def test_a_node_begins_whatever_stands_in_its_state_folder(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)  # noqa: S311 - to fail again

@@ -14,7 +14,7 @@ import pytest
 from msgspec import structs
 
 from tests.fuzz.fleet import Fleet, in_fleet
-from tests.mesh.kit import run
+from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
@@ -22,6 +22,7 @@ from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import RcState, RcView
 from zscout.services.rcm.devices import ExpectedDevices, SeenHome, homes_in
 from zscout.services.rcm.inventory import FILE, Inventory
+from zscout.types import SECOND
 
 
 def state(**fields: Any) -> bytes:
@@ -79,6 +80,47 @@ def test_an_instance_that_was_told_to_stand_by_serves_again() -> None:
         fleet.stranger.put(fleet.stranger.mesh.keys.grants, json.dumps(said).encode())
         await asyncio.sleep(0.1)
         fleet.leave()
+        await fleet.serves()
+
+    errors, _ = in_fleet(story)
+    assert not errors
+
+
+def test_a_publication_that_was_never_made_is_believed_for_a_hold_lease() -> None:
+    """One of the leader's own term, and of a number far above its own: RCs took all that it published for old."""
+
+    async def story(fleet: Fleet) -> float:
+        (leader,) = fleet.leaders
+        assert leader.rcm is not None
+        said = {"term": leader.rcm.term, "seq": 2**63, "prev": 2**63, "every": 0.5}
+        fleet.stranger.put(fleet.stranger.mesh.keys.grants, json.dumps(said).encode())
+        await asyncio.sleep(0.1)
+        fleet.leave()
+        at = leader.mesh.now()
+        await fleet.serves()
+        await until(lambda: fleet.held is not None and fleet.held.grant in fleet.rcs["robot/b"].holds.held)
+        return (leader.mesh.now() - at) / SECOND
+
+    errors, seconds = in_fleet(story)
+    assert not errors
+    assert seconds < 10
+
+
+def test_who_asks_for_the_last_terms_believes_none_beyond_them() -> None:
+    """Who took one for its own could never lead, nor hear anybody, again."""
+
+    async def story(fleet: Fleet) -> None:
+        (leader,) = fleet.leaders
+        assert leader.rcm is not None
+        name, keys = leader.rcm.term.rcm, fleet.stranger.mesh.keys
+        answer = {"term": [2**64, name], "seq": 1, "host": "a"}
+        fleet.stranger.serve(keys.rcm_state, lambda: (json.dumps(answer).encode(), True))
+        said = {"term": [2**52 - 1, "f"], "seq": 1, "prev": 1, "every": 0.5}
+        fleet.stranger.put(keys.grants, json.dumps(said).encode())
+        await asyncio.sleep(3)
+        fleet.leave()
+        assert max(one.known.counter for one in fleet.candidates) < 100
+        assert max(rc.holds.term.counter for rc in fleet.rcs.values()) < 100
         await fleet.serves()
 
     errors, _ = in_fleet(story)

@@ -132,6 +132,9 @@ class HoldTable:
         missed = grants.term != self.term or grants.prev > self.seq
         change = HoldChange()
         if not self._accept(grants, change, now):
+            if grants.term == self.term and not self._heard(now):
+                # For a hold lease nothing newer came: what made this old was no RCM's. What stands is read.
+                self.seq, change.reread = grants.seq, True
             return change
         change.reread = missed
         holders = grants.rcs.get(self.rc)

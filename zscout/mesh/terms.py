@@ -8,7 +8,7 @@ from collections.abc import Callable
 from zscout.keyexpr import BadName, Role, Token, client_of
 from zscout.mesh.session import Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import ClientRequests, RcAsk, RcmState, RcState, StateAsk, of_the_last
+from zscout.messages import MAX_COUNTER, ClientRequests, RcAsk, RcmState, RcState, StateAsk, of_the_last
 from zscout.types import NO_TERM, Term
 
 
@@ -50,7 +50,7 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
     terms += [
         reply.message.term for reply in leaders if reply.message is not None and reply.message.term.rcm in leading
     ]
-    return max(terms, default=NO_TERM)
+    return max((term for term in terms if term.counter <= MAX_COUNTER), default=NO_TERM)
 
 
 def _key_of(mesh: Mesh, token: Token) -> str | None:
