@@ -13,12 +13,13 @@ from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, hol
 from tests.hang import HANG
 from tests.mesh.kit import run, until
 from zscout.drivers.holds import HoldChange
+from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
 from zscout.drivers.resource_controller import EARLY_PER_HOST, SAY_AGAIN, CommandQuery, ResourceController, WorkQueue
 from zscout.keyexpr import Role, Sender
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
-from zscout.mesh import Mesh
-from zscout.messages import Grants, Malformed, RcAsk, RcmState, RcState
+from zscout.mesh import IncomingQuery, Mesh, Refused
+from zscout.messages import Command, Done, Grants, Malformed, RcAsk, RcmState, RcState
 from zscout.types import SECOND, Grant
 
 Story = Callable[[Rcm, ResourceController, Device, Mesh], Awaitable[None]]
@@ -102,6 +103,50 @@ def test_an_early_command_makes_the_rc_read_what_it_missed() -> None:
         assert await answer(client, grant(5), ttl=0) == "bad_command"
 
     play(story)
+
+
+def test_a_command_that_arrives_again_is_carried_out_once() -> None:
+    async def story(rcm: Rcm, _rc: ResourceController, device: Device, client: Mesh) -> None:
+        rcm.publish(holder(1))
+        await until(lambda: device.calls and device.calls[-1] == "begin one")
+        key, other = client.keys.command("robot/x", client.me), client.keys.command("robot/x", Sender("h", "other"))
+
+        async def told(number: int, *, id_: str | None, key: str = key, name: str = "echo") -> object:
+            do = {"name": name, "value": number, "seconds": 1.0}
+            command = Command(do=do, grant=grant(1), ttl=5.0, id=id_)
+            reply = await client.ask_one(key, command, Done, timeout=60)
+            assert reply is not None
+            return reply.message.result if reply.message is not None else reply.problem and reply.problem.code
+
+        assert [await told(1, id_="a"), await told(2, id_="a"), await told(3, id_="b")] == [1, 1, 3]
+        slow = [told(4, id_="c", name="slow") for _ in range(3)]
+        assert await asyncio.gather(*slow) == [4, 4, 4]
+        assert device.calls[-3:] == ["echo 1", "echo 3", "slow 4"]
+        # What was refused stays so, and an id is its sender's.
+        assert [await told(5, id_="d", key=other), await told(5, id_="d", key=other)] == ["wrong_client"] * 2
+        assert [await told(5, id_="d"), await told(6, id_=None), await told(6, id_=None)] == [5, 6, 6]
+        assert device.calls[-3:] == ["echo 5", "echo 6", "echo 6"]
+
+    play(story)
+
+
+def test_one_host_fills_no_others_memory_of_commands() -> None:
+    memory = CommandMemory()
+
+    def is_new(host: str, id_: str) -> bool:
+        query = IncomingQuery(None, "", "", Command(do={}, id=id_), 0)
+        return memory.is_new(Sender(host, "one"), query)
+
+    assert is_new("mine", "a")
+    assert all(is_new("stranger", str(number)) for number in range(2 * MAX_PER_HOST))
+    assert not is_new("mine", "a")
+    assert is_new("stranger", "0")  # forgotten
+    waiting = [is_new("mine", "a") for _ in range(MAX_WAITING - 1)]
+    assert waiting == [False] * (MAX_WAITING - 1)
+    with pytest.raises(Refused):
+        is_new("mine", "a")
+    assert all(is_new(f"host{number}", "a") for number in range(MAX_HOSTS))
+    assert is_new("mine", "a")  # others commanded later
 
 
 def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:

@@ -14,7 +14,7 @@ from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.mesh.zenoh_mesh import zenoh_config
 
-LIMITS = "[limits]\nmax_needs = 8\nmax_queued = 20\nmax_requests_per_client = 5\n"
+LIMITS = "[limits]\nmax_needs = 8\nmax_queued = 20\nmax_requests_per_client = 5\nmax_requests_per_host = 15\n"
 HIGH = 10**15
 """The counter of a term that no election leads to."""
 

@@ -226,18 +226,23 @@ def test_what_is_handed_over_goes_by_the_same_id_at_its_new_client(stranger: Str
     stranger.serves()
 
 
-def test_one_client_and_all_together_may_wait_with_so_many(stranger: Stranger) -> None:
-    tokens = [stranger.token(f"t/client/many{client}/1") for client in range(4)]
+def test_one_client_one_host_and_all_together_may_wait_with_so_many(stranger: Stranger) -> None:
+    clients = [*(f"t/many{number}" for number in range(3)), "other/many"]
+    tokens = [stranger.token(f"{one.replace('/', '/client/')}/1") for one in clients]
     try:
-        for client in range(4):
+        for client in clients:
             for number in range(5):
                 asked = good_ask(id=f"n{number}", needs={"robot/ghost": {}})
-                assert stranger.ask(f"rcm/schedule/t/many{client}", asked)["state"] == "queued"
-            if client == 0:
+                assert stranger.ask(f"rcm/schedule/{client}", asked)["state"] == "queued"
+            if client == "t/many0":
                 [(kind, answer)] = stranger.get("rcm/schedule/t/many0", bad(id="n6"))
                 assert (kind, answer["code"]) == ("err", "too_many")
                 assert "5 requests open" in answer["message"]
-        [(kind, answer)] = stranger.get(SCHEDULE, bad())
+            if client == "t/many2":
+                [(kind, answer)] = stranger.get("rcm/schedule/t/more", bad())
+                assert (kind, answer["code"]) == ("err", "too_many")
+                assert "the clients of t have 15 requests open" in answer["message"]
+        [(kind, answer)] = stranger.get("rcm/schedule/other/more", bad())
         assert (kind, answer["code"]) == ("err", "queue_full")
         assert "20 ARCs wait already" in answer["message"]
     finally:

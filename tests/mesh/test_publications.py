@@ -8,6 +8,7 @@ import logging
 import threading
 from collections.abc import Callable
 from contextlib import AsyncExitStack, closing
+from typing import Any, cast
 
 import pytest
 
@@ -90,6 +91,28 @@ def test_what_is_published_before_a_subscription_is_not_kept(play: Play) -> None
         assert heard == [2]
 
     play(story)
+
+
+def test_of_deletes_and_keys_with_wildcards_nothing_is_heard() -> None:
+    async def story() -> None:
+        async with AsyncExitStack() as stack, asyncio.timeout(HANG):
+            world = Zenoh(stack)
+            a, b = await world.open("a", "b")
+            heard: list[int] = []
+            a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
+            polled, frames = a.poll_latest(NEWS, Ping), list[bytes]()
+            a._transport.subscriber(NEWS, lambda _key, payload, _head: frames.append(payload))
+            await world.declared()
+            transport = cast("Any", b._transport)
+            session = transport.current._session
+            session.put("test/*", b'{"number": 1}')
+            session.delete(NEWS)
+            b.put(NEWS, Ping(2))
+            await until(lambda: heard and frames)
+            assert (heard, frames) == ([2], [b'{"number":2}'])
+            assert [ping.number for _, ping in polled.each()] == [2]
+
+    asyncio.run(story())
 
 
 def test_alike_subscriptions_are_closed_one_by_one(play: Play) -> None:

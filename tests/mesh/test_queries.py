@@ -219,6 +219,26 @@ def test_queries_beyond_a_full_queue_are_refused_as_busy(play: Play) -> None:
     play(story)
 
 
+def test_one_host_fills_half_a_queue_at_most_and_is_refused_undecoded(play: Play) -> None:
+    async def story(world: World) -> None:
+        a, b = await world.open("a", "b")
+        b.serve("test/ask/*/*", Ping, pong(b), depth=4)
+        await world.declared()
+        outcomes: list[object] = []
+        for number in range(10):
+            a._transport.get(f"test/ask/one/{number}", b"no JSON", Ping, LONG, Replies())
+        for number in range(2):
+            a.ask_then(f"test/ask/two/{number}", Ping(number), Pong, outcomes.append, timeout=LONG)
+        await world.occupied(lambda: len(b._inbox.items) == 4)
+        await until(lambda: len(outcomes) == 2)
+        assert all(reply.message is not None for reply in outcomes)  # type: ignore[attr-defined]
+        reply = await a.ask_one("test/ask/one/x", Ping(7), Pong, timeout=LONG)
+        assert reply is not None
+        assert reply.message == Pong(7, "b")
+
+    play(story)
+
+
 def test_ask_ends_with_the_reply_that_is_enough(play: Play) -> None:
     async def story(world: World) -> None:
         a, b, c = await world.open("a", "b", "c")

@@ -86,6 +86,9 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
     max_queued: Annotated[int, key("ARCs that wait at one time.", 1, 1_000_000)] = 10_000
     max_needs: Annotated[int, key("RCs in one ARC.", 1, 1_000)] = 64
     max_requests_per_client: Annotated[int, key("ARCs of one client, waiting or running.", 1, 100_000)] = 256
+    max_requests_per_host: Annotated[
+        int, key("ARCs of all clients of one host or person, waiting or running.", 1, 1_000_000)
+    ] = 2_500
     max_payload: Annotated[int, key("Of one request.", 1_024, 16_777_216, unit="bytes")] = 65_536
     max_running_per_host: Annotated[
         int, key("Running ARCs of all clients of one host, but for an operator's; 0: any number.", 0, 100_000)

@@ -21,6 +21,7 @@ from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.instances import Instances, InstanceState
 from zscout.drivers.last_holder import LastHolder
+from zscout.drivers.repeated import CommandMemory
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
 from zscout.mesh.renewal import UNHEARD
@@ -135,7 +136,7 @@ class ResourceController:
         self._last_holder, self._noting = last_holder or LastHolder(), asyncio.Lock()
         self.rules = 0
         self.health = "ok"
-        self.queue = WorkQueue()
+        self.queue, self._memory = WorkQueue(), CommandMemory()
         self.directory = RcDirectory(mesh) if driver.relays else None
         self.stall, self._on_failure = stall, on_failure
         self.supervisor = Supervisor(name, self._failed)
@@ -350,7 +351,9 @@ class ResourceController:
     # Commands
 
     def _on_command(self, query: CommandQuery) -> None:
-        self.mesh.keys.sender_of(query.key)  # a sender without a valid name is refused here
+        sender = self.mesh.keys.sender_of(query.key)  # one without a valid name is refused here
+        if not self._memory.is_new(sender, query):
+            return
         # What stops a robot is let in where commands are not.
         room = COMMAND_QUEUE if query.message.grant is not None else 2 * COMMAND_QUEUE
         if self.queue.commands >= room:

@@ -6,6 +6,7 @@ while its radio can't."""
 from __future__ import annotations
 
 import asyncio
+import itertools
 import statistics
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -79,6 +80,7 @@ class RobotDriver(Driver):
         self._declared: list[Declaration] = []
         self._counts = Counter(commands=0, refused=0, halts=0, dead_man_stops=0)
         self._latencies: deque[float] = deque(maxlen=RECENT)
+        self._sent = itertools.count(1)
 
     @classmethod
     def configured(cls, options: Any) -> Self:
@@ -184,7 +186,8 @@ class RobotDriver(Driver):
 
     async def _ask_radio(self, radio: str, order: Any, grant: Grant | None, timeout: float) -> Reply[Done] | None:
         key = self._mesh.keys.command(radio, self._mesh.me)
-        message = Command(do=msgspec.to_builtins(order), grant=grant, ttl=timeout)
+        id_ = f"{self._rc.instances.instance}-{next(self._sent)}"
+        message = Command(do=msgspec.to_builtins(order), grant=grant, ttl=timeout, id=id_)
         return await self._mesh.ask_one(key, message, Done, timeout=timeout)
 
     def _drop(self, outcome: Any, kind: type = object) -> None:

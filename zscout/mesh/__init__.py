@@ -13,6 +13,7 @@ os.environ.setdefault(
     "app:(worker_threads:2))",
 )
 
+from zscout.mesh.exchange import Answered as Answered
 from zscout.mesh.exchange import Declaration as Declaration
 from zscout.mesh.exchange import IncomingQuery as IncomingQuery
 from zscout.mesh.exchange import MeshError as MeshError

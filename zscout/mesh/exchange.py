@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
@@ -49,6 +50,26 @@ class Reply(Generic[R]):
 
 
 @dataclass(slots=True, eq=False)
+class Answered:
+    """How a question was answered, for arrivals of it that come later."""
+
+    said: msgspec.Struct | None = None
+    waiting: list[IncomingQuery[Any]] = field(default_factory=list)
+
+    def join(self, query: IncomingQuery[Any]) -> None:
+        """`query` gets the same answer, now or when there is one."""
+        if self.said is None:
+            self.waiting.append(query)
+        else:
+            query.end(self.said)
+
+    def tell(self, said: msgspec.Struct) -> None:
+        self.said = said
+        while self.waiting:
+            self.waiting.pop().end(said)
+
+
+@dataclass(slots=True, eq=False)
 class IncomingQuery(Generic[R]):
     """A query that arrived: answer it once, now or later. No answer at all reads as "unknown"."""
 
@@ -58,16 +79,26 @@ class IncomingQuery(Generic[R]):
     message: R
     arrived: Ns
     """When it came out of the network, by `Mesh.now`."""
+    outcome: Answered | None = None
+    """Where to keep the answer, if it is to be kept."""
 
     def answer(self, message: msgspec.Struct) -> None:
-        query, self._query = self._query, None
-        if query is not None:
-            query.reply(self._reply_key, messages.encode(message), type(message))
+        self.end(message)
 
     def refuse(self, problem: Problem) -> None:
+        self.end(problem)
+
+    def end(self, said: msgspec.Struct) -> None:
+        """Answers or refuses, as `said` is a message or a Problem."""
         query, self._query = self._query, None
-        if query is not None:
-            query.reply_error(messages.encode(problem), Problem)
+        if query is None:
+            return
+        if isinstance(said, Problem):
+            query.reply_error(messages.encode(said), Problem)
+        else:
+            query.reply(self._reply_key, messages.encode(said), type(said))
+        if self.outcome is not None:
+            self.outcome.tell(said)
 
 
 class Publisher:
@@ -90,6 +121,27 @@ class Backlog:
     closed: bool = False
     """Nothing that still waits is handled any more. Subscriptions that share a backlog do not ask."""
     depth: int = QUEUE_DEPTH
+
+
+class HostShares:
+    """How many queries of each host wait, so that one host can't take all the room. Counted on any thread."""
+
+    def __init__(self, share: int) -> None:
+        self._share, self._lock, self._waiting = share, threading.Lock(), dict[str, int]()
+
+    def enter(self, host: str) -> bool:
+        with self._lock:
+            waiting = self._waiting.get(host, 0)
+            if waiting >= self._share:
+                return False
+            self._waiting[host] = waiting + 1
+            return True
+
+    def leave(self, host: str) -> None:
+        with self._lock:
+            self._waiting[host] -= 1
+            if not self._waiting[host]:
+                del self._waiting[host]
 
 
 class Declaration:

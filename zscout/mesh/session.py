@@ -16,11 +16,12 @@ from typing import Any, Self, TypeAlias, TypeVar
 from msgspec import Struct
 
 from zscout import messages
-from zscout.keyexpr import BadName, FleetMember, Keys, Role, Sender, Token
+from zscout.keyexpr import MAX_NAME, BadName, FleetMember, Keys, Role, Sender, Token
 from zscout.mesh.exchange import (
     QUEUE_DEPTH,
     Backlog,
     Declaration,
+    HostShares,
     IncomingQuery,
     PolledSubscription,
     Publisher,
@@ -265,17 +266,26 @@ class Mesh:
 
         A payload that is not one is refused before the handler sees it, with code `malformed`; a query whose
         own key holds a wildcard is answered on `key` itself where that is concrete, and refused otherwise;
-        with `depth` queries waiting for the event loop, further ones are refused as `busy`."""
+        with `depth` queries waiting for the event loop, or half as many of one host where the key names its sender,
+        further ones are refused as `busy`, undecoded."""
         state = Backlog(depth=depth)
-        wild = "*" in key
+        wild, names_sender = "*" in key, key.endswith("/*/*")
+        shares = HostShares(depth // 2)
 
         def on_query(query: TransportQuery) -> None:
+            host = query.key.rsplit("/", 2)[-2] if names_sender else ""
             if state.closed:
                 query.drop()
-            elif not self._inbox.offer(state, handle, query, self.now()):
+            elif host and not shares.enter(host):
+                _refuse(query, "busy", f"too many requests of {host[:MAX_NAME]} are waiting here; ask again")
+            elif not self._inbox.offer(state, handle, query, self.now(), host):
+                if host:
+                    shares.leave(host)
                 _refuse(query, "busy", "too many requests are waiting here; ask again")
 
-        def handle(query: TransportQuery, arrived: Ns) -> None:
+        def handle(query: TransportQuery, arrived: Ns, host: str) -> None:
+            if host:
+                shares.leave(host)
             if state.closed:
                 # Unless it is dropped here and now, its sender waits for the whole of its timeout.
                 query.drop()

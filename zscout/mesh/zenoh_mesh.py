@@ -318,6 +318,8 @@ class ZenohTransport(Transport):
 
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
         def on_zenoh_sample(sample: zenoh.Sample) -> None:
+            if not _is_publication(sample):
+                return
             head = sample.attachment
             on_sample(str(sample.key_expr), sample.payload.to_bytes(), None if head is None else head.to_bytes())
 
@@ -328,10 +330,12 @@ class ZenohTransport(Transport):
 
         def take() -> tuple[str, bytes] | None:
             try:
-                sample = subscriber.try_recv()
+                while (sample := subscriber.try_recv()) is not None:
+                    if _is_publication(sample):
+                        return str(sample.key_expr), sample.payload.to_bytes()
             except zenoh.ZError:  # its session is closed
-                return None
-            return None if sample is None else (str(sample.key_expr), sample.payload.to_bytes())
+                pass
+            return None
 
         return take, _undeclare(subscriber)
 
@@ -406,6 +410,11 @@ def _encoding(kind: type | None) -> zenoh.Encoding:
     if kind is None:
         return zenoh.Encoding.IMAGE_JPEG
     return zenoh.Encoding.APPLICATION_JSON.with_schema(messages.schema(kind))
+
+
+def _is_publication(sample: zenoh.Sample) -> bool:
+    """Not a delete, nor of a key with a wildcard, by which one message would pass for everybody's."""
+    return sample.kind == zenoh.SampleKind.PUT and "*" not in str(sample.key_expr)
 
 
 def _collecting(to: Collector) -> Callback[zenoh.Reply]:

@@ -11,6 +11,8 @@ from zscout.messages.scheduling import Holder, Parameters
 from zscout.types import NO_TERM, Grant, Term
 
 MAX_FIGURES = 32
+MAX_ID = 64
+"""Characters of a command's id."""
 MAX_FRAME = 2_000_000
 """Bytes of one frame."""
 Figures: TypeAlias = Annotated[dict[str, float], Meta(max_length=MAX_FIGURES)]
@@ -38,7 +40,8 @@ class Ballot(Message, frozen=True):
 
 
 class Command(Message, frozen=True):
-    """An action `do` under `grant`, to be refused once it has waited longer than `ttl` seconds.
+    """An action `do` under `grant`, to be refused once it has waited longer than `ttl` seconds. Under one `id` a sender
+    has it carried out once, however often it arrives.
 
     `do` has the action in `name`; the rest is the driver's. Every RC knows `confirm`, `leaving` and `left`. Without a
     grant only what stops a robot is done, by a radio, for the node of that robot's RC."""
@@ -46,6 +49,7 @@ class Command(Message, frozen=True):
     do: dict[str, Any]
     grant: Grant | None = None
     ttl: float = 1.0
+    id: Annotated[str, Meta(min_length=1, max_length=MAX_ID)] | None = None
 
 
 class Done(Message, frozen=True):

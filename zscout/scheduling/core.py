@@ -143,7 +143,7 @@ class Core:
 
     def arcs_of_owners(self, owners: Collection[str]) -> list[ArcId]:
         """The ARCs of all clients of these hosts and people."""
-        return [arc.id for arc in self._state.all_arcs() if arc.owner in owners]
+        return [arc.id for owner in owners for arc in self._state.arcs_of_owner(owner)]
 
     def at_place(self, place: Place) -> list[ArcId]:
         """The ARCs of this place: one, or more where clients claim the same after a takeover."""

@@ -150,6 +150,7 @@ class SchedulerState:
         """How many RCs they hold."""
         self._by_bit: list[Rc] = []
         self._clients: dict[ClientId, dict[ArcId, Arc]] = {}
+        self._owners: dict[str, dict[ArcId, Arc]] = {}
         self.entries = 0
         """Counts who was queued or started."""
         self.version = 0
@@ -240,7 +241,7 @@ class SchedulerState:
     def enqueue(self, arc: Arc, since: Ns) -> None:
         arc.since, arc.entry = since, self._next_entry()
         arc.rcs = arc.rcs or tuple(self.rcs_in(arc.mask))
-        self._clients.setdefault(arc.request.client, {})[arc.id] = arc
+        self._know(arc)
         if not self._is_first(arc):
             arc.move_to(ArcState.HELD_BACK)
             self.held_back[arc.id] = arc
@@ -304,14 +305,22 @@ class SchedulerState:
         self._forget_client(arc)
         self.leave_place(arc)
 
+    def _know(self, arc: Arc) -> None:
+        self._clients.setdefault(arc.request.client, {})[arc.id] = arc
+        self._owners.setdefault(arc.owner, {})[arc.id] = arc
+
     def _forget_client(self, arc: Arc) -> None:
-        arcs = self._clients[arc.request.client]
-        del arcs[arc.id]
-        if not arcs:
-            del self._clients[arc.request.client]
+        for known, of in ((self._clients, arc.request.client), (self._owners, arc.owner)):
+            del known[of][arc.id]
+            if not known[of]:
+                del known[of]
 
     def arcs_of(self, client: ClientId) -> Collection[Arc]:
         return self._clients.get(client, {}).values()
+
+    def arcs_of_owner(self, owner: str) -> Collection[Arc]:
+        """The ARCs of all clients of a host or a person."""
+        return self._owners.get(owner, {}).values()
 
     def hand_over(self, arc: Arc, to: ClientId, renamed: ArcId) -> None:
         """An ARC goes on under another client, by another name. Its hold or its wait goes on."""
@@ -327,7 +336,7 @@ class SchedulerState:
         for end in (arc.hold.end, arc.hold.last):
             if end is not None and end > self.now:
                 heapq.heappush(self._ends, (end, arc.id))
-        self._clients.setdefault(to, {})[arc.id] = arc
+        self._know(arc)
 
     def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
         self._forget_client(arc)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import os
 import socket
@@ -80,6 +81,9 @@ class Client(MovableClient):
         self._leaving: asyncio.Task[None] | None = None
         self._declared: list[Declaration] = []
         self._token: Declaration | None = None
+        self._instance = ""
+        """Of its token."""
+        self._commanded = itertools.count(1)
         self._shown: Ns = 0
         """When the present token was declared."""
         self._denied: set[Grant] = set()
@@ -132,7 +136,8 @@ class Client(MovableClient):
     def _renew_token(self) -> None:
         """Shows that this client lives, by a token that nobody can have taken for gone."""
         mesh = self.mesh
-        token = mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance()))
+        self._instance = new_instance()
+        token = mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, self._instance))
         if self._token is not None:
             self._token.close()
         self._token, self._shown = token, mesh.now()
@@ -522,7 +527,8 @@ class Client(MovableClient):
     ) -> Done:
         """Has an RC do something under `grant`. Raises CommandRefused."""
         key = self.mesh.keys.command(rc, self.mesh.me)
-        command = messages.Command(grant=grant, do=dict(do), ttl=ttl)
+        id_ = f"{self._instance}-{next(self._commanded)}"
+        command = messages.Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
         reply = await self.mesh.ask_one(key, command, Done, timeout=timeout)
         if reply is None:
             raise CommandRefused(rc, Problem("unknown", "no answer; it may have been done or not"))

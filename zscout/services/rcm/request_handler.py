@@ -231,7 +231,7 @@ class RequestHandler:
         same_place = self.core.at_place(ask.place) if ask.place is not None else ()
         return any(request_id(arc) == ask.id for arc in same_place)
 
-    def _open_of(self, names: Collection[str], but: ArcId) -> int:
+    def _open_of(self, names: Collection[str], but: ArcId = "") -> int:
         """How many ARCs these have, waiting or running; what this burst has brought counts."""
         coming = {event.request.arc for event in self._batch.values() if isinstance(event, Requested)}
         owned = {arc for arc in coming if client_id(arc).partition("/")[0] in names}
@@ -245,6 +245,9 @@ class RequestHandler:
         most = self.limits.max_requests_per_client
         if sum(event.request.client == client for event in coming) + len(self.core.arcs_of(client)) >= most:
             raise Refused("too_many", f"{client} has {most} requests open already")
+        host, most = client.partition("/")[0], self.limits.max_requests_per_host
+        if self._open_of((host,)) >= most:
+            raise Refused("too_many", f"the clients of {host} have {most} requests open already")
 
     def _forecast(self, query: Query, asked: Foresee, sender: Sender) -> None:
         self.flush()

@@ -1,0 +1,46 @@
+"""Commands that arrive again, over a second relay or because their sender had no answer: they are carried out once."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Final
+
+from zscout.keyexpr import Sender
+from zscout.mesh import Answered, IncomingQuery, Refused
+from zscout.messages import Command
+
+MAX_HOSTS: Final = 64
+"""Hosts whose commands are remembered: those that commanded last."""
+MAX_PER_HOST: Final = 256
+"""Commands of one host that are remembered: the latest."""
+MAX_WAITING: Final = 8
+"""Arrivals of one command that may wait for its answer."""
+
+
+class CommandMemory:
+    """The outcomes of the latest commands of each host, by sender and id."""
+
+    def __init__(self) -> None:
+        self._hosts: OrderedDict[str, OrderedDict[tuple[str, str], Answered]] = OrderedDict()
+
+    def is_new(self, sender: Sender, query: IncomingQuery[Command]) -> bool:
+        """False: it came before, and is answered as then. What has no id is always new. Raises Refused."""
+        if query.message.id is None:
+            return True
+        known, name = self._of(sender.host), (sender.client, query.message.id)
+        if (before := known.get(name)) is not None:
+            if len(before.waiting) >= MAX_WAITING:
+                raise Refused("busy", "this command came before, and is not done yet; wait for its answer")
+            before.join(query)
+            return False
+        query.outcome = known[name] = Answered()
+        if len(known) > MAX_PER_HOST:
+            known.popitem(last=False)
+        return True
+
+    def _of(self, host: str) -> OrderedDict[tuple[str, str], Answered]:
+        known = self._hosts.setdefault(host, OrderedDict())
+        self._hosts.move_to_end(host)
+        if len(self._hosts) > MAX_HOSTS:
+            self._hosts.popitem(last=False)
+        return known
