@@ -14,7 +14,14 @@ from tests.hang import HANG
 from tests.mesh.kit import run, until
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
-from zscout.drivers.resource_controller import EARLY_PER_HOST, SAY_AGAIN, CommandQuery, ResourceController, WorkQueue
+from zscout.drivers.resource_controller import (
+    COMMANDS_PER_HOST,
+    EARLY_PER_HOST,
+    SAY_AGAIN,
+    CommandQuery,
+    ResourceController,
+    WorkQueue,
+)
 from zscout.keyexpr import Role, Sender
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
@@ -355,7 +362,7 @@ def drained(queue: WorkQueue, count: int) -> list[Any]:
 def test_changes_go_before_all_commands_and_keep_their_order() -> None:
     queue, first, second = WorkQueue(), HoldChange(stayed=True), HoldChange(reread=True)
     for name in ("a", "b"):
-        queue.put_command(query(name))
+        assert queue.put_command(query(name), "host")
     queue.put_change(first)
     queue.put_change(second)
     assert drained(queue, 4) == [first, second, "a", "b"]
@@ -365,7 +372,7 @@ def test_what_was_set_aside_comes_back_before_other_commands_in_its_order() -> N
     queue = WorkQueue()
     for name in ("one", "two", "three"):
         assert queue.set_aside(query(name), "host")
-    queue.put_command(query("late"))
+    assert queue.put_command(query("late"), "host")
     assert queue.commands == 4
     queue.resume(lambda command: cast("str", command) != "two")
     assert queue.drop_early() == [query("two")]
@@ -378,6 +385,13 @@ def test_one_host_can_not_fill_what_is_set_aside() -> None:
     assert all(queue.set_aside(query(str(number)), "stranger") for number in range(EARLY_PER_HOST))
     assert not queue.set_aside(query("more"), "stranger")
     assert queue.set_aside(query("mine"), "host")
+
+
+def test_one_host_can_not_fill_the_queue() -> None:
+    queue = WorkQueue()
+    assert all(queue.put_command(query(str(number)), "stranger") for number in range(COMMANDS_PER_HOST))
+    assert not queue.put_command(query("more"), "stranger")
+    assert queue.put_command(query("mine"), "host")
 
 
 def test_who_waits_is_woken() -> None:

@@ -47,6 +47,8 @@ AT_ONCE: Final = 0.1
 """Seconds for which what comes next waits for a device that is being made safe; then it is answered `settling`."""
 NEVER_HELD_BACK: Final = ("stop", "halt")
 COMMAND_QUEUE = 64
+COMMANDS_PER_HOST = 48
+"""Of those that wait, at most."""
 EARLY_PER_HOST = 16
 """Commands of one host that may be set aside."""
 LOOK_PERIOD = 0.5
@@ -67,9 +69,10 @@ class WorkQueue:
 
     def __init__(self) -> None:
         self._changes: deque[HoldChange] = deque()
-        self._commands: deque[CommandQuery] = deque()
+        self._commands: deque[tuple[str, CommandQuery]] = deque()
+        """With the sender's host."""
         self._early: list[tuple[str, CommandQuery]] = []
-        """With the sender's host, in the order of arrival."""
+        """Likewise, in the order of arrival."""
         self._wakeup = asyncio.Event()
 
     @property
@@ -81,9 +84,15 @@ class WorkQueue:
         self._changes.append(change)
         self._wakeup.set()
 
-    def put_command(self, command: CommandQuery) -> None:
-        self._commands.append(command)
+    def put_command(self, command: CommandQuery, host: str) -> bool:
+        """False: too many of this host wait already."""
+        if self.commands >= COMMANDS_PER_HOST:
+            waiting = Counter(of for queue in (self._commands, self._early) for of, _ in queue)
+            if waiting[host] >= COMMANDS_PER_HOST:
+                return False
+        self._commands.append((host, command))
         self._wakeup.set()
+        return True
 
     def set_aside(self, command: CommandQuery, host: str) -> bool:
         """Keeps a command for `resume`. False: too many of this host are kept already."""
@@ -96,7 +105,7 @@ class WorkQueue:
         """Puts early commands that are `ready` before all others, in the order of arrival."""
         found = [early for early in self._early if ready(early[1])]
         self._early = [early for early in self._early if early not in found]
-        self._commands.extendleft(command for _, command in reversed(found))
+        self._commands.extendleft(reversed(found))
         if found:
             self._wakeup.set()
 
@@ -110,7 +119,7 @@ class WorkQueue:
         while not (self._changes or self._commands):
             self._wakeup.clear()
             await self._wakeup.wait()
-        return self._changes.popleft() if self._changes else self._commands.popleft()
+        return self._changes.popleft() if self._changes else self._commands.popleft()[1]
 
 
 class ResourceController:
@@ -209,7 +218,7 @@ class ResourceController:
             if self.driver.sharable:
                 self._served.append(mesh.serve(keys.vote(self.name), messages.Proposal, self._on_proposal))
             command = keys.command_any(self.name)
-            self._served.append(mesh.serve(command, messages.Command, self._on_command, depth=COMMAND_QUEUE))
+            self._served.append(mesh.serve(command, messages.Command, self._on_command, depth=2 * COMMAND_QUEUE))
 
     def _on_instance_state(self) -> None:
         if self._is_open:
@@ -360,7 +369,9 @@ class ResourceController:
             raise Refused("busy", f"{self.name} has {COMMAND_QUEUE} commands waiting; ask again")
         if not 0 < query.message.ttl <= MAX_TTL:
             raise Refused("bad_command", f"ttl must lie between 0 and {MAX_TTL:g} seconds")
-        self.queue.put_command(query)
+        # Nor does what stops one wait for what else its host has sent.
+        if not self.queue.put_command(query, sender.host if query.message.grant is not None else ""):
+            raise Refused("busy", f"{COMMANDS_PER_HOST} commands of {sender.host} to {self.name} wait; ask again")
 
     async def _worker(self) -> None:
         """Carries out changes of holders and commands, one at a time."""
