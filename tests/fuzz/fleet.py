@@ -338,13 +338,13 @@ class Stranger:
         return found
 
     def serve(self, key: str, answer: Callable[[], tuple[bytes, bool]]) -> None:
-        """Answers whatever is asked there, on the key of the question."""
+        """Answers whatever is asked there, on that key, or the question's where that has wildcards."""
 
         def on_query(query: TransportQuery) -> None:
             payload, ok = answer()
             self._said.add(payload)
             if ok:
-                query.reply(query.key.replace("*", "a"), payload, type(self))
+                query.reply((query.key if "*" in key else key).replace("*", "a"), payload, type(self))
             else:
                 query.reply_error(payload, type(self))
 

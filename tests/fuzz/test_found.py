@@ -106,15 +106,26 @@ def test_a_publication_that_was_never_made_is_believed_for_a_hold_lease() -> Non
     assert seconds < 10
 
 
-def test_who_asks_for_the_last_terms_believes_none_beyond_them() -> None:
-    """Who took one for its own could never lead, nor hear anybody, again."""
+@pytest.mark.parametrize("counter", [2**52 - 1, 2**64])
+@pytest.mark.parametrize("witness", ["the leader", "an RC", "a client"])
+def test_who_asks_for_the_last_terms_believes_none_beyond_them(witness: str, counter: int) -> None:
+    """Who took one for its own could never lead, nor hear anybody, again. The stranger speaks in the name of somebody
+    who is seen, and who speaks as well."""
 
     async def story(fleet: Fleet) -> None:
         (leader,) = fleet.leaders
         assert leader.rcm is not None
         name, keys = leader.rcm.term.rcm, fleet.stranger.mesh.keys
-        answer = {"term": [2**64, name], "seq": 1, "host": "a"}
-        fleet.stranger.serve(keys.rcm_state, lambda: (json.dumps(answer).encode(), True))
+        rc = {"rc": "robot/b", "host": "b", "instance": "x", "sharable": False, "term": [counter, "f"]}
+        key, answer = {
+            "the leader": (keys.rcm_state, {"term": [counter, name], "seq": 1, "host": "a"}),
+            "an RC": (keys.rc_state("robot/b"), rc),
+            "a client": (
+                keys.requests(client := fleet.clients["victim"].mesh.me),
+                {"client": str(client), "requests": [], "term": [counter, "f"]},
+            ),
+        }[witness]
+        fleet.stranger.serve(key, lambda: (json.dumps(answer).encode(), True))
         said = {"term": [2**52 - 1, "f"], "seq": 1, "prev": 1, "every": 0.5}
         fleet.stranger.put(keys.grants, json.dumps(said).encode())
         await asyncio.sleep(3)

@@ -29,7 +29,7 @@ os.environ.setdefault("ZENOH_RUNTIME", "(rx:(worker_threads:16),net:(worker_thre
 
 import zenoh
 
-MAX_COUNTER = 10**12
+MAX_COUNTER = 2**52 - 1
 MAX_JUMP = 1_000_000
 ASK_AGAIN = 5.0
 QUERY_TIMEOUT = 1.0

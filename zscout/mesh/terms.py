@@ -34,7 +34,8 @@ class LastTerms:
 
 
 async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
-    """The highest term that RCs and clients have promised, or an RCM leads in, of those whose tokens are seen."""
+    """The highest term that RCs and clients have promised, or an RCM leads in, of those whose tokens are seen. Where
+    one seems to say two things the lower counts: whoever speaks in its name can only make less of its word."""
     keys = mesh.keys
     tokens, rcs, clients, leaders = await asyncio.gather(
         mesh.living(keys.alive_any(), timeout=timeout),
@@ -42,15 +43,17 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
         mesh.ask(keys.requests_any, RcAsk(), ClientRequests, timeout=timeout),
         mesh.ask(keys.rcm_state, StateAsk(holds_only=True), RcmState, timeout=timeout),
     )
-    seen = {_key_of(mesh, token) for token in tokens}
+    seen = {key for token in tokens if (key := _key_of(mesh, token)) is not None}
+    # A leader's instance is of one term: it is witness to itself.
+    seen |= {token.instance for token in tokens if token.role == Role.RCM}
     said = [(reply.key, reply.message.term) for reply in rcs if reply.message is not None]
     said += [(reply.key, reply.message.term) for reply in clients if reply.message is not None]
-    terms = [term for key, term in said if key in seen]
-    leading = {token.instance for token in tokens if token.role == Role.RCM}
-    terms += [
-        reply.message.term for reply in leaders if reply.message is not None and reply.message.term.rcm in leading
-    ]
-    return max((term for term in terms if term.counter <= MAX_COUNTER), default=NO_TERM)
+    said += [(reply.message.term.rcm, reply.message.term) for reply in leaders if reply.message is not None]
+    words = dict[str, Term]()
+    for witness, term in said:
+        if witness in seen and term.counter <= MAX_COUNTER:
+            words[witness] = min(term, words.get(witness, term))
+    return max(words.values(), default=NO_TERM)
 
 
 def _key_of(mesh: Mesh, token: Token) -> str | None:
