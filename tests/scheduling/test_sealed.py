@@ -8,7 +8,20 @@ from pathlib import Path
 from zscout.scheduling.core import Core
 
 ROOT = Path(__file__).parents[2]
-SURFACE = {"handle", "status", "arc", "is_queued", "waiting", "holders", "arcs_of", "at_place", "could_have_issued"}
+SURFACE = {
+    "handle",
+    "status",
+    "arc",
+    "is_queued",
+    "waiting",
+    "holders",
+    "arcs_of",
+    "arcs",
+    "arcs_of_owners",
+    "place_of",
+    "at_place",
+    "could_have_issued",
+}
 SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}
 

@@ -18,6 +18,8 @@ MAX_OTHERS = 255
 """ARCs that one hand-over takes along, beside the one that it names first."""
 
 
+Seal: TypeAlias = Annotated[str, msgspec.Meta(max_length=128)]
+RequestId: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 MAX_WHO = 64
 """Characters of a user's, a host's or a command's name."""
 MAX_COMMENT = 200
@@ -85,6 +87,10 @@ class Ask(_Asked, frozen=True, tag_field="op", tag="request"):
     unserved: bool = False
     """The time of `grant` went by while RCs of it settled: nobody made use of it."""
     who: Who | None = None
+    seal: Seal | None = None
+    """As its notice had it beside the place."""
+    was: RequestId | None = None
+    """The id under which its client had that place, where it is another one now. What is open under it ends."""
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -203,6 +209,8 @@ class Notice(_ArcParty, frozen=True):
     why: ReasonInfo | None = None
     who: Who | None = None
     """Whose it is, while it is open."""
+    seal: str | None = None
+    """Proof that the place is this ARC's, for every RCM; absent where RCMs share no key."""
 
 
 class Holder(_ArcParty, frozen=True):
@@ -366,6 +374,8 @@ class OpenRequest(_Wanted, frozen=True):
     """The RCs of `grant`."""
     direct: bool = False
     who: Who | None = None
+    seal: Seal | None = None
+    was: RequestId | None = None
 
 
 class ClientRequests(Message, frozen=True):

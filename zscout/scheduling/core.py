@@ -145,6 +145,10 @@ class Core:
         """The ARCs of all clients of these hosts and people."""
         return [arc.id for owner in owners for arc in self._state.arcs_of_owner(owner)]
 
+    def place_of(self, arc_id: ArcId) -> Place | None:
+        arc = self._state.arc(arc_id)
+        return None if arc is None else arc.place
+
     def at_place(self, place: Place) -> list[ArcId]:
         """The ARCs of this place: one, or more where clients claim the same after a takeover."""
         first = self._state.at_place(place)
@@ -317,7 +321,10 @@ class Core:
         reason = Reason(ReasonCode.HANDED_OVER, detail=to)
         if existing is not None:
             # Where a change of RCM hid the outcome, both clients may have reported the one ARC.
-            if existing.place != arc.place:
+            same = existing.place == arc.place or (
+                existing.hold is not None and existing.request.needs == arc.request.needs
+            )
+            if not same:
                 return
             if existing.hold is not None or arc.hold is None:
                 self._end_request(arc_id, Outcome.HANDED_OVER, reason)

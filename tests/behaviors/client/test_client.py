@@ -13,6 +13,7 @@ from zscout.behaviors.client.client import Client, CommandRefused, RequestRefuse
 from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.components.component import ComponentContext, SafePointGate
 from zscout.behaviors.components.shipped import Counter
+from zscout.config.fleet import Fleet
 from zscout.keyexpr import Sender
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh
@@ -187,8 +188,8 @@ def test_connecting_can_be_awaited_entered_and_run_as_a_task(monkeypatch: pytest
     async def test() -> None:
         async with small_fleet("watch") as (fleet, _):
 
-            async def opened(name: str, me: Sender, *_: object) -> MemoryMesh:
-                return fleet.network.open(name, me)
+            async def opened(_: Fleet, me: Sender) -> MemoryMesh:
+                return fleet.network.open(FLEET.name, me)
 
             monkeypatch.setattr(ZenohMesh, "open", opened)
             async with Client.connect("entered", fleet=FLEET, host="h") as entered:

@@ -211,8 +211,8 @@ class FakeFleet:
         rcm.start(recovered or RecoveredState())
         return rcm
 
-    def candidate(self, host: str, folder: Path | None = None) -> Candidate:
-        candidate = Candidate(self.mesh(host), self.fleet, folder)
+    def candidate(self, host: str, folder: Path | None = None, **how: Any) -> Candidate:
+        candidate = Candidate(self.mesh(host), self.fleet, folder, **how)
         candidate.start()
         return candidate
 

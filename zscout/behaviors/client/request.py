@@ -81,6 +81,10 @@ class OpenArc:
     outcome: str | None = None
     by: str | None = None
     place: Place | None = None
+    seal: str | None = None
+    """Proof that the place is its own, by the RCM's word."""
+    was: str | None = None
+    """The id under which it had that place, if that was another one."""
     ahead: int | None = None
     start: Ns | None = None
     """While it is queued: when it will start by the RCM's last estimate, on this host's clock."""
@@ -153,8 +157,8 @@ class OpenArc:
         self.outcome, self.by = notice.outcome, notice.by
         self.ahead = notice.ahead
         self.start = None if notice.starts_in is None else now + round(notice.starts_in * SECOND)
-        if notice.place is not None and (self.place is None or notice.place < self.place):
-            self.place = notice.place
+        if notice.place is not None and (self.place is None or notice.place <= self.place):
+            self.place, self.seal, self.was = notice.place, notice.seal, None
         if notice.state == "running":
             self.grant = notice.grant
             self.bound, self.rcs = bound, sorted(bound.get(need, need) for need in self.needs)
@@ -240,7 +244,7 @@ class OpenArc:
         """The client to which it was handed over is gone: it is asked for anew, at its old place."""
         if self.ending is not None and self.ending.outcome == "handed_over":
             self.ending = HoldEnd("lost", reason)
-        self.id, self.last = new_id, (NO_TERM, 0)
+        self.id, self.was, self.last = new_id, self.was or self.id, (NO_TERM, 0)
         self.state, self.reason, self.outcome, self.since = "asking", reason, None, now
         self.why = None
 
@@ -273,6 +277,8 @@ class OpenArc:
             "min_runtime": self.min_runtime,
             "keep": self.keep,
             "place": self.place,
+            "seal": self.seal,
+            "was": self.was,
             "waited": max(0, now - since) / SECOND,
             "grant": grant,
             "rcs": self.rcs if grant is not None else [],

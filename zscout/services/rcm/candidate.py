@@ -25,6 +25,7 @@ from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
+from zscout.services.rcm.places import Places
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import aged, take_over
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
@@ -46,9 +47,16 @@ class Candidate:
     """Stands by, leads when it must, steps down when a higher term is seen or when anything fails."""
 
     def __init__(
-        self, mesh: Mesh, fleet: Fleet, folder: Path | None = None, authority: Authority | None = None
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        folder: Path | None = None,
+        authority: Authority | None = None,
+        places_key: bytes | None = None,
     ) -> None:
-        """`folder`: where it keeps what it must know after a restart; None: it does not."""
+        """`folder`: where it keeps what it must know after a restart; None: it does not. `places_key`: that by which
+        the managers of a fleet seal places."""
+        self._places_key = places_key
         self._authority = authority or Authority(fleet)
         self.mesh, self.fleet = mesh, fleet
         self.known: Term = NO_TERM
@@ -276,12 +284,21 @@ class Candidate:
         return messages
 
     def _lead(self, term: Term, states: list[RcState], open_requests: list[ClientRequests]) -> None:
-        recovered = take_over(states, open_requests, self.mesh.now(), self.inventory.devices.home_of)
+        places = Places(self.fleet.name, self._places_key, term)
+        recovered = take_over(
+            states,
+            open_requests,
+            self.mesh.now(),
+            self.inventory.devices.home_of,
+            lambda client, one, place: places.was_sealed(place, client, one.was or one.id, one.seal),
+        )
         recovered.patient = self.election.links_return(self.mesh.now(), self._leader)
         self.known, self._goes_above = term, False
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
-        rcm = self.rcm = Rcm(self.mesh, self.fleet, term, self._see, self._failed, self.inventory, self._authority)
+        rcm = self.rcm = Rcm(
+            self.mesh, self.fleet, term, self._see, self._failed, self.inventory, self._authority, places
+        )
         rcm.membership.on_disbelieved = self._disbelieved
         self._leading.callback(rcm.stop)
         rcm.start(recovered)

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Final
 
 from msgspec.structs import replace
 
@@ -29,6 +30,7 @@ from zscout.scheduling.model import (
     ArcRequest,
     ArcStatus,
     ClientLost,
+    Dropped,
     Effect,
     Event,
     Granted,
@@ -37,6 +39,7 @@ from zscout.scheduling.model import (
     HoldEnded,
     LeadTaken,
     Outcome,
+    PlaceShown,
     Propose,
     RcReported,
     RecoveredHold,
@@ -52,8 +55,9 @@ from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.authority import Authority
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.membership import Membership, discrepancies
+from zscout.services.rcm.places import Places, client_id, request_id
 from zscout.services.rcm.recovery import RecoveredState
-from zscout.services.rcm.registry import RequestRegistry, client_id, reason_info, request_id
+from zscout.services.rcm.registry import REMEMBER, RequestRegistry, reason_info
 from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import SECOND, ArcId, ClientId, Ns, RcName, Term
 
@@ -64,6 +68,10 @@ MAX_LISTED = 1_000
 LATE_VOTE = 2.0
 """Seconds within which a late vote still counts."""
 REMOVED = "the fleet file, which names its owner under no role"
+KEPT: Final[Mapping[Outcome, Ns]] = MappingProxyType(
+    {Outcome.RELEASED: 0, Outcome.CANCELLED: 0, Outcome.CLIENT_LOST: 86_400 * SECOND}
+)
+"""For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
 MAX_REASON = 500
 """Characters of a veto's reason."""
 
@@ -81,14 +89,16 @@ class Rcm:
         on_failure: Callable[[Exception], object],
         inventory: Inventory | None = None,
         authority: Authority | None = None,
+        places: Places | None = None,
     ) -> None:
-        """`inventory` and `authority`: those of its candidate, if it has one."""
+        """`inventory` and `authority`: those of its candidate, if it has one. `places`: those that it has recovered."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         self._authority = authority or Authority(fleet)
         self.core = Core(STRATEGIES[fleet.strategy](), self._authority.bound(fleet.scheduling))
         supervisor, receive = self.supervisor, self._receive
-        self.registry = RequestRegistry(mesh, self.core, term, supervisor)
+        self.places = places or Places(fleet.name, None, term)
+        self.registry = RequestRegistry(mesh, self.core, term, supervisor, self.places)
         self._own_inventory = inventory is None
         self.inventory = inventory or Inventory(mesh, fleet)
         devices = self.inventory.devices
@@ -96,7 +106,16 @@ class Rcm:
         self.membership.on_requests = self._on_requests
         self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(
-            mesh, fleet, self.core, self.registry, self.membership, devices, self._authority, supervisor, receive
+            mesh,
+            fleet,
+            self.core,
+            self.registry,
+            self.membership,
+            devices,
+            self._authority,
+            self.places,
+            supervisor,
+            receive,
         )
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
@@ -136,6 +155,10 @@ class Rcm:
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*joined, lead], named=recovered.rcs)
+        for arc in self.core.arcs():
+            self._bind(arc)
+            if (expecting := recovered.expected.get(request_id(arc))) is not None:
+                self.places.admit(arc, expecting)
         limit = self.fleet.limits.max_payload
         self._declared = [
             mesh.serve(keys.schedule_any, messages.Operation, guard(self.requests.on_operation), limit=limit),
@@ -210,7 +233,11 @@ class Rcm:
             match event:
                 case Requested(ArcRequest(client=client)) | HandedOver(to=client) if client not in seen:
                     self.membership.expect(client)
+            match event:
+                case PlaceShown(arc) | HandedOver(renamed=arc) | Requested(ArcRequest(arc=arc)):
+                    self._bind(arc)
                 case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
+                    self._bind(request.arc)
                     self.registry.enter(request.arc, request.name)
                     if client not in seen:
                         # As the links to its RCs came back just now, so may its own.
@@ -222,12 +249,21 @@ class Rcm:
         self.requests.answer(effects)
         for effect in effects:
             match effect:
+                case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self._is_open(arc):
+                    self.places.end(arc, self.mesh.now(), KEPT.get(outcome, REMEMBER))
                 case Propose():
                     self._propose(effect)
                 case WakeAt(at):
                     self._set_wake(at)
         if line := self.core.strategy.log_line():
             log.info("%s", line)
+
+    def _is_open(self, arc: ArcId) -> bool:
+        return self.core.place_of(arc) is not None
+
+    def _bind(self, arc: ArcId) -> None:
+        if (place := self.core.place_of(arc)) is not None:
+            self.places.bind(place, arc, self.mesh.now())
 
     def _set_wake(self, at: Ns | None) -> None:
         """Sets when the core is woken. A timer that is set for earlier stays, and is set anew when it goes off: most

@@ -18,8 +18,8 @@ from msgspec.structs import replace
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
 from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
-from zscout.services.rcm.registry import arc_id, request_id
-from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, RcName
+from zscout.services.rcm.places import arc_id, request_id
+from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, Place, RcName
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +37,8 @@ class RecoveredState:
     """Of that, what its client does not ask for any more."""
     holds: list[RecoveredHold] = field(default_factory=list)
     waiting: list[Requested] = field(default_factory=list)
+    expected: dict[str, set[ClientId]] = field(default_factory=dict)
+    """By request id: the clients to which it is to be handed over, as they say."""
     believed: dict[ArcId, list[RcName]] = field(default_factory=dict)
     """Of what waits: the RCs that its client believes to hold. They may not have answered yet."""
     answered: set[ClientId] = field(default_factory=set)
@@ -53,17 +55,18 @@ def take_over(
     clients: Collection[ClientRequests],
     now: Ns,
     home_of: Callable[[RcName], HostName | None] = lambda _: None,
+    is_own: Callable[[ClientId, OpenRequest, Place], bool] = lambda *_: True,
 ) -> RecoveredState:
     """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided.
     `home_of`: the host at which the fleet file has an RC; one that is free elsewhere is taken in later, as its device
-    may still be used at home."""
+    may still be used at home. `is_own`: whether that place is this client's."""
     states = [state for state in states if state.holders or home_of(state.rc) in (None, state.host)]
     # Of two instances of one RC the one with the newest hold is meant, else the one at home.
     by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
     by_host.sort(key=lambda state: state.host == home_of(state.rc))
     answered = {state.rc: state for state in sorted(by_host, key=_newest_grant)}
     pending = {rc for rc in answered if not gangs_of(rc, answered) <= answered.keys()}
-    result = recover([state for rc, state in answered.items() if rc not in pending], clients, now)
+    result = recover([state for rc, state in answered.items() if rc not in pending], clients, now, is_own)
     result.answered = {one.client for one in clients}
     result.pending = [answered[rc] for rc in sorted(pending)]
     asked = {one.client: {request.id for request in one.requests} for one in clients}
@@ -87,7 +90,12 @@ def gangs_of(rc: RcName, states: Mapping[RcName, RcState]) -> set[RcName]:
     return found
 
 
-def recover(states: Iterable[RcState], clients: Collection[ClientRequests], now: Ns) -> RecoveredState:
+def recover(
+    states: Iterable[RcState],
+    clients: Collection[ClientRequests],
+    now: Ns,
+    is_own: Callable[[ClientId, OpenRequest, Place], bool] = lambda *_: True,
+) -> RecoveredState:
     """Combines the answers. What is malformed is left out and logged, and all else is recovered."""
     result = RecoveredState(rcs={state.rc: state for state in states})
     parts: dict[tuple[str, Grant], dict[RcName, Holder]] = {}
@@ -114,10 +122,13 @@ def recover(states: Iterable[RcState], clients: Collection[ClientRequests], now:
             continue
         try:
             # A request without a place was never answered: its client will ask again.
-            if request.place is not None:
+            if request.place is None:
+                result.expected.setdefault(request.id, set()).add(client)
+            else:
                 wanted = _request(arc, client, request.needs, request)
                 since = now - round(request.waited * SECOND)
-                result.waiting.append(Requested(wanted, request.place, since))
+                place = request.place if is_own(client, request, request.place) else None
+                result.waiting.append(Requested(wanted, place, since))
                 if request.grant is not None:
                     result.believed[arc] = request.rcs
         except (BadName, ValueError) as error:
@@ -126,7 +137,7 @@ def recover(states: Iterable[RcState], clients: Collection[ClientRequests], now:
     held_requests = {(held.place, request_id(held.request.arc)) for held in result.holds}
     result.waiting = sorted(
         (one for one in result.waiting if (one.place, request_id(one.request.arc)) not in held_requests),
-        key=attrgetter("place"),
+        key=lambda one: (one.place is None, one.place),
     )
     return result
 

@@ -21,7 +21,8 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.reason import Party, Reason, ended, waits
-from zscout.types import SECOND, ArcId, ClientId, Grant, Ns, Term
+from zscout.services.rcm.places import Places, client_id, request_id
+from zscout.types import SECOND, ArcId, Grant, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -44,20 +45,6 @@ MAX_LOGGED = 50
 """Lines in one entry of the log; the history has them all."""
 
 
-def arc_id(client: str, request_id: str) -> ArcId:
-    """The core's name of a request: unique on the mesh, as a client's own id is not."""
-    return f"{client}/{request_id}"
-
-
-def request_id(arc: ArcId) -> str:
-    """The client's own id in an ArcId."""
-    return arc.rpartition("/")[2]
-
-
-def client_id(arc: ArcId) -> ClientId:
-    return arc.rpartition("/")[0]
-
-
 def reason_info(reason: Reason | None, now: Ns) -> ReasonInfo | None:
     if reason is None:
         return None
@@ -74,8 +61,9 @@ def party_info(party: Party, now: Ns) -> ReasonParty:
 class RequestRegistry:
     """The requests of one term, those that ended lately included."""
 
-    def __init__(self, mesh: Mesh, core: Core, term: Term, supervisor: Supervisor) -> None:
+    def __init__(self, mesh: Mesh, core: Core, term: Term, supervisor: Supervisor, places: Places) -> None:
         self._mesh, self._core, self._term, self._supervisor = mesh, core, term, supervisor
+        self._places = places
         self._step = 0
         """The number of the last notice."""
         self._names: dict[ArcId, str] = {}
@@ -152,6 +140,7 @@ class RequestRegistry:
             why=reason_info(arc.reason, self._mesh.now()),
             who=arc.request.who,
             place=arc.place,
+            seal=self._places.seal(arc.place, arc.id),
             ahead=arc.ahead,
             grant=hold.grant if hold is not None else None,
             rcs=sorted(rcs),

@@ -5,6 +5,7 @@ their order."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import TypeAlias
@@ -12,6 +13,7 @@ from typing import TypeAlias
 from zscout.config.fleet import Fleet, RcmLimits
 from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
+from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
     MAX_PARAMS,
@@ -50,8 +52,11 @@ from zscout.services.authority import Authority
 from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.door import check_door
 from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.registry import RequestRegistry, arc_id, client_id, party_info, reason_info, request_id
+from zscout.services.rcm.places import Places, arc_id, client_id, request_id
+from zscout.services.rcm.registry import RequestRegistry, party_info, reason_info
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
+
+log = logging.getLogger(__name__)
 
 Query: TypeAlias = IncomingQuery[Operation]
 
@@ -74,15 +79,17 @@ class RequestHandler:
         membership: Membership,
         devices: ExpectedDevices,
         authority: Authority,
+        places: Places,
         supervisor: Supervisor,
         emit: Callable[..., None],
     ) -> None:
         self.mesh, self.limits, self.core, self._devices = mesh, fleet.limits, core, devices
-        self._authority = authority
+        self._authority, self._places = authority, places
         self._knows_all = mesh.now() + fleet.timing.hold_lease
         """From when on an RC that was not seen yet is none of this fleet."""
         self._first_answer_timeout = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
         self._registry, self._membership, self._supervisor = registry, membership, supervisor
+        self._strange = SparseLog(log, mesh.now)
         self._flush_guarded = supervisor.guard(self.flush)
         self._emit = emit
         """Takes the events of one instant."""
@@ -144,9 +151,8 @@ class RequestHandler:
             self.waiting[arc].append(query)
         elif self.core.arc(arc) is not None:
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-            if ask.place is not None:
-                check_place(ask.place, self.core)
-                self._emit(PlaceShown(arc, ask.place))
+            if (place := self._own_place(ask, str(sender))) is not None:
+                self._emit(PlaceShown(arc, place))
             if ask.grant is not None and ask.unconfirmed:
                 self._emit(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
             if ask.reachable:
@@ -159,17 +165,33 @@ class RequestHandler:
         else:
             self._check_room(str(sender))
             request = admit(ask, sender, arc, self.core, self.limits)
+            place = self._own_place(ask, str(sender))
             if ask.check and ask.place is None and ask.grant is None:
                 self._check_door(ask)
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
             self._registry.record(arc, f"asked for {', '.join(sorted(ask.needs))} at priority {ask.priority}")
-            since = None if ask.place is None else self.mesh.now() - round(ask.waited * SECOND)
+            since = None if place is None else self.mesh.now() - round(ask.waited * SECOND)
+            asked = Requested(request, place, since)
             if self._may_hold(arc, ask):
                 # It ends what it began under that grant before anybody is asked for a vote.
-                self._emit(Requested(request, ask.place, since))
+                self._emit(asked)
                 query.answer(self._standing(arc, ask))
-            else:
-                self._gather(query, arc, Requested(request, ask.place, since))
+                return
+            before = arc_id(str(sender), ask.was or ask.id)
+            self._keep_order(before)
+            is_replaced = place is not None and before != arc and self.core.place_of(before) is not None
+            self._gather(query, arc, asked, before if is_replaced else None)
+
+    def _own_place(self, ask: Ask, client: ClientId) -> Place | None:
+        """The place that a request shows, if it is its client's. Raises Refused for one that can't be."""
+        if ask.place is None:
+            return None
+        check_place(ask.place, self.core)
+        seen = client in self._membership.clients
+        if self._places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
+            return ask.place
+        self._strange.warning(client, "%s shows a place that is not its own: it has none for that", client)
+        return None
 
     def _check_door(self, ask: Ask | Foresee) -> None:
         """Raises Refused for what can never start."""
@@ -276,10 +298,14 @@ class RequestHandler:
 
     # One burst, one instant
 
-    def _gather(self, query: Query, arc: ArcId, event: Requested | Cancelled | Released) -> None:
+    def _gather(
+        self, query: Query, arc: ArcId, event: Requested | Cancelled | Released, replaced: ArcId | None = None
+    ) -> None:
         self.waiting.setdefault(arc, []).append(query)
         if not self._batch:
             self.mesh.after_burst(self._flush_guarded)
+        if replaced is not None:
+            self._batch[replaced] = Released(replaced, f"its client, which asks for it as {request_id(arc)}")
         self._batch[arc] = event
         if len(self._batch) >= MAX_BATCH:
             self.flush()
@@ -369,7 +395,11 @@ class RequestHandler:
             self._authority.check_hand_over(client_of(to), known.needs if known is not None else ())
         for move in moves:
             self._registry.enter(move.renamed, self._registry.name(move.arc))
-        self._emit(*moves)
+        places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
+        shown = [
+            PlaceShown(arc, place) for arc, place in places.items() if self.core.place_of(arc) not in (None, place)
+        ]
+        self._emit(*shown, *moves)
         self._registry.publish(move.renamed for move in moves if self.core.is_queued(move.renamed))
         query.answer(self._registry.notice(moves[0].renamed))
 
@@ -382,7 +412,8 @@ class RequestHandler:
                 continue
             renamed = arc_id(to, name)
             taken = self.core.arc(renamed)
-            if taken is not None and taken.place != arc.place:
+            if taken is not None and (taken.request.needs != arc.request.needs or taken.place < arc.place):
+                # Else it is the same: its new client has asked for it, and could not prove that it has its place.
                 raise Refused("bad_request", f"{to} has a request {name} already; ask under random ids")
             moves.append(HandedOver(arc.id, to, renamed))
         return moves
