@@ -20,7 +20,9 @@ import click
 import uvloop
 
 from zscout import __version__
+from zscout.config.certificates import PLACES_KEY, read_places_key
 from zscout.config.devices import RobotRc
+from zscout.config.fleet import Fleet
 from zscout.config.node import Node, default_node, load_node
 from zscout.config.state_folder import state_folder
 from zscout.config.strict import BadInput
@@ -123,7 +125,7 @@ async def run_services(
             stack.push_async_callback(recorder.stop)
         candidate = None
         if node.candidate:
-            candidate = Candidate(mesh, node.fleet, kept, authority)
+            candidate = Candidate(mesh, node.fleet, kept, authority, _places_key(node.fleet))
             candidate.start()
             stack.push_async_callback(candidate.stop)
         await components.start()
@@ -152,6 +154,15 @@ async def run_services(
         manager.stopping("ends in order")
     if failures:
         raise NodeFailed(f"a service failed: {failures[0]!r}; see the log") from failures[0]
+
+
+def _places_key(fleet: Fleet) -> bytes | None:
+    """Raises BadInput."""
+    if fleet.security is None:
+        return None
+    if (key := read_places_key(fleet.security)) is None:
+        log.warning("%s has no %s: places are not sealed; copy it from the CA's folder", fleet.security, PLACES_KEY)
+    return key
 
 
 def _say_if_alone(mesh: Mesh) -> None:

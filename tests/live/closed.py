@@ -32,6 +32,7 @@ anvil = ["robot/*"]
 cart = ["radio/*"]
 """
 NAMES = ("anvil", "bench", "cart", "ada", "bob", "eve", "wall")
+MANAGERS = ("anvil", "bench")
 DAY = timedelta(days=1)
 
 
@@ -44,7 +45,7 @@ def make_keys(folder: Path, *names: str) -> CertificateAuthority:
     """A CA, and a certificate for each name, in folders of their names."""
     authority = make_authority(folder / "ca")
     for name in names:
-        authority.issue(name, folder / name, DAY, datetime.now(UTC))
+        authority.issue(name, folder / name, DAY, datetime.now(UTC), manager=name in MANAGERS)
     return authority
 
 

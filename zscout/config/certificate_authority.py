@@ -5,6 +5,7 @@ What it issues is for both ends of a link, on the curve P-256, which every TLS l
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -24,7 +25,19 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from zscout.config.certificates import CA, CA_KEY, CERT, KEY, MAX_FILE, Validity, check_mode, shown
+from zscout.config.certificates import (
+    CA,
+    CA_KEY,
+    CERT,
+    KEY,
+    MAX_FILE,
+    PLACES_KEY,
+    PLACES_KEY_BYTES,
+    Validity,
+    check_mode,
+    read_places_key,
+    shown,
+)
 from zscout.config.state_folder import write_durably
 from zscout.config.strict import Where, check_name, read_text
 
@@ -59,6 +72,7 @@ class CertificateAuthority:
         )
         write_durably(folder / CA_KEY, _private(key), PRIVATE)
         write_durably(folder / CA, certificate.public_bytes(Encoding.PEM), PUBLIC)
+        write_durably(folder / PLACES_KEY, f"{secrets.token_hex(PLACES_KEY_BYTES)}\n".encode(), PRIVATE)
         return Validity(f"zscout CA {number}", now, ends)
 
     @classmethod
@@ -85,10 +99,16 @@ class CertificateAuthority:
             )
         return cls(folder, own, key, trusted)
 
-    def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime) -> datetime:
+    def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime, *, manager: bool = False) -> datetime:
         """Makes the folder of who has this name, in place of what was there; returns when its certificate ends: not
-        after this CA. Raises BadInput."""
+        after this CA. A manager's has the key of places as well. Raises BadInput."""
         check_name(name, Where("NAME"))
+        if manager:
+            if (places := read_places_key(self.folder)) is None:
+                raise Where(str(self.folder / PLACES_KEY)).bad(
+                    "there is no such file", "copy it from the folder of the CA that issued the first manager"
+                )
+            write_durably(folder / PLACES_KEY, f"{places.hex()}\n".encode(), PRIVATE)
         return self._write(folder, name, lasts, now, _new_key())
 
     def renew(self, folder: Path, lasts: timedelta, now: datetime, *, new_key: bool = False) -> datetime:

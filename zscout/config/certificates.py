@@ -23,6 +23,9 @@ CERT: Final = "cert.pem"
 KEY: Final = "key.pem"
 CA_KEY: Final = "ca-key.pem"
 """In the folder of a CA, beside its `ca.pem`."""
+PLACES_KEY: Final = "places.key"
+"""In the folders of managers and of their CA: by what they seal places in the queue."""
+PLACES_KEY_BYTES: Final = 32
 KEYS_VARIABLE: Final = "ZSCOUT_KEYS"
 """Names a person's folder."""
 MAX_FILE: Final = 65_536
@@ -136,6 +139,20 @@ def read_certificates(folder: Path) -> Certificates:
     check_name(own.name, cert)
     last = max((one.ends for one in cas if one.name == issuer), default=own.ends)
     return Certificates(own.name, own.begins, min(own.ends, last), folder, issuer, tuple(one.name for one in cas))
+
+
+def read_places_key(folder: Path) -> bytes | None:
+    """By what the managers of this fleet seal places; None: there is no such file. Raises BadInput."""
+    path = folder / PLACES_KEY
+    if not path.exists():
+        return None
+    check_mode(path, 0o027, "640")
+    with suppress(ValueError):
+        if len(key := bytes.fromhex(read_text(path, max_bytes=MAX_FILE))) == PLACES_KEY_BYTES:
+            return key
+    raise Where(str(path)).bad(
+        f"is not {PLACES_KEY_BYTES} bytes in hexadecimal", f"copy {PLACES_KEY} from the CA's folder"
+    )
 
 
 def read_cas(path: Path) -> list[Validity]:

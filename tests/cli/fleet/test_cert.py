@@ -12,7 +12,8 @@ import pytest
 
 from tests.cli.tools import Terminal, zscout_here
 from zscout.config.certificate_authority import CertificateAuthority
-from zscout.config.certificates import KEYS_VARIABLE, read_certificates
+from zscout.config.certificates import KEYS_VARIABLE, read_certificates, read_places_key
+from zscout.config.strict import BadInput
 
 FILES = ("ca.pem", "cert.pem", "key.pem")
 
@@ -51,8 +52,30 @@ def test_a_ca_issues_folders_that_are_ready_to_be_copied(capsys: pytest.CaptureF
         assert sorted(one.name for one in Path("out", name).iterdir()) == list(FILES)
         assert read_certificates(Path("out", name)).name == name
         assert lasting(f"out/{name}") == timedelta(days=365)
-    secret = [*Path().rglob("*key.pem")]
-    assert [one.stat().st_mode & 0o777 for one in secret] == [0o600] * 3
+    secret = [*Path().rglob("*key.pem"), *Path().rglob("*.key")]
+    assert [one.stat().st_mode & 0o777 for one in secret] == [0o600] * 4
+
+
+def test_managers_share_the_key_that_seals_places(capsys: pytest.CaptureFixture[str]) -> None:
+    zscout_here("cert", "ca")
+    assert zscout_here("cert", "issue", "--manager", "anvil", "--manager", "bellows", "ada") == 0
+    keys = {name: read_places_key(Path(name)) for name in ("zscout-ca", "anvil", "bellows", "ada")}
+    key = keys["anvil"]
+    assert key is not None
+    assert len(key) == 32
+    assert keys == {"zscout-ca": key, "anvil": key, "bellows": key, "ada": None}
+    assert Path("anvil/places.key").stat().st_mode & 0o777 == 0o600
+    Path("anvil/places.key").chmod(0o644)
+    with pytest.raises(BadInput, match="may be read by others"):
+        read_places_key(Path("anvil"))
+    Path("bellows/places.key").write_text("short\n")
+    with pytest.raises(BadInput, match=r"places\.key: is not 32 bytes"):
+        read_places_key(Path("bellows"))
+    Path("zscout-ca/places.key").unlink()
+    capsys.readouterr()
+    assert zscout_here("cert", "issue", "--manager", "cart") == 2
+    assert "there is no such file; copy it" in capsys.readouterr().err
+    assert zscout_here("cert", "issue") == 2
 
 
 def test_a_certificate_lasts_days_or_what_has_a_unit(capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,7 +72,7 @@ def cert() -> None:
     \b
     Examples:
       zscout cert ca
-      zscout cert issue anvil bellows ada
+      zscout cert issue --manager anvil --manager bellows ada
       zscout cert renew anvil bellows
       zscout cert show anvil --json
     """
@@ -101,12 +101,20 @@ def ca(folder: Path, lasts: timedelta, force: bool) -> None:
 
 
 @cert.command()
-@click.argument("name", type=common.NAME, nargs=-1, required=True)
+@click.argument("name", type=common.NAME, nargs=-1)
 @ca_option
 @click.option("--to", type=FOLDER, default=Path(), help="Where to make the folder NAME.")
 @days_option("365")
+@click.option(
+    "--manager",
+    "managers",
+    metavar="NAME",
+    type=common.NAME,
+    multiple=True,
+    help="Also for NAME, a host that may lead: with the key by which managers seal places.",
+)
 @click.option("--force", is_flag=True, help="Overwrite a certificate that is there.")
-def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, force: bool) -> None:
+def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, managers: tuple[str, ...], force: bool) -> None:
     """Make a folder NAME with a certificate, for each machine or person of this name.
 
     A machine's is named as its host in the node file, a person's as in the roles of the fleet file. Nobody else
@@ -114,15 +122,17 @@ def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, force: bo
 
     \b
     Examples:
-      zscout cert issue anvil bellows ada
+      zscout cert issue --manager anvil --manager bellows ada
       zscout cert issue wall --days 30
     """
     authority = _authority(ca)
-    for one in name:
+    if not name and not managers:
+        raise BadInput("name at least one machine or person")
+    for one in (*managers, *name):
         _check_free(to / one, (CA, CERT, KEY), force)
-    for one in name:
+    for one in (*managers, *name):
         with _writing():
-            ends = authority.issue(one, to / one, lasts, datetime.now(UTC))
+            ends = authority.issue(one, to / one, lasts, datetime.now(UTC), manager=one in managers)
         terminal.print_line(f"{to / one}: until {shown(ends)}; copy this folder to {one}, its key to nobody else")
 
 
