@@ -30,6 +30,8 @@ class Device:
     """Who drives it, and in which process the driver is that let them."""
     programs: dict[Grant, str] = field(default_factory=dict)
     """Programs that touch it past its driver, by grant: whose they are."""
+    done: set[str] = field(default_factory=set)
+    """The commands of programs that it has carried out."""
     newest: tuple[Process, Grant] | None = None
     """Of all commands that it has carried out; and the process that its driver was in. One that starts anew knows of
     none, and obeys the RCM that it finds."""
@@ -60,7 +62,12 @@ class Device:
         self.log(f"{self.name} is safe")
         self.holders = {grant: held for grant, held in self.holders.items() if held[0] is not process}
 
-    def command(self, process: Process, holder: Holder) -> None:
+    def command(self, process: Process, holder: Holder, value: object) -> None:
+        """A program gives each of its commands a value of its own; a component may command the same again."""
+        if isinstance(value, str):
+            if value in self.done:
+                self.broken(f"{self.name} carries out a command of {holder.client} twice")
+            self.done.add(value)
         self._forget_dead()
         newest = self.newest[1] if self.newest is not None else NO_GRANT
         if self.capacity is None and holder.grant < newest:
@@ -113,7 +120,7 @@ class _Watched:
         self.device.safe(_here())
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        self.device.command(_here(), holder)
+        self.device.command(_here(), holder, do["value"])
         return await super().command(holder, do)  # type: ignore[misc]
 
 

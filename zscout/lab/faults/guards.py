@@ -20,6 +20,7 @@ from zscout.behaviors.client.request import OpenArc, RequestStore
 from zscout.drivers import holds
 from zscout.drivers.holds import HoldChange, HoldEntry, HoldTable
 from zscout.drivers.instances import Instances
+from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import Problem
@@ -27,6 +28,7 @@ from zscout.scheduling.state import SchedulerState
 from zscout.services.rcm import candidate, membership, recovery
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.membership import Membership
+from zscout.services.rcm.places import Places
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.registry import RequestRegistry
 from zscout.services.rcm.request_handler import RequestHandler
@@ -166,6 +168,8 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             {(HoldTable, "expire"): _expire_by_time, (RcmLink, "watch_lease"): _never},
         ),
         "snapshots": Guard("what a snapshot adds passes the RC's own vote", {(ResourceController, "_carries"): _yes}),
+        "once": Guard("a command that arrives again is not carried out again", {(CommandMemory, "is_new"): _yes}),
+        "sealed": Guard("a place is had by whom it was given to", {(Places, "may_claim"): _yes}),
         "instances": Guard(
             "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Membership, "named"): _no_names}
         ),

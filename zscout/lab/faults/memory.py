@@ -11,7 +11,7 @@ import itertools
 import random
 import weakref
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import lru_cache
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
@@ -79,6 +79,8 @@ class MemoryNetwork:
         self.trace: Trace | None = None
         self.forgetful = 0.0
         """How likely each declaration stays unknown to a peer whose link comes back, until it is lost again."""
+        self.twice: Collection[str] = ()
+        """Kinds of queries that arrive twice, as over two relays."""
         self.links: dict[tuple[MemoryTransport, MemoryTransport], MemoryLink] = {}
         """Of all that live, those with themselves included; a new one is made when it is first needed."""
         self._linked: dict[MemoryTransport, list[Neighbour]] = {}
@@ -342,8 +344,11 @@ class MemoryTransport(Transport):
         get.waiting = {query.id: there.node for there, query, _ in queries}
         get.check()
         for there, query, on_query in queries:
-            if not there.to.send_message(kind_of(key), on_query, query, operation=query.operation):
+            what = kind_of(key)
+            if not there.to.send_message(what, on_query, query, operation=query.operation):
                 query.lose()
+            elif what in self.network.twice:
+                there.to.send_message(what, on_query, query, operation=query.operation)
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
         return self.queryables.add(key, on_query)

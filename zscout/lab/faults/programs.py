@@ -9,15 +9,21 @@ from contextvars import Context
 from dataclasses import dataclass
 from typing import Any, Final
 
+from msgspec.structs import replace
+
 from zscout.behaviors.client.arc import Held, Revoked, hold, holds
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.direct import DirectHold
-from zscout.keyexpr import RANDOM
+from zscout.keyexpr import RANDOM, Role, Token, new_instance
 from zscout.lab.faults.device import Device
 from zscout.lab.faults.virtual_time import PROCESS
-from zscout.types import SECOND
+from zscout.mesh import Mesh
+from zscout.messages import Ask, ClientRequests, Notice, OpenRequest, RcAsk, RcmState, StateAsk
+from zscout.types import SECOND, Place
 
 LONG: Final = 4
+STEALS_EVERY: Final = 0.5
+ASKED: Final = ("id", "arc", "needs", "priority", "min_runtime", "seal", "was")
 CLEARS_UP: Final = (0.0, 0.0, 0.2, 1.0, 60.0)
 """Seconds that a program takes to end when it is told to; the last is killed before."""
 
@@ -51,6 +57,32 @@ class Program:
             device.leave(self._grant)
 
 
+async def steal_places(mesh: Mesh, over: Callable[[], bool]) -> None:
+    """Asks at the places of others that wait, and says to new leaders that they are its own."""
+    rng, listed, seals = RANDOM.get(), list[OpenRequest](), dict[Place | None, str | None]()
+    hear = lambda _, notice: seals.update({notice.place: notice.seal})  # noqa: E731
+    answer = lambda query: query.answer(ClientRequests(str(mesh.me), listed))  # noqa: E731
+    declared = [
+        mesh.subscribe(mesh.keys.notice_any, Notice, hear),
+        mesh.serve(mesh.keys.requests(mesh.me), RcAsk, answer),
+        mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance())),
+    ]
+    while not over():
+        await asyncio.sleep(rng.uniform(0, 2 * STEALS_EVERY))
+        state = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=STEALS_EVERY)
+        others = [one for one in state.message.queue if one.client != str(mesh.me)] if state and state.message else []
+        if others:
+            one = rng.choice(others)
+            id_ = rng.choice((new_instance(), one.id))
+            stolen = OpenRequest(id_, "stolen", one.needs, one.priority, one.min_runtime, seal=seals.get(one.place))
+            listed[:] = [replace(stolen, place=one.place, was=rng.choice((None, one.id)))]
+            ask = Ask(place=one.place, **{name: getattr(listed[0], name) for name in ASKED})
+            await mesh.ask_one(mesh.keys.schedule(mesh.me), ask, Notice, timeout=STEALS_EVERY)
+    listed.clear()
+    for left in declared:
+        left.close()
+
+
 @dataclass(slots=True)
 class Work:
     """What all programs have to do: to ask for `devices` until `over`, with up to `pause` seconds in between."""
@@ -64,6 +96,7 @@ class Work:
     touched: Mapping[str, Device] | None = None
     """By RC: its device, where programs touch it past the RC."""
     over: bool = False
+    commanded: int = 0
 
     async def run(self, client: Client, arc: str, busy: set[str]) -> None:
         """One ARC after the other, under one name, which is in `busy` while one is open."""
@@ -123,7 +156,8 @@ class Work:
         self.counts["grants"] += 1
         for _ in range(rng.randrange(1, 12) * times):
             try:
-                await held.command(rng.choice(held.rcs), {"name": "echo", "value": 1})
+                self.commanded += 1
+                await held.command(rng.choice(held.rcs), {"name": "echo", "value": f"command {self.commanded}"})
                 self.counts["commands"] += 1
             except CommandRefused as refused:
                 self.counts[f"refused {refused.code}"] += 1

@@ -46,12 +46,12 @@ Rank: TypeAlias = tuple[int, Ns, Place]
 class Promises:
     """Told what happens; `broken(text)` is told of a promise that was not kept. Times are virtual seconds.
 
-    `strict`: the strategy grants in rank order, whatever was promised."""
+    `strict`: the strategy grants in rank order, whatever was promised. `thief`: who asks at others' places."""
 
     def __init__(
-        self, broken: Callable[[str], None], now: Callable[[], float], hold_lease: float, *, strict: bool
+        self, broken: Callable[[str], None], now: Callable[[], float], hold_lease: float, *, strict: bool, thief: str
     ) -> None:
-        self._broken, self._now, self._strict = broken, now, strict
+        self._broken, self._now, self._strict, self._thief = broken, now, strict, thief
         self._half_a_gang = hold_lease + HALF_A_GANG
         self.terms: dict[Term, float] = {}
         """Of every leader that was seen, and when it was seen first."""
@@ -228,6 +228,10 @@ class Promises:
                 self._begun.append(self._now())
             if self._strict:
                 self._in_order(rcm)
+            given = {*self._places.values()}
+            for arc in rcm.core.arcs_of(self._thief):
+                if (place := rcm.core.place_of(arc)) in given:
+                    self._broken(f"{arc} has a place that was given to another: {place}")
         lasting = dict.fromkeys(_half_gangs(clients, rcs), self._half_a_gang)
         lasting |= dict.fromkeys(_unled(rcs, silence), UNLED)
         if calm:

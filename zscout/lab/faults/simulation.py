@@ -34,7 +34,7 @@ from zscout.lab.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent
 from zscout.lab.faults.device import Device, WatchedCapacity, WatchedExclusive
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork, MemoryTransport
 from zscout.lab.faults.plan import OPERATIONS, Fault
-from zscout.lab.faults.programs import Work
+from zscout.lab.faults.programs import Work, steal_places
 from zscout.lab.faults.promises import LEFT_OVER, Promises
 from zscout.lab.faults.virtual_time import PROCESS, START, Process, VirtualTimeLoop
 from zscout.mesh.supervision import StallWatch
@@ -69,6 +69,8 @@ SETTLE: Final = 2.0
 LOOK_EVERY: Final = 0.05
 FORGED_EVERY: Final = 0.25
 OPERATOR: Final = "h0/operator"
+THIEF: Final = "h0/thief"
+PLACES_KEY: Final = bytes(32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +88,15 @@ class Size:
     """Seconds from one request of a program to its next, at most."""
     direct: bool = False
     """Many programs touch devices past their RCs."""
+    thief: bool = False
+    """Managers share a key, and a program asks at the places of others. Commands arrive twice."""
     moves_only: bool = False
     """Nothing fails but nodes, in the steps of a component's move: no other fault excuses what breaks."""
 
     @classmethod
     def of(cls, seed: int) -> Size:
-        """Every tenth run is a long one of many, every tenth one of moves that fail, and every tenth one of programs
-        that touch devices past their RCs."""
+        """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
+        touch devices past their RCs, and every tenth one with a thief."""
         match seed % 10:
             case 8:
                 return cls(direct=True, span=40.0)
@@ -100,6 +104,8 @@ class Size:
                 return cls(hosts=4, clients=20, faults=30, span=300.0, pause=60.0)
             case 7:
                 return cls(moves_only=True)
+            case 0:
+                return cls(thief=True)
         return cls()
 
 
@@ -209,9 +215,14 @@ class Simulation:
             lambda: loop.now,
             self.fleet.timing.hold_lease / SECOND,
             strict=self.fleet.strategy == "priority",
+            thief=THIEF,
         )
         for name in (*self.everybody, OPERATOR):
             self.start(name)
+        if self.size.thief:
+            self.network.twice = ("command",)
+            process, mesh = self.open_process(THIEF)
+            process.main = process.run(asyncio.create_task, self._guard(steal_places(mesh, lambda: self.work.over)))
         look = asyncio.create_task(self._look())
         timers = [loop.call_later(fault.at, self._begin, fault) for fault in self.faults]
         done = asyncio.create_task(self._served())
@@ -355,7 +366,8 @@ class Simulation:
         mesh_token = mesh.alive(Token(host, Role.NODE, "node", new_instance()))
         await self._offer_all(mesh, stall)
         if host in self.candidates_at:
-            candidate = self.candidates[host] = Candidate(mesh, self.fleet)
+            key = PLACES_KEY if self.size.thief else None
+            candidate = self.candidates[host] = Candidate(mesh, self.fleet, places_key=key)
             candidate.start()
         component_host = ComponentHost(
             mesh, self.fleet, ComponentsConfig(), self._on_failure, kinds=lambda: KINDS, process=self.component
