@@ -32,7 +32,7 @@ from zscout.mesh.renewal import RenewableTransport, Suspicions
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.transport import Collector, Quality, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem
-from zscout.types import Ns
+from zscout.types import VERSION, Ns
 
 log = logging.getLogger(__name__)
 
@@ -288,7 +288,7 @@ class Mesh:
             try:
                 message = messages.decode(b"{}" if payload is None else payload, kind, limit)
             except Malformed as error:
-                _refuse(query, "malformed", str(error))
+                _refuse(query, "malformed", str(error), VERSION)
                 return
             incoming: IncomingQuery[Any] = IncomingQuery(query, asked, asked if wild else key, message, arrived)
             try:
@@ -296,7 +296,7 @@ class Mesh:
             except Refused as refused:
                 incoming.refuse(refused.problem)
             except BadName as error:
-                incoming.refuse(Problem("bad_name", str(error)))
+                incoming.refuse(Problem("bad_name", str(error), version=VERSION))
             except Exception:
                 incoming.refuse(Problem("internal", "the request failed here; see this node's log"))
                 raise
@@ -470,5 +470,5 @@ class _Collector(Collector):
             self._over()
 
 
-def _refuse(query: TransportQuery, code: str, message: str) -> None:
-    query.reply_error(messages.encode(Problem(code, message)), Problem)
+def _refuse(query: TransportQuery, code: str, message: str, version: str = "") -> None:
+    query.reply_error(messages.encode(Problem(code, message, version=version)), Problem)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from zscout.messages.base import MAX_COUNTER, MAX_INCARNATION, Bytes, Elapsed, Figure, Message, ShortText
+from zscout.messages.base import MAX_COUNTER, MAX_INCARNATION, Bytes, Elapsed, Figure, Message, ShortText, VersionText
 from zscout.types import Metric, Policy
 
 MAX_RANKED = 256
@@ -49,6 +49,8 @@ class LoadReport(Message, frozen=True):
     temperature: float | None = None
     labels: Annotated[tuple[ShortText, ...], msgspec.Meta(max_length=MAX_LABELS)] = ()
     components: Annotated[tuple[ComponentUse, ...], msgspec.Meta(max_length=MAX_COMPONENTS)] = ()
+    version: VersionText = ""
+    """Of the node."""
 
 
 class RankAsk(Message, frozen=True):

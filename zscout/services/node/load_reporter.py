@@ -13,6 +13,7 @@ from zscout.mesh import Mesh, Supervisor
 from zscout.messages import LoadReport
 from zscout.services.node import host_figures
 from zscout.services.node.process_use import Running, TreeMeter, TreeUse, UseMeter, faded
+from zscout.types import VERSION
 
 log = logging.getLogger("zscout.load")
 
@@ -153,6 +154,7 @@ class Gauge:
             temperature=self._temperatures(),
             labels=self._labels,
             components=self._uses(),
+            version=VERSION,
         )
 
     def _host_load(self, size: float, ram: host_figures.HostMemory) -> LoadFigures:
