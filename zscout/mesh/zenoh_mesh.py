@@ -227,7 +227,9 @@ async def _open(config: MeshConfig, security: Security | None) -> Transport:
     except zenoh.ZError as error:
         raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
     try:
-        return ZenohTransport(session, _relinking(session, config, security) if config.multicast else None)
+        # A relay leaves it to its sites, which know where it is.
+        relinks = config.multicast and not config.relay
+        return ZenohTransport(session, _relinking(session, config, security) if relinks else None)
     except BaseException:
         _in_thread("closes the mesh", session.close)
         raise
@@ -269,7 +271,8 @@ class ZenohTransport(Transport):
         return str(self._session.info.zid())
 
     def peers(self) -> list[str]:
-        return [one for peer in self._session.info.peers_zid() if not (one := str(peer)).startswith(MEETING)]
+        linked = (*self._session.info.peers_zid(), *self._session.info.routers_zid())
+        return [one for peer in linked if not (one := str(peer)).startswith(MEETING)]
 
     def links(self) -> int:
         return len(self._session.info.links())
