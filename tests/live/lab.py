@@ -148,6 +148,7 @@ class Lab:
                 "-m",
                 "tests.live.holder",
                 name,
+                "test",
                 env=self.env,
                 cwd=self.cwd,
                 stdin=asyncio.subprocess.PIPE,
