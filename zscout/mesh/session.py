@@ -16,6 +16,7 @@ from typing import Any, Self, TypeAlias, TypeVar
 from msgspec import Struct
 
 from zscout import messages
+from zscout.config.certificates import Validity
 from zscout.keyexpr import BadName, FleetMember, Keys, Role, Sender, Token
 from zscout.mesh.exchange import (
     QUEUE_DEPTH,
@@ -136,6 +137,9 @@ class Mesh:
     """One process's place on the mesh, an async context manager: typed queries, publications, liveliness, and a clock.
 
     Declare once per purpose, never per request: Zenoh keeps memory for every key that was ever declared."""
+
+    validity: Validity | None = None
+    """Of this process's certificate as it is now; None on a plain mesh."""
 
     def __init__(self, transport: RenewableTransport, keys: Keys, me: Sender, now: Callable[[], Ns]) -> None:
         self.keys, self.me, self.now = keys, me, now
