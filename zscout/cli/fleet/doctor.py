@@ -8,11 +8,10 @@ import asyncio
 import ctypes
 import os
 import socket
-from collections.abc import Coroutine
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import click
 
@@ -99,10 +98,10 @@ async def _look(file: Path | None) -> Seen:
         if plain:
             seen.plain = await asyncio.to_thread(probing.plain_fleets, plain)
 
-    works: list[Coroutine[Any, Any, None]] = [call()]
-    if not seen.bad:
-        works.append(_join(seen, seen.fleet))
-    await asyncio.gather(*works)
+    async with asyncio.TaskGroup() as both:  # when it is interrupted it waits until the mesh is left
+        both.create_task(call())
+        if not seen.bad:
+            both.create_task(_join(seen, seen.fleet))
     return seen
 
 

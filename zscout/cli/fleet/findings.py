@@ -219,14 +219,14 @@ def _links(seen: Seen) -> Iterator[Finding]:
     elif others and fleet.security is None:
         remedy = "mend the fleet's name in the file, or start zscout-node with it"
         yield Finding("links", "mend", f"nobody is seen of fleet {fleet.name}, and of others: {known}", remedy)
-    elif seen.links:
+    elif seen.links and not any(one.objection for one in seen.answers):  # a link that is refused lives for a moment
         says = f"{many(seen.links, 'link')}, and nobody of fleet {fleet.name} is seen through them"
         remedy = "is the fleet's name the same there?"
         if fleet.security is not None:
             remedy = f"is {seen.host} named under [roles] in the files of the others, and the fleet's name the same?"
         yield Finding("links", "mend", says, remedy)
     else:
-        yield Finding("links", "mend", "no link to anybody", "start zscout-node, or see the lines above")
+        yield Finding("links", "mend", "no link to anybody", "mend what stands above, or start zscout-node")
     if here and others:
         yield Finding("links", "note", f"other fleets on this network: {known}")
 
@@ -236,7 +236,9 @@ def _leader(seen: Seen) -> Iterator[Finding]:
     if seen.links is None:
         return
     leads = sorted(name for name, host in seen.hosts.items() if host.has(Role.RCM))
-    could = sorted(name for name, host in seen.hosts.items() if host.has(Role.CANDIDATE))
+    # One that the file does not name leads nobody.
+    named = {*(fleet.candidates or seen.hosts)}
+    could = sorted(name for name, host in seen.hosts.items() if host.has(Role.CANDIDATE) and name in named)
     missing = [name for name in fleet.candidates if name not in could]
     if seen.state is not None:
         yield Finding("leader", "ok", f"{seen.state.host} leads, term {seen.state.term.counter}")
@@ -308,7 +310,7 @@ def _devices(seen: Seen) -> Iterator[Finding]:
 def _hosts(seen: Seen) -> Iterator[Finding]:
     """What their load reports say of them."""
     reports = {name: host.load for name, host in sorted(seen.hosts.items()) if host.load is not None}
-    own = seen.certificates.name if seen.certificates is not None else ""
+    own = seen.certificates.name if seen.certificates is not None and seen.certificates.soon(seen.at) else ""
     for name, report in reports.items():
         if report.renew and name != own:
             yield _ends_soon(name, report.certificate_ends_in or 0.0)
