@@ -116,7 +116,7 @@ async def heard(config: MeshConfig) -> list[Heard]:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Called:
     """What came of calling an address. `speaks` is empty where nobody answered, and `problem` says why.
 
     Of TLS: the certificate that was shown, by which CA, whether one that we trust has issued it, and what the other
@@ -131,15 +131,15 @@ class Answer:
     objection: str = ""
 
 
-async def call(addresses: Iterable[str], cas: str = "", own: Certificates | None = None) -> list[Answer]:
+async def call(addresses: Iterable[str], cas: str = "", own: Certificates | None = None) -> list[Called]:
     """Calls all at a time, within four seconds: as who trusts these CAs (PEM) and has this certificate."""
     return list(await asyncio.gather(*(_call(one, cas, own) for one in addresses)))
 
 
-async def _call(address: str, cas: str, own: Certificates | None) -> Answer:
+async def _call(address: str, cas: str, own: Certificates | None) -> Called:
     match = _ADDRESS.match(address)
     if match is None or match[1] not in ("tcp", "tls"):
-        return Answer(address, "", "can't be called")
+        return Called(address, "", "can't be called")
     host, port = match[2].strip("[]"), int(match[3])
     try:
         async with asyncio.timeout(CONNECT):
@@ -149,9 +149,9 @@ async def _call(address: str, cas: str, own: Certificates | None) -> Answer:
             _, writer = await asyncio.open_connection(*at)
         writer.transport.abort()
     except TimeoutError:
-        return Answer(address, "", "no answer")
+        return Called(address, "", "no answer")
     except OSError as error:
-        return Answer(address, "", _reason(error))
+        return Called(address, "", _reason(error))
     shaken: _Shaken | None = None
     if cas:
         try:
@@ -213,16 +213,16 @@ def _trusting(cas: str | None, own: Certificates | None = None) -> ssl.SSLContex
     return context
 
 
-def _answer(address: str, shaken: _Shaken | None, *, trusted: bool) -> Answer:
+def _answer(address: str, shaken: _Shaken | None, *, trusted: bool) -> Called:
     if shaken is None:
-        return Answer(address, "plain")
+        return Called(address, "plain")
     objection = shaken.objection if trusted else ""
     try:
         certificate = validity(shaken.told, Where(address))
     except (BadInput, KeyError):
-        return Answer(address, "tls", objection=objection)
+        return Called(address, "tls", objection=objection)
     issuer = clean(common_name(shaken.told["issuer"]))
-    return Answer(address, "tls", "", certificate, issuer, trusted, objection)
+    return Called(address, "tls", "", certificate, issuer, trusted, objection)
 
 
 def _reason(error: OSError) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from zscout.cli.fleet.findings import Finding, Seen, findings
+from zscout.cli.fleet.findings import Finding, Evidence, findings
 from zscout.cli.fleet.fleet_view import Host
 from zscout.config.access import AccessPolicy, Roles
 from zscout.config.certificates import Certificates, Validity
@@ -18,7 +18,7 @@ from zscout.config.fleet import Fleet, MeshConfig, default_fleet
 from zscout.config.node import default_node
 from zscout.config.strict import BadInput, Where
 from zscout.keyexpr import Role, Token
-from zscout.mesh.probing import Answer, Heard
+from zscout.mesh.probing import Called, Heard
 from zscout.messages import LoadReport, RcmState, RcState, RcView
 from zscout.types import Term
 
@@ -53,17 +53,17 @@ def led(*views: RcView, by: str = "anvil") -> RcmState:
     return RcmState(term=Term(3, by), seq=1, host=by, holds=[], queue=[], rcs=list(views), story=[])
 
 
-def seen(fleet: Fleet = PLAIN, **more: object) -> Seen:
+def seen(fleet: Fleet = PLAIN, **more: object) -> Evidence:
     """All is well, but for what is said otherwise."""
     known = {"interfaces": {"eth0": ""}, "heard": [HERE], "links": 1, "hosts": leading(), "state": led()}
-    return Seen(NOW, "ada", fleet, clock_kept=True, **(known | more))  # type: ignore[arg-type]
+    return Evidence(NOW, "ada", fleet, clock_kept=True, **(known | more))  # type: ignore[arg-type]
 
 
-def mends(one: Seen) -> list[tuple[str, str]]:
+def mends(one: Evidence) -> list[tuple[str, str]]:
     return [(found.about, str(found)) for found in findings(one) if found.state == "mend"]
 
 
-def the_mend(one: Seen) -> Finding:
+def the_mend(one: Evidence) -> Finding:
     (found,) = [found for found in findings(one) if found.state == "mend"]
     assert found.remedy
     return found
@@ -86,7 +86,7 @@ def test_a_fleet_that_is_well_has_nothing_to_mend() -> None:
 
 def test_a_bad_file_is_told_with_its_remedy_and_is_all_that_is_looked_at() -> None:
     error = Where("fleet.toml", ("mesh", "lease")).bad("is 90", "write at most 30")
-    told = findings(Seen(NOW, bad=[("files", error)], clock_kept=False))
+    told = findings(Evidence(NOW, bad=[("files", error)], clock_kept=False))
     assert told[0] == Finding("files", "mend", "fleet.toml: mesh.lease: is 90", "write at most 30")
     assert [(one.about, one.state) for one in told[1:]] == [("clock", "note")]
 
@@ -131,12 +131,12 @@ def test_without_multicast_nobody_is_found(mesh: MeshConfig, more: dict[str, obj
 @pytest.mark.parametrize(
     ("answer", "says"),
     [
-        (Answer("tcp/anvil:7447", "", "Connection refused"), "tcp/anvil:7447: Connection refused"),
-        (Answer("tls/anvil:7447", "plain"), "tls/anvil:7447: answers without TLS"),
-        (Answer("tcp/anvil:7447", "tls"), "tcp/anvil:7447: takes TLS only"),
+        (Called("tcp/anvil:7447", "", "Connection refused"), "tcp/anvil:7447: Connection refused"),
+        (Called("tls/anvil:7447", "plain"), "tls/anvil:7447: answers without TLS"),
+        (Called("tcp/anvil:7447", "tls"), "tcp/anvil:7447: takes TLS only"),
     ],
 )
-def test_what_stands_under_connect_is_called(answer: Answer, says: str) -> None:
+def test_what_stands_under_connect_is_called(answer: Called, says: str) -> None:
     fleet = replace(PLAIN, mesh=MeshConfig(connect=(answer.address,)))
     assert [one.says for one in findings(seen(fleet, answers=[answer])) if one.about == "connect"] == [says]
     # Of a process that is only heard its addresses may well be of another network.
@@ -144,7 +144,7 @@ def test_what_stands_under_connect_is_called(answer: Answer, says: str) -> None:
 
 
 def test_a_plain_host_among_secured_ones_is_told_whose_they_are() -> None:
-    closed = Answer("tls/10.0.0.2:7447", "tls", "", shown("bellows"), "CA one")
+    closed = Called("tls/10.0.0.2:7447", "tls", "", shown("bellows"), "CA one")
     shut_out = seen(answers=[closed], links=0, hosts={}, state=None)
     about, words = mends(shut_out)[0]
     assert about == "security"
@@ -167,37 +167,37 @@ def test_plain_hosts_of_a_secured_fleet_are_named() -> None:
     ("answer", "says"),
     [
         (
-            Answer("tls/b:1", "tls", "", shown("bellows"), "CA two"),
+            Called("tls/b:1", "tls", "", shown("bellows"), "CA two"),
             "bellows (tls/b:1) shows a certificate of CA two, and ca.pem trusts CA one",
         ),
         (
-            Answer("tls/b:1", "tls", "", shown("bellows", ends=-DAY), "CA one", trusted=True),
+            Called("tls/b:1", "tls", "", shown("bellows", ends=-DAY), "CA one", trusted=True),
             "the certificate of bellows (tls/b:1) has ended on 2026-04-30 12:00 UTC",
         ),
         (
-            Answer("tls/b:1", "tls", "", shown("bellows", begins=DAY), "CA one", trusted=True),
+            Called("tls/b:1", "tls", "", shown("bellows", begins=DAY), "CA one", trusted=True),
             "the certificate of bellows (tls/b:1) is valid from 2026-05-02 12:00 UTC on",
         ),
         (
-            Answer("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="unknown ca"),
+            Called("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="unknown ca"),
             "bellows (tls/b:1) refuses this certificate: unknown ca",
         ),
     ],
 )
-def test_certificates_that_do_not_fit_are_told_apart(answer: Answer, says: str) -> None:
+def test_certificates_that_do_not_fit_are_told_apart(answer: Called, says: str) -> None:
     found = the_mend(seen(CLOSED, certificates=certificates(), answers=[answer, answer]))
     assert (found.about, found.says) == ("security", says)
 
 
 def test_another_secured_fleet_on_the_network_is_well() -> None:
-    other = Answer("tls/x:1", "tls", "", shown("stranger"), "CA two")
-    fits = Answer("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True)
+    other = Called("tls/x:1", "tls", "", shown("stranger"), "CA two")
+    fits = Called("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True)
     assert not mends(seen(CLOSED, certificates=certificates(), answers=[other, fits]))
 
 
 def test_an_own_certificate_that_is_bad_is_not_told_again_by_those_who_refuse_it() -> None:
     bad = [("certificate", BadInput("keys/cert.pem: has ended on x; renew it"))]
-    refuses = Answer("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="certificate expired")
+    refuses = Called("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="certificate expired")
     shut_out = seen(CLOSED, bad=bad, certificates=certificates(), answers=[refuses], links=None, hosts={}, state=None)
     assert mends(shut_out) == [("certificate", "keys/cert.pem: has ended on x; renew it")]
 
@@ -214,7 +214,7 @@ def test_links_without_anybody_of_the_fleet_are_explained() -> None:
     assert said(PLAIN, links=2).startswith("2 links, and nobody of fleet zscout is seen through them; ")
     assert "nobody is seen of fleet zscout, and of others: lab (anvil)" in said(PLAIN, plain={"lab": {"anvil"}})
     assert "is ada named under [roles] in the files of the others" in said(CLOSED, links=1)
-    refused = Answer("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="unknown ca")
+    refused = Called("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="unknown ca")
     assert said(CLOSED, links=1, answers=[refused]).startswith("no link to anybody; ")
     assert said(PLAIN, unjoined="the mesh can't be joined: x") == "the mesh can't be joined: x"
 

@@ -17,7 +17,7 @@ import click
 
 from zscout import terminal
 from zscout.cli import common
-from zscout.cli.fleet.findings import Finding, Seen, findings
+from zscout.cli.fleet.findings import Finding, Evidence, findings
 from zscout.config.certificates import MAX_FILE, read_cas, read_certificates
 from zscout.config.fleet import Fleet
 from zscout.config.node import load_node
@@ -34,11 +34,10 @@ TIME_ERROR: Final = 5
 TIMEX: Final = 256
 """Bytes that are enough for its struct on any platform."""
 STYLES: Final = {"ok": "green", "note": "yellow", "mend": "bold red"}
-FILE: Final = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
 @click.command()
-@click.argument("file", required=False, type=FILE)
+@click.argument("file", required=False, type=click.Path(path_type=Path))
 @common.json_option("Print one JSON object.")
 @common.runs
 async def doctor(file: Path | None, as_json: bool) -> int:
@@ -53,7 +52,7 @@ async def doctor(file: Path | None, as_json: bool) -> int:
     \b
     Examples:
       zscout doctor
-      zscout doctor /etc/zscout/node.toml
+      zscout doctor lab.toml
       zscout doctor --json | jq -r '.findings[] | select(.state == "mend").says'
     """
     seen = await _look(file)
@@ -69,8 +68,8 @@ async def doctor(file: Path | None, as_json: bool) -> int:
     return int(bool(bad))
 
 
-async def _look(file: Path | None) -> Seen:
-    seen = Seen(datetime.now(UTC), clock_kept=_clock_kept())
+async def _look(file: Path | None) -> Evidence:
+    seen = Evidence(datetime.now(UTC), clock_kept=_clock_kept())
     try:
         if file is not None:
             seen.node = load_node(file)
@@ -78,7 +77,7 @@ async def _look(file: Path | None) -> Seen:
         else:
             seen.fleet = common.the_fleet()
     except BadInput as error:
-        if (named := common.fleet_file()) is not None and file is None and not named.exists():
+        if (named := file or common.fleet_file()) is not None and not named.exists():
             raise
         seen.bad.append(("files", error))
         return seen
@@ -105,7 +104,7 @@ async def _look(file: Path | None) -> Seen:
     return seen
 
 
-def _look_at_certificates(seen: Seen, fleet: Fleet) -> str:
+def _look_at_certificates(seen: Evidence, fleet: Fleet) -> str:
     """The CAs that are trusted, in PEM; empty where there are none."""
     if fleet.security is None:
         return ""
@@ -122,7 +121,7 @@ def _look_at_certificates(seen: Seen, fleet: Fleet) -> str:
     return cas
 
 
-async def _join(seen: Seen, fleet: Fleet) -> None:
+async def _join(seen: Evidence, fleet: Fleet) -> None:
     """What is seen from inside."""
     from zscout.cli.fleet.fleet_view import Devices, FleetView
     from zscout.mesh import MeshError

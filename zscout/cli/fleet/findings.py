@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from zscout.cli.fleet.fleet_view import Host
     from zscout.config.fleet import Fleet
     from zscout.config.node import Node
-    from zscout.mesh.probing import Answer, Heard
+    from zscout.mesh.probing import Called, Heard
     from zscout.messages import RcmState, RcState
 
 MAX_NAMED: Final = 6
@@ -40,7 +40,7 @@ class Finding:
 
 
 @dataclass(slots=True)
-class Seen:
+class Evidence:
     """All that was found out. What could not be looked at is None, or empty."""
 
     at: datetime
@@ -54,7 +54,7 @@ class Seen:
     interfaces: Mapping[str, str] = field(default_factory=dict)
     """Those that multicast would use, with why it can't."""
     heard: Sequence[Heard] = ()
-    answers: Sequence[Answer] = ()
+    answers: Sequence[Called] = ()
     """Of the addresses under `connect`, and of those that were heard."""
     plain: Mapping[str, Collection[str]] = field(default_factory=dict)
     """Hosts with nodes on the network without TLS, by fleet."""
@@ -69,7 +69,7 @@ class Seen:
     """Whether something keeps this host's clock."""
 
 
-def findings(seen: Seen) -> list[Finding]:
+def findings(seen: Evidence) -> list[Finding]:
     """All that is to be said, causes before what comes of them."""
     found = [_bad(about, error) for about, error in seen.bad]
     if seen.fleet is None:
@@ -83,12 +83,12 @@ def _bad(about: str, error: BadInput) -> Finding:
     return Finding(about, "mend", says, remedy)
 
 
-def _the_fleet(seen: Seen) -> Fleet:
+def _the_fleet(seen: Evidence) -> Fleet:
     assert seen.fleet is not None  # noqa: S101 - looked at by `findings`
     return seen.fleet
 
 
-def _certificate(seen: Seen) -> Iterator[Finding]:
+def _certificate(seen: Evidence) -> Iterator[Finding]:
     fleet, own = _the_fleet(seen), seen.certificates
     if own is None or any(about == "certificate" for about, _ in seen.bad):
         return
@@ -105,7 +105,7 @@ def _ends_soon(name: str, left: float) -> Finding:
     return Finding("certificate", "mend", ending(name, left), "renew it (zscout cert renew)")
 
 
-def _multicast(seen: Seen) -> Iterator[Finding]:
+def _multicast(seen: Evidence) -> Iterator[Finding]:
     fleet, linked = _the_fleet(seen), bool(seen.links)
     mesh = fleet.mesh
     if not mesh.multicast:
@@ -135,7 +135,7 @@ def _multicast(seen: Seen) -> Iterator[Finding]:
         yield Finding("multicast", "ok", f"{heard} heard at {where}, {here} of them on this host")
 
 
-def _called(seen: Seen) -> Iterator[Finding]:
+def _called(seen: Evidence) -> Iterator[Finding]:
     """The addresses that files name, and who is not heard as it says."""
     fleet = _the_fleet(seen)
     for one in seen.answers:
@@ -152,7 +152,7 @@ def _called(seen: Seen) -> Iterator[Finding]:
             yield Finding("connect", "mend", f"{one.address}: takes TLS only", remedy)
 
 
-def _security(seen: Seen) -> Iterator[Finding]:
+def _security(seen: Evidence) -> Iterator[Finding]:
     """Plain against TLS, and certificates that do not fit."""
     fleet = _the_fleet(seen)
     closed = [one for one in seen.answers if one.speaks == "tls"]
@@ -182,7 +182,7 @@ def _security(seen: Seen) -> Iterator[Finding]:
         yield from _member(one.address, one.certificate, one.objection, seen)  # type: ignore[arg-type]
 
 
-def _member(address: str, certificate: Validity, objection: str, seen: Seen) -> Iterator[Finding]:
+def _member(address: str, certificate: Validity, objection: str, seen: Evidence) -> Iterator[Finding]:
     """A host whose certificate is of a CA of ours."""
     name = f"{certificate.name} ({address})"
     if seen.at >= certificate.ends:
@@ -196,7 +196,7 @@ def _member(address: str, certificate: Validity, objection: str, seen: Seen) -> 
         yield Finding("security", "mend", says, f"is its {CA} that of this CA, is its clock right?")
 
 
-def _by_name(answers: Iterable[Answer]) -> list[tuple[tuple[str, str], list[str]]]:
+def _by_name(answers: Iterable[Called]) -> list[tuple[tuple[str, str], list[str]]]:
     found = defaultdict[tuple[str, str], list[str]](list)
     for one in answers:
         name = one.certificate.name if one.certificate is not None else "somebody"
@@ -204,7 +204,7 @@ def _by_name(answers: Iterable[Answer]) -> list[tuple[tuple[str, str], list[str]
     return sorted(found.items())
 
 
-def _links(seen: Seen) -> Iterator[Finding]:
+def _links(seen: Evidence) -> Iterator[Finding]:
     fleet = _the_fleet(seen)
     if seen.unjoined is not None:
         yield Finding("links", "mend", seen.unjoined)
@@ -231,7 +231,7 @@ def _links(seen: Seen) -> Iterator[Finding]:
         yield Finding("links", "note", f"other fleets on this network: {known}")
 
 
-def _leader(seen: Seen) -> Iterator[Finding]:
+def _leader(seen: Evidence) -> Iterator[Finding]:
     fleet = _the_fleet(seen)
     if seen.links is None:
         return
@@ -261,7 +261,7 @@ def _leader(seen: Seen) -> Iterator[Finding]:
         yield Finding("leader", "mend", says, "start zscout-node there, or remove it from `candidates`")
 
 
-def _devices(seen: Seen) -> Iterator[Finding]:
+def _devices(seen: Evidence) -> Iterator[Finding]:
     if seen.links is None:
         return
     offered = defaultdict[str, set[str]](set)
@@ -307,7 +307,7 @@ def _devices(seen: Seen) -> Iterator[Finding]:
         yield Finding("devices", "ok", f"{many(well, 'RC')} there and well")
 
 
-def _hosts(seen: Seen) -> Iterator[Finding]:
+def _hosts(seen: Evidence) -> Iterator[Finding]:
     """What their load reports say of them."""
     reports = {name: host.load for name, host in sorted(seen.hosts.items()) if host.load is not None}
     own = seen.certificates.name if seen.certificates is not None and seen.certificates.soon(seen.at) else ""
@@ -324,7 +324,7 @@ def _hosts(seen: Seen) -> Iterator[Finding]:
         yield Finding("versions", "ok", f"all hosts run {next(iter(versions))}")
 
 
-def _clock(seen: Seen) -> Iterator[Finding]:
+def _clock(seen: Evidence) -> Iterator[Finding]:
     if seen.clock_kept:
         yield Finding("clock", "ok", "this host's clock is kept")
     elif seen.clock_kept is False:
@@ -332,7 +332,7 @@ def _clock(seen: Seen) -> Iterator[Finding]:
         yield Finding("clock", "note", says, "only certificates need it; start a time service (timedatectl)")
 
 
-def _open(seen: Seen) -> Iterator[Finding]:
+def _open(seen: Evidence) -> Iterator[Finding]:
     fleet = _the_fleet(seen)
     if fleet.security is None:
         roles = "roles are advisory and " if fleet.access.ranks else ""
