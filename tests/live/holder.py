@@ -6,7 +6,8 @@ Orders come as JSON lines on stdin, what happens goes out as JSON lines on stdou
 Orders: {"order": "ask", "arc", "needs", "priority", "min_runtime", "keep"}, {"order": "command", "rc", "do", "ttl"}
 under the last grant of this process, {"order": "work", "rcs"}: commands these RCs all the time, until one refuses it
 ("disturbed"); {"order": "beats"}: how often they have obeyed since it was asked last; {"order": "state"}: the RCM's;
-{"order": "end"}. It ends when its stdin does.
+{"order": "time", "rc"}: how long it takes from a request to the confirmed grant; {"order": "end"}. It ends when its
+stdin does.
 """
 
 from __future__ import annotations
@@ -78,6 +79,8 @@ class Holder:
                 self.beats = 0
             case "state":
                 say("state", state=msgspec.to_builtins(await self.client.state(timeout=0.5)))
+            case "time":
+                await self._time(**order)
             case "end" if self.arc is not None:
                 await self.client.end(self.arc)
                 say("given_up")
@@ -124,6 +127,14 @@ class Holder:
                 return
             self.beats += 1
             await asyncio.sleep(BEAT)
+
+    async def _time(self, rc: str) -> None:
+        began = clock.now()
+        asked = await self.client.request("timed", {rc: {}}, min_runtime=600)
+        await self.client.granted(asked)
+        took = clock.now() - began
+        await self.client.end(asked)
+        say("timed", took=took)
 
     def start(self, line: bytes) -> None:
         task = asyncio.get_running_loop().create_task(self.obey(json.loads(line)))

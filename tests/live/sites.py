@@ -1,21 +1,29 @@
 """A fleet over two sites, whose hosts reach each other by a relay alone: what that costs, and whether a hold inside a
 site feels that the relay dies and comes back.
 
-    python -m tests.live.sites --merges 20      (needs root, network namespaces, iproute2; --help for more)
+    python -m tests.live.sites --merges 20 --frozen 5 --cut 5      (needs root, network namespaces, iproute2)
 
-Exit code 0: no hold inside a site was disturbed; 1: else; 2: it can't run here."""
+Two programs that hold and command devices of their own sites run through all merges. Exit code 0: none of them was
+disturbed; 1: else; 2: it can't run here."""
 
 from __future__ import annotations
 
+import argparse
 import asyncio
+import itertools
 import json
 import os
+import random
+import shutil
 import signal
 import sys
-from collections.abc import Callable
+import tempfile
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import median
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import msgspec
 
@@ -38,6 +46,10 @@ NODES: Final = {
 """The hosts of both sites, with their RCs. The first of each may lead."""
 ALL: Final = frozenset(rc for rcs in NODES.values() for rc in rcs)
 LOOK: Final = 0.02
+Fault: TypeAlias = Literal["killed", "frozen", "cut"]
+"""What happens to the relay; the last: site b's line to it."""
+INSIDE, ACROSS = "inside", "across"
+WARM_UP: Final = 20
 ROLES: Final = """
 [security]
 folder = "keys"
@@ -85,6 +97,10 @@ class SitesNet:
                 net.ip("-n", space, "addr", "add", f"{self.address(host, site)}/24", "dev", card)
                 net.ip("-n", space, "link", "set", card, "up")
                 net.ip("-n", space, "route", "append", "224.0.0.0/4", "dev", card)
+
+    def plug(self, site: str, state: Literal["up", "down"]) -> None:
+        """The relay's cable to a site."""
+        net.ip("-n", self.space(f"lan{site}"), "link", "set", GATE, state)
 
     def close(self) -> None:
         net.remove(self.mark)
@@ -166,8 +182,13 @@ class Sites:
         for host in (GATE, *NODES):
             rcs = "".join(f'[[rc]]\nname = "{rc}"\ndriver = "exclusive"\n' for rc in NODES.get(host, ()))
             more = f'[security]\nfolder = "certificates/{host}"\n' if secured else ""
-            fleet = "gate" if host == GATE else host[0]
-            text = f'[node]\nhost = "{host}"\nfleet = "{fleet}.fleet.toml"\n{rcs}{more}'
+            site = "a"
+            if host == GATE:
+                listen = self._endpoint("[::]")
+                more += f'[mesh]\nrelay = ["a", "b"]\nlisten = ["{listen}"]\nconnect = []\ninterface = "eth0,eth1"\n'
+            else:
+                site = host[0]
+            text = f'[node]\nhost = "{host}"\nfleet = "{site}.fleet.toml"\n{rcs}{more}'
             (folder / f"{host}.toml").write_text(text)
 
     def _endpoint(self, address: str) -> str:
@@ -222,17 +243,23 @@ class Sites:
         await program.event("up")
         return program
 
-    def lose_relay(self, *, frozen: bool = False) -> None:
-        if frozen:
-            self.processes.signal(GATE, signal.SIGSTOP)
-        else:
-            self.processes.kill(GATE)
+    def lose_relay(self, fault: Fault) -> None:
+        match fault:
+            case "killed":
+                self.processes.kill(GATE)
+            case "frozen":
+                self.processes.signal(GATE, signal.SIGSTOP)
+            case "cut":
+                self.net.plug("b", "down")
 
-    def bring_relay_back(self) -> None:
-        if self.processes.running[GATE].poll() is None:
-            self.processes.signal(GATE, signal.SIGCONT)
-        else:
-            self.processes.start(GATE)
+    def bring_relay_back(self, fault: Fault) -> None:
+        match fault:
+            case "killed":
+                self.processes.start(GATE)
+            case "frozen":
+                self.processes.signal(GATE, signal.SIGCONT)
+            case "cut":
+                self.net.plug("b", "up")
 
     async def sees(self, program: Program, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state, as this program is told it, as soon as `until` holds of it."""
@@ -263,3 +290,135 @@ class Sites:
 
 def present(state: RcmState) -> set[str]:
     return {view.rc for view in state.rcs if view.present}
+
+
+async def times(sites: Sites, rounds: int) -> dict[str, list[Ns]]:
+    """From a request to the confirmed grant, one after the other: by a program in the site of leader and RC, and by one
+    in the other site."""
+    programs = {site: await sites.program(site, f"timer-{site}") for site in SITES}
+    leads = (await sites.whole(*programs.values())).host[0]
+    found: dict[str, list[Ns]] = {INSIDE: [], ACROSS: []}
+    for number in range(rounds + WARM_UP):
+        for site, program in programs.items():
+            await program.order("time", rc=f"robot/{leads}3")
+            took = (await program.event("timed"))["took"]
+            if number >= WARM_UP:
+                found[INSIDE if site == leads else ACROSS].append(took)
+    for program in programs.values():
+        program.kill()
+    return found
+
+
+async def successions(sites: Sites, rounds: int) -> list[Ns]:
+    """From `kill -9` of a holder in one site until the next one, in the other, has entered its body."""
+    found = []
+    rcs = "robot/a3", "robot/b3"
+    for number in range(rounds):
+        site, other = SITES[number % 2], SITES[number % 2 - 1]
+        first, following = await sites.program(site, f"first-{number}"), await sites.program(other, f"next-{number}")
+        await sites.whole(first, following)
+        await first.works("first", *rcs)
+        await following.asks("next", *rcs)
+        await following.event("queued")
+        killed = first.kill()
+        found.append(await following.enters() - killed)
+        await following.gives_back()
+        following.kill()
+    return found
+
+
+class Merge(NamedTuple):
+    fault: Fault
+    took: float
+    """Seconds from the relay's return until one RCM had all devices, for programs of both sites."""
+    trouble: list[dict[str, Any]]
+
+
+async def merges(sites: Sites, faults: Sequence[Fault], down: float, tell: Callable[[Merge], None]) -> list[Merge]:
+    """`down`: for how many seconds the sites are apart."""
+    found: list[Merge] = []
+    programs: list[Program] = []
+    for number, fault in enumerate(faults):
+        if not programs:
+            programs = [await sites.program(site, f"holds-{site}-{number}") for site in SITES]
+            await sites.whole(*programs)
+            for program in programs:
+                await program.works(program.name, f"robot/{program.site}1", f"robot/{program.site}2")
+        lost = time.monotonic()
+        sites.lose_relay(fault)
+        for program in programs:
+            await sites.apart(program)
+        await asyncio.sleep(max(0, lost + down - time.monotonic()))
+        back = time.monotonic()
+        sites.bring_relay_back(fault)
+        await sites.whole(*programs)
+        took = time.monotonic() - back
+        trouble = [event for program in programs for event in await program.works_on()]
+        found.append(Merge(fault, took, trouble))
+        tell(found[-1])
+        if trouble:
+            for program in programs:
+                program.kill()
+            programs = []
+    return found
+
+
+async def measure(asked: argparse.Namespace, folder: Path) -> bool:
+    """Prints what it finds. Returns whether nobody was disturbed."""
+    numbers = itertools.count(1)
+
+    def tell(one: Merge) -> None:
+        what = f"DISTURBED: {one.trouble}" if one.trouble else "nobody disturbed"
+        print(f"{next(numbers):3}  relay {one.fault}  one fleet {one.took:5.2f} s after its return, {what}", flush=True)
+
+    async with Sites(folder, secured=asked.secured) as sites:
+        if asked.grants:
+            took = await times(sites, asked.grants)
+            inside, across = (median(took[one]) / 1e6 for one in (INSIDE, ACROSS))
+            print(f"grant inside {inside:.2f} ms, across {across:.2f} ms: {across / inside:.2f} times ({asked.grants})")
+        if asked.kills:
+            gaps = [one / 1e6 for one in await successions(sites, asked.kills)]
+            print(f"kill -9, next across: median {median(gaps):.0f} ms, at most {max(gaps):.0f} ms ({len(gaps)})")
+        faults: list[Fault] = [*["frozen"] * asked.frozen, *["cut"] * asked.cut]  # type: ignore[list-item]
+        faults += ["killed"] * (asked.merges - len(faults))
+        random.Random(asked.seed).shuffle(faults)  # noqa: S311
+        found = await merges(sites, faults, asked.down, tell)
+        if found:
+            well, waits = sum(not one.trouble for one in found), [one.took for one in found]
+            print(
+                f"{well} of {len(found)} merges disturbed nobody; one fleet after {median(waits):.2f} s, at most "
+                f"{max(waits):.2f} s"
+            )
+    return not any(one.trouble for one in found)
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(prog="python -m tests.live.sites", description=__doc__.partition("\n\n")[0])
+    options.add_argument("--merges", type=int, default=20, help="so often the relay goes and comes back (20)")
+    options.add_argument("--frozen", type=int, default=0, help="of these it is frozen, not killed (0)")
+    options.add_argument("--cut", type=int, default=0, help="of these a site's line to it is cut (0)")
+    options.add_argument("--down", type=float, default=10.0, help="seconds without a relay (10)")
+    options.add_argument("--grants", type=int, default=200, help="grants of each kind (200)")
+    options.add_argument("--kills", type=int, default=10, help="holders killed (10)")
+    options.add_argument("--secured", action="store_true", help="with certificates and roles")
+    options.add_argument("--seed", type=int, default=1, help="order of the merges (1)")
+    asked = options.parse_args()
+    try:
+        net.check()
+    except net.NoNamespaces as error:
+        print(f"sites: {error}", file=sys.stderr)
+        return 2
+    net.end_on_signals()
+    folder = Path(tempfile.mkdtemp(prefix="zscout-sites-"))
+    before = os.getloadavg()[0]
+    well = asyncio.run(measure(asked, folder))
+    print(f"{os.cpu_count()} cores, load average {before:.2f} before, {os.getloadavg()[0]:.2f} after")
+    if not well:
+        print(f"logs are in {folder}", file=sys.stderr)
+        return 1
+    shutil.rmtree(folder, ignore_errors=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -17,7 +17,7 @@ from tests.chaos.net import NoNamespaces, check, ip
 from tests.cli.tools import COMMAND
 from tests.hang import HANG
 from tests.live.lab import PATIENT
-from tests.live.sites import ALL, GATE, SITES, Sites
+from tests.live.sites import ALL, GATE, SITES, Fault, Sites
 from zscout.config.certificate_authority import CertificateAuthority
 from zscout.messages import RcmState
 from zscout.types import SECOND, Grant
@@ -98,9 +98,9 @@ def test_the_next_in_the_other_site_follows_a_holder_that_was_killed(tmp_path: P
 
 
 @DOORS
-@pytest.mark.parametrize("fault", ["killed", "frozen"])
+@pytest.mark.parametrize("fault", get_args(Fault))
 def test_each_site_leads_itself_without_the_relay_and_the_merge_ends_no_hold(
-    tmp_path: Path, fault: str, secured: bool
+    tmp_path: Path, fault: Fault, secured: bool
 ) -> None:
     async def story() -> None:
         async with Sites(tmp_path, secured=secured, lease=LEASE) as sites:
@@ -112,14 +112,14 @@ def test_each_site_leads_itself_without_the_relay_and_the_merge_ends_no_hold(
                 await program.works(program.name, f"robot/{program.site}1", f"robot/{program.site}2")
             await across.works("across", "robot/a3", "robot/b3")
 
-            sites.lose_relay(frozen=fault == "frozen")
+            sites.lose_relay(fault)
             assert {(await sites.apart(program)).host for program in inside} == {"a1", "b1"}
             await across.event("queued")
             for program in late:
                 await program.works(program.name, f"robot/{program.site}3")
             assert [await program.works_on() for program in inside] == [[], []]
 
-            sites.bring_relay_back()
+            sites.bring_relay_back(fault)
             merged = await sites.whole(*inside, *late, across)
             assert held(merged) == {program.name: program.grant for program in (*inside, *late)}
             assert [await program.works_on() for program in (*inside, *late)] == [[]] * 4
