@@ -32,11 +32,11 @@ from zscout.mesh.relinking import MEETING
 from zscout.mesh.zenoh_mesh import in_thread, zenoh_config
 from zscout.types import clean
 
-SCOUT: Final = 1.0
+SCOUT: Final = 1.5
 """Seconds in which all who are there have answered."""
 POLL: Final = 0.02
-CONNECT: Final = 1.0
-HANDSHAKE: Final = 1.0
+CONNECT: Final = 1.5
+HANDSHAKE: Final = 2.0
 OBJECTION: Final = 0.3
 """Seconds within which the other side says that it refuses our certificate: it looks after we have seen its own."""
 LINK: Final = 0.8
@@ -46,7 +46,7 @@ MAX_HEARD: Final = 64
 """Processes that are called."""
 MAX_TOKENS: Final = 10_000
 _ALERT: Final = re.compile(r"alert ([a-z ]*[a-z])")
-_ADDRESS: Final = re.compile(r"([a-z]+)/(.+):(\d+)")
+_ADDRESS: Final = re.compile(r"(tcp|tls)/([^#?]+):(\d+)(?:[?#].*)?")
 
 
 # Multicast
@@ -131,41 +131,53 @@ class Called:
     objection: str = ""
 
 
-async def call(addresses: Iterable[str], cas: str = "", own: Certificates | None = None) -> list[Called]:
-    """Calls all at a time, within four seconds: as who trusts these CAs (PEM) and has this certificate."""
-    return list(await asyncio.gather(*(_call(one, cas, own) for one in addresses)))
+async def call(
+    named: Iterable[str], heard: Iterable[str] = (), cas: str = "", own: Certificates | None = None
+) -> list[Called]:
+    """Calls all addresses of TCP and TLS at a time, within six seconds, as who trusts these CAs (PEM) and has this
+    certificate. Who was `heard` has said itself whether it speaks TLS; of those that a file has `named` it is tried."""
+    tried = dict.fromkeys(heard, False) | dict.fromkeys(named, True)
+    matches = [(match, doubted) for one, doubted in tried.items() if (match := _ADDRESS.fullmatch(one))]
+    return list(await asyncio.gather(*(_call(match, doubted, cas, own) for match, doubted in matches)))
 
 
-async def _call(address: str, cas: str, own: Certificates | None) -> Called:
-    match = _ADDRESS.match(address)
-    if match is None or match[1] not in ("tcp", "tls"):
-        return Called(address, "", "can't be called")
-    host, port = match[2].strip("[]"), int(match[3])
+async def _call(match: re.Match[str], doubted: bool, cas: str, own: Certificates | None) -> Called:
+    address = match[0]
     try:
         async with asyncio.timeout(CONNECT):
-            # In a thread that nobody waits for: where no name server answers it takes its time.
-            look_up = functools.partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
-            at = (await asyncio.wrap_future(in_thread("looks up a name", look_up)))[0][4][:2]
-            _, writer = await asyncio.open_connection(*at)
-        writer.transport.abort()
+            at = await _reached(match[2].strip("[]"), int(match[3]))
     except TimeoutError:
         return Called(address, "", "no answer")
     except OSError as error:
         return Called(address, "", _reason(error))
-    shaken: _Shaken | None = None
+    if match[1] == "tcp" and not doubted:
+        return Called(address, "plain")
     if cas:
-        try:
-            shaken = await _handshake(at, _trusting(cas, own))
-        except ssl.SSLCertVerificationError:
-            pass
-        else:
-            return _answer(address, shaken, trusted=True)
+        with suppress(ssl.SSLCertVerificationError):
+            return _answer(address, await _handshake(at, _trusting(cas, own)), trusted=True)
     # Whoever issued it, a certificate that is taken for an authority itself can be read.
     if (shaken := await _handshake(at, _trusting(None))) is not None and shaken.encoded:
         itself = ssl.DER_cert_to_PEM_cert(shaken.encoded)
         with suppress(ssl.SSLCertVerificationError):
             shaken = await _handshake(at, _trusting(itself))
     return _answer(address, shaken, trusted=False)
+
+
+async def _reached(host: str, port: int) -> tuple[str, int]:
+    """Which of a host's addresses takes a connection. Raises OSError."""
+    # In a thread that nobody waits for: where no name server answers it takes its time.
+    look_up = functools.partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
+    error: OSError | None = None
+    for *_, found in await asyncio.wrap_future(in_thread("looks up a name", look_up)):
+        at = str(found[0]), port
+        try:
+            _, writer = await asyncio.open_connection(*at)
+        except OSError as failed:
+            error = failed
+        else:
+            writer.transport.abort()
+            return at
+    raise error or OSError("it has no address")
 
 
 class _Shaken(NamedTuple):
@@ -175,7 +187,7 @@ class _Shaken(NamedTuple):
     objection: str
 
 
-async def _handshake(at: tuple[Any, ...], context: ssl.SSLContext) -> _Shaken | None:
+async def _handshake(at: tuple[str, int], context: ssl.SSLContext) -> _Shaken | None:
     """None: no TLS is spoken there. Raises SSLCertVerificationError."""
     try:
         async with asyncio.timeout(HANDSHAKE):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from zscout.cli.fleet.findings import Finding, Evidence, findings
+from zscout.cli.fleet.findings import Evidence, Finding, findings
 from zscout.cli.fleet.fleet_view import Host
 from zscout.config.access import AccessPolicy, Roles
 from zscout.config.certificates import Certificates, Validity
@@ -50,13 +50,13 @@ def leading(name: str = "anvil", *rcs: str, **load: object) -> dict[str, Host]:
 
 
 def led(*views: RcView, by: str = "anvil") -> RcmState:
-    return RcmState(term=Term(3, by), seq=1, host=by, holds=[], queue=[], rcs=list(views), story=[])
+    return RcmState(Term(3, by), 1, by, rcs=list(views), version="1")
 
 
 def seen(fleet: Fleet = PLAIN, **more: object) -> Evidence:
     """All is well, but for what is said otherwise."""
     known = {"interfaces": {"eth0": ""}, "heard": [HERE], "links": 1, "hosts": leading(), "state": led()}
-    return Evidence(NOW, "ada", fleet, clock_kept=True, **(known | more))  # type: ignore[arg-type]
+    return Evidence(NOW, "ada", "lab.toml", fleet, clock_kept=True, **(known | more))  # type: ignore[arg-type]
 
 
 def mends(one: Evidence) -> list[tuple[str, str]]:
@@ -72,6 +72,7 @@ def the_mend(one: Evidence) -> Finding:
 def test_a_fleet_that_is_well_has_nothing_to_mend() -> None:
     told = [(one.about, one.state) for one in findings(seen())]
     assert told == [
+        ("files", "ok"),
         ("multicast", "ok"),
         ("links", "ok"),
         ("leader", "ok"),
@@ -81,7 +82,8 @@ def test_a_fleet_that_is_well_has_nothing_to_mend() -> None:
     ]
     closed = findings(seen(CLOSED, certificates=certificates()))
     assert [one.about for one in closed if one.state != "ok"] == []
-    assert closed[0].says == "keys/cert.pem: ada, by CA one, until 2027-04-30 12:00 UTC"
+    assert closed[0].says == "fleet zscout (lab.toml), looked at as ada"
+    assert closed[1].says == "keys/cert.pem: ada, by CA one, until 2027-04-30 12:00 UTC"
 
 
 def test_a_bad_file_is_told_with_its_remedy_and_is_all_that_is_looked_at() -> None:

@@ -17,7 +17,7 @@ import click
 
 from zscout import terminal
 from zscout.cli import common
-from zscout.cli.fleet.findings import Finding, Evidence, findings
+from zscout.cli.fleet.findings import Evidence, Finding, findings
 from zscout.config.certificates import MAX_FILE, read_cas, read_certificates
 from zscout.config.fleet import Fleet
 from zscout.config.node import load_node
@@ -76,6 +76,7 @@ async def _look(file: Path | None) -> Evidence:
             seen.fleet, seen.host = seen.node.fleet, seen.node.host
         else:
             seen.fleet = common.the_fleet()
+        seen.file = str(file or common.fleet_file() or "")
     except BadInput as error:
         if (named := file or common.fleet_file()) is not None and not named.exists():
             raise
@@ -89,10 +90,10 @@ async def _look(file: Path | None) -> Evidence:
     if mesh.multicast:
         seen.interfaces = probing.multicast_problems(mesh)
         seen.heard = await probing.heard(mesh)
-    addresses = [*mesh.connect, *(address for one in seen.heard for address in one.addresses[:LISTENS])]
+    heard = [address for one in seen.heard for address in one.addresses[:LISTENS]]
 
     async def call() -> None:
-        seen.answers = await probing.call(dict.fromkeys(addresses), cas, seen.certificates)
+        seen.answers = await probing.call(mesh.connect, heard, cas, seen.certificates)
         plain = [one.address for one in seen.answers if one.speaks == "plain"]
         if plain:
             seen.plain = await asyncio.to_thread(probing.plain_fleets, plain)

@@ -46,6 +46,8 @@ class Evidence:
     at: datetime
     host: str = ""
     """In whose name it was looked: this host's or person's."""
+    file: str = ""
+    """That says how; empty: there is none."""
     fleet: Fleet | None = None
     node: Node | None = None
     bad: list[tuple[str, BadInput]] = field(default_factory=list)
@@ -74,7 +76,7 @@ def findings(seen: Evidence) -> list[Finding]:
     found = [_bad(about, error) for about, error in seen.bad]
     if seen.fleet is None:
         return [*found, *_clock(seen)]
-    parts = (_certificate, _multicast, _called, _security, _links, _leader, _devices, _hosts, _clock, _open)
+    parts = (_files, _certificate, _multicast, _called, _security, _links, _leader, _devices, _hosts, _clock, _open)
     return [*found, *(one for part in parts for one in part(seen))]
 
 
@@ -86,6 +88,11 @@ def _bad(about: str, error: BadInput) -> Finding:
 def _the_fleet(seen: Evidence) -> Fleet:
     assert seen.fleet is not None  # noqa: S101 - looked at by `findings`
     return seen.fleet
+
+
+def _files(seen: Evidence) -> Iterator[Finding]:
+    by = seen.file or "no file is named: the default"
+    yield Finding("files", "ok", f"fleet {_the_fleet(seen).name} ({by}), looked at as {seen.host}")
 
 
 def _certificate(seen: Evidence) -> Iterator[Finding]:
@@ -132,7 +139,9 @@ def _multicast(seen: Evidence) -> Iterator[Finding]:
     else:
         here = sum(one.here for one in seen.heard)
         heard = f"{len(seen.heard)} {'process' if len(seen.heard) == 1 else 'processes'}"
-        yield Finding("multicast", "ok", f"{heard} heard at {where}, {here} of them on this host")
+        yield Finding(
+            "multicast", "ok", f"{heard} heard at {where}, {here} of them here, {len(seen.heard) - here} elsewhere"
+        )
 
 
 def _called(seen: Evidence) -> Iterator[Finding]:
@@ -308,15 +317,17 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
 
 
 def _hosts(seen: Evidence) -> Iterator[Finding]:
-    """What their load reports say of them."""
+    """What they say of themselves."""
     reports = {name: host.load for name, host in sorted(seen.hosts.items()) if host.load is not None}
     own = seen.certificates.name if seen.certificates is not None and seen.certificates.soon(seen.at) else ""
     for name, report in reports.items():
         if report.renew and name != own:
             yield _ends_soon(name, report.certificate_ends_in or 0.0)
+    told = {state.host: state.version for state in seen.devices.values()}
+    told |= {} if seen.state is None else {seen.state.host: seen.state.version}
     versions = defaultdict[str, list[str]](list)
-    for name, report in reports.items():
-        versions[report.version or "older than 0.2.0"].append(name)
+    for name, version in sorted((told | {name: report.version for name, report in reports.items()}).items()):
+        versions[version or "older than 0.2.0"].append(name)
     if len(versions) > 1:
         mixture = ", ".join(f"{version} ({_listed(names)})" for version, names in sorted(versions.items()))
         yield Finding("versions", "note", f"several run: {mixture}", "upgrade what is old, and use new settings then")
