@@ -301,8 +301,11 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
         stand_by = {*view.duplicates, view.host} if view is not None and view.duplicates else set[str]()
         if len(at := sorted(offered[rc] | stand_by)) > 1:
             meant = f", and {view.host} is meant" if view is not None and view.host else ""
-            remedy = "remove its [[rc]] table from all node files but one"
-            yield Finding("devices", "mend", f"{rc} is offered by {_listed(at)}{meant}", remedy)
+            remedy = "unless the others are substitutes, remove it from their node files"
+            yield Finding("devices", "note", f"{rc} is offered by {_listed(at)}{meant}", remedy)
+        for host in view.unseen if view is not None else ():
+            remedy = "is it up, is the network cut in two? If it has the device no more, it is forgotten after a day"
+            yield Finding("devices", "mend", f"{rc}: its other host {host} is not seen", remedy)
     for home, rcs in sorted(missing.items()):
         there = home in seen.hosts and seen.hosts[home].has(Role.NODE)
         remedy = f"see the log of zscout-node at {home}: has its file these [[rc]] tables?"
