@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from zscout.types import VERSION
+
+__version__ = VERSION
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.arc import Held, Revoked, hold, holds

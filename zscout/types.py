@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import Final, Literal, NamedTuple, TypeAlias
 
+VERSION: Final = "0.2.0"
+"""This zscout's own; pyproject.toml has it as well."""
 ArcId: TypeAlias = str
 """Identifies one request for as long as it lives; unique in the fleet. On the mesh `<host>/<client>/<id>`, of
 which the client chooses the id."""

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 PREFIX: Final = "zc"
 NOWHERE: Final = "02:00:00:00:ff:ff"
@@ -52,6 +52,13 @@ def end_on_signals() -> None:
 def ip(*words: str) -> str:
     done = subprocess.run(["ip", *words], capture_output=True, text=True, check=True, timeout=COMMAND_TIMEOUT)
     return done.stdout
+
+
+class Spaces(Protocol):
+    """Where hosts are."""
+
+    def space(self, host: str) -> str:
+        """The namespace of a host."""
 
 
 class Net:
@@ -137,10 +144,12 @@ class Net:
         self.cuts = {way for way in self.cuts if way[0] != host}
 
     def close(self) -> None:
-        _remove(self.mark)
+        remove(self.mark)
 
 
-def _remove(mark: str) -> None:
+def remove(mark: str) -> None:
+    """All namespaces, links and the bridge that bear this mark."""
+
     def run(*words: str) -> str:
         command = ["ip", *words]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMMAND_TIMEOUT).stdout
@@ -161,7 +170,7 @@ def remove_leftovers() -> None:
         mark = space.split("-")[0]
         number = mark.removeprefix(PREFIX)
         if mark.startswith(PREFIX) and number.isdigit() and not Path(f"/proc/{number}").exists():
-            _remove(mark)
+            remove(mark)
 
 
 class Links:
@@ -211,7 +220,7 @@ def _dies_with_its_parent() -> None:
 class Processes:
     """One process for each host, in its namespace; its output goes to `<host>.log` of the folder."""
 
-    def __init__(self, net: Net, folder: Path) -> None:
+    def __init__(self, net: Spaces, folder: Path) -> None:
         self._net, self._folder = net, folder
         self._commands: dict[str, list[str]] = {}
         self.running: dict[str, subprocess.Popen[bytes]] = {}

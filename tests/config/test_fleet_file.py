@@ -127,8 +127,8 @@ BAD_FLEETS = {
     "[placement]\ngain = 0": "placement.gain: is 0; write a number from 0.05 to 100",
     '[placement]\nrebalance = "yes"': 'placement.rebalance: is the text "yes"; write true or false',
     # Sites
-    '[mesh]\nrelay = ["a"]': 'mesh.relay: joins a to nothing; name the sites, as in ["north", "south"]',
-    '[mesh]\nsite = "a"\nrelay = ["a", "b"]': "mesh.site: a relay is of none of its sites; remove site, or relay",
+    '[mesh]\nrelay = ["a", "b"]': "mesh.relay: unknown key; known here: connect, interface, lease, listen, multicast, "
+    "multicast_address, site",
     '[mesh]\nsite = "a b"': f'mesh.site: "a b" is not a name; {NAME_RULE}',
     # Security
     "[security]": "security.folder: is missing; add it",

@@ -35,6 +35,8 @@ BAD_NODES = {
     ),
     f"[node]\nlabels = {['a'] * 33}": "node.labels: has 33 entries; at most 32 are allowed",
     "[mesh]\nlease = 1": "mesh.lease: unknown key; known here: connect, interface, listen, relay, site",
+    '[mesh]\nrelay = ["a"]': 'mesh.relay: joins a to nothing; name the sites, as in ["north", "south"]',
+    '[mesh]\nsite = "a"\nrelay = ["a", "b"]': "mesh.site: a relay is of none of its sites; remove site, or relay",
     '[mesh]\nconnect = ["anvil"]': f'mesh.connect[0]: "anvil" is not an endpoint; {ENDPOINT_RULE}',
     '[mesh]\ninterface = "a b"': 'mesh.interface: "a b" names no interface; write "auto", or as in "eth0"',
     '[rc]\nname = "robot/a"': "rc: is a table; write tables, each under [[rc]]",
@@ -123,6 +125,14 @@ def test_every_key_of_a_node_file() -> None:
         CapacityRc(name="radio/rf0", capacity={"command_rate": Decimal(10), "share": Decimal("0.1")}),
     )
     assert made.recorder == RecorderConfig(Path("hosts/tapes"), "0.0.0.0", 1234)  # noqa: S104
+
+
+def test_a_relay_is_of_no_site_though_the_fleet_file_names_one(tmp_path: Path) -> None:
+    (tmp_path / "fleet.toml").write_text('[mesh]\nsite = "north"\n')
+    path = tmp_path / "relay.toml"
+    path.write_text('[node]\nfleet = "fleet.toml"\n[mesh]\nrelay = ["north", "south"]\n')
+    mesh = load_node(path).fleet.mesh
+    assert (mesh.site, mesh.relay) == (None, ("north", "south"))
 
 
 def test_an_empty_node_file_means_the_defaults() -> None:

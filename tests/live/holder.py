@@ -1,25 +1,35 @@
 """A client process for live tests: asks for ARCs, holds or waits, and can be killed or frozen.
 
-    python -m tests.live.holder NAME        (the fleet is the one that ZSCOUT_FLEET names)
+    python -m tests.live.holder NAME [HOST]     (the fleet is the one that ZSCOUT_FLEET names)
 
 Orders come as JSON lines on stdin, what happens goes out as JSON lines on stdout, with `at` in ns of this host's clock.
 Orders: {"order": "ask", "arc", "needs", "priority", "min_runtime", "keep"}, {"order": "command", "rc", "do", "ttl"}
-under the last grant of this process, {"order": "end"}. It ends when its stdin does.
+under the last grant of this process, {"order": "work", "rcs"}: commands these RCs all the time, until one refuses it
+("disturbed"); {"order": "beats"}: how often they have obeyed since it was asked last; {"order": "state"}: the RCM's;
+{"order": "time", "rc"}: how long it takes from a request to the confirmed grant; {"order": "end"}. It ends when its
+stdin does.
 """
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import sys
 from collections.abc import Iterable
 from typing import Any
+
+import msgspec
 
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Mesh, clock
 from zscout.types import Grant
+
+HOST = sys.argv[2] if len(sys.argv) > 2 else None
+BEAT = 0.02
+"""Seconds between two commands of a program at work."""
 
 
 def say(event: str, **details: Any) -> None:
@@ -49,6 +59,7 @@ class Holder:
         self.arc: OpenArc | None = None
         self.grant: Grant | None = None
         self.tasks: set[asyncio.Task[None]] = set()
+        self.beats = 0
         client.watch(self._told)
 
     def _told(self, arc: OpenArc) -> None:
@@ -61,6 +72,15 @@ class Holder:
                 await self._ask(**order)
             case "command":
                 await self._command(**order)
+            case "work":
+                await self._work(**order)
+            case "beats":
+                say("beats", beats=self.beats)
+                self.beats = 0
+            case "state":
+                say("state", state=msgspec.to_builtins(await self.client.state(timeout=0.5)))
+            case "time":
+                await self._time(**order)
             case "end" if self.arc is not None:
                 await self.client.end(self.arc)
                 say("given_up")
@@ -95,6 +115,27 @@ class Holder:
         else:
             say("command", code="done", result=done.result)
 
+    async def _work(self, rcs: list[str]) -> None:
+        assert self.arc is not None
+        grant, commands = self.grant, itertools.cycle(rcs)
+        assert grant is not None
+        while self.arc.grant == grant:
+            try:
+                await self.client.command(next(commands), grant, {"name": "echo", "value": 1}, ttl=5)
+            except CommandRefused as refused:
+                say("disturbed", code=refused.code, reason=str(refused))
+                return
+            self.beats += 1
+            await asyncio.sleep(BEAT)
+
+    async def _time(self, rc: str) -> None:
+        began = clock.now()
+        asked = await self.client.request("timed", {rc: {}}, min_runtime=600)
+        await self.client.granted(asked)
+        took = clock.now() - began
+        await self.client.end(asked)
+        say("timed", took=took)
+
     def start(self, line: bytes) -> None:
         task = asyncio.get_running_loop().create_task(self.obey(json.loads(line)))
         self.tasks.add(task)
@@ -105,7 +146,7 @@ async def main() -> None:
     loop = asyncio.get_running_loop()
     orders = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(orders), sys.stdin)
-    async with await Client.connect(sys.argv[1], host="test") as client:
+    async with await Client.connect(sys.argv[1], host=HOST) as client:
         holder = Holder(client)
         say("up")
         while line := await orders.readline():

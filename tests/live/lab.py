@@ -68,6 +68,8 @@ class Lab:
         )
         self.fleet: Fleet = load_fleet(self.fleet_file)
         self.env = os.environ | {"ZSCOUT_FLEET": str(self.fleet_file), "XDG_STATE_HOME": str(folder / "state")}
+        self.cwd: Path | None = None
+        """Of what is started. `python -m` looks there first."""
 
     def node(self, host: str, *rcs: str, extra: str = "") -> subprocess.Popen[bytes]:
         """Starts a node. `rcs` are names, or `name:param=bound` for a sharable one with a capacity."""
@@ -87,7 +89,7 @@ class Lab:
         out: Any = subprocess.DEVNULL
         if log is not None:
             out = (self.folder / log).open("ab")
-        process = subprocess.Popen(list(command), env=self.env, stdout=out, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(list(command), env=self.env, cwd=self.cwd, stdout=out, stderr=subprocess.STDOUT)
         if log is not None:
             out.close()
         self.others.append(process)
@@ -146,7 +148,9 @@ class Lab:
                 "-m",
                 "tests.live.holder",
                 name,
+                "test",
                 env=self.env,
+                cwd=self.cwd,
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=log,

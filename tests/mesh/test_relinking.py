@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from msgspec.structs import replace
 
 from tests.mesh.kit import WITHIN, until
 from zscout.config.fleet import MeshConfig
@@ -49,17 +50,34 @@ class _World:
         port = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         port.bind(("127.0.0.1", 0))  # held, so that no other test on this machine is given its number
         address = f"224.0.0.224:{port.getsockname()[1]}"
-        self._config = MeshConfig(multicast_address=address, interface="lo", lease=0.5)
+        self._config = MeshConfig(multicast_address=address, interface="lo", lease=0.5, site="a")
         self._peers: list[ZenohTransport] = []
         self._connect: list[str] = []
 
-    async def peer(self, *, relinks: bool = False, makes_links: bool = False, known: bool = True) -> ZenohTransport:
-        settings = zenoh_config(self._config)
+    def relay(self) -> tuple[ZenohTransport, str]:
+        """One, and where it listens."""
+        settings = zenoh_config(replace(self._config, site=None, relay=("a", "b"), listen=("tcp/127.0.0.1:0",)))
+        relay = ZenohTransport(zenoh.open(settings))
+        self._stack.push_async_callback(relay.close)
+        with zenoh.scout(what="router", config=settings) as scout:
+            return relay, next(hello.locators[0] for hello in scout if str(hello.zid) == relay.id())
+
+    async def peer(
+        self,
+        *,
+        relinks: bool = False,
+        makes_links: bool = False,
+        known: bool = True,
+        answers: bool = True,
+        connect: Sequence[str] = (),
+    ) -> ZenohTransport:
+        """`answers`: by multicast, as all do."""
+        settings = zenoh_config(replace(self._config, multicast=answers))
         # Of two that are told of one another the one with the greater id makes the link.
         settings.insert_json5("id", f'"{"f" if makes_links else "1"}{len(self._peers)}"')
         settings.insert_json5("scouting/multicast/autoconnect", '{"peer": []}')
         if self._connect and known:
-            settings.insert_json5("connect/endpoints", str(self._connect))
+            settings.insert_json5("connect/endpoints", str([*self._connect, *connect]))
         session = zenoh.open(settings)
         if not self._connect:
             with zenoh.scout(what="peer", config=settings) as scout:
@@ -144,5 +162,61 @@ def test_whoever_ends_is_not_looked_for() -> None:
             for one in (first, here):
                 assert one._relinking is not None
                 await until(lambda relinking=one._relinking: relinking._thread is None)  # type: ignore[misc]
+
+    asyncio.run(story())
+
+
+def test_who_listens_and_is_not_found_is_asked_once_whether_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each connection that is closed unused keeps others from a TLS listener for a while."""
+    looked: list[object] = []
+
+    def listens(addresses: Sequence[str]) -> bool:
+        looked.append(addresses)
+        return True
+
+    monkeypatch.setattr(relinking, "_listens", listens)
+    monkeypatch.setattr(relinking, "PAUSES", (0.01,) * 5)
+    monkeypatch.setattr(relinking, "SCOUT_TIMEOUT", 0.05)
+
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            world = _World(stack)
+            await world.peer()
+            here = await world.peer(relinks=True, makes_links=True)
+            there = (await world.peer(answers=False)).id()
+            _cut(_ends(here, there))
+            assert here._relinking is not None
+            await until(lambda: looked)
+            await until(lambda: here._relinking._thread is None)  # type: ignore[union-attr]
+            assert len(looked) == 1
+
+    asyncio.run(story())
+
+
+def test_a_relay_is_not_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answers nobody who looks for peers."""
+    looked: list[str] = []
+
+    def listens(addresses: Sequence[str]) -> bool:
+        looked.extend(addresses)
+        return True
+
+    monkeypatch.setattr(relinking, "_listens", listens)
+
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            world = _World(stack)
+            await world.peer()
+            relay, address = world.relay()
+            here = await world.peer(relinks=True, makes_links=True, connect=[address])
+            there = (await world.peer()).id()
+            before = _ends(here, there)
+            await until(lambda: _ends(here, relay.id()))
+            await relay.close()
+            await until(lambda: not _ends(here, relay.id()))
+            _cut(before)
+            await until(lambda: _ends(here, there) - before)
+            assert looked
+            assert address not in looked
 
     asyncio.run(story())

@@ -57,6 +57,7 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "multicast_address": Key('"224.0.0.224:7446"', ('"239.1.2.3:99"',), ('"10.0.0.1:7446"', '"224.0.0.224"', "1")),
         "interface": Key('"auto"', ('"eth0,lo"',), ('""', '"eth 0"', "0")),
         "lease": _number("1.0", "0.2", "2.5", "0.1", "31"),
+        "site": Key(None, ('"north"',), NAMES),
     },
     "limits": {
         "max_queued": _number("10_000", "1", "1_000_000", "0", "1_000_001"),
@@ -98,6 +99,8 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
         "listen": Key(None, ('["tcp/0.0.0.0:7447"]',), ('["tcp/7447"]',)),
         "connect": Key(None, ('["tcp/anvil:7447"]',), ('["tcp/a:0"]',)),
         "interface": Key(None, ('"eth0"',), ('""',)),
+        "site": Key(None, ('"north"',), NAMES),
+        "relay": Key(None, ('["north", "south"]',), ('["north"]', '["a/b", "c"]', '["a", "a"]', '"north"')),
     },
     "recorder": {
         "path": Key('"runs"', ('"elsewhere"', '"/var/runs"'), ('""', "1")),

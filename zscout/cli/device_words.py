@@ -1,11 +1,16 @@
-"""What is to be said of a device, in words."""
+"""What is to be said of a device, or of a certificate, in words."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from zscout.messages import RcView
-from zscout.terminal import clock
+from zscout.terminal import clock, span
+
+
+def ending(name: str, left: float) -> str:
+    """That the certificate of this machine or person ends in so many seconds."""
+    return f"the certificate of {name} " + (f"ends in {span(left)}" if left > 0 else f"has ended {span(-left)} ago")
 
 
 def absence(view: RcView) -> str:

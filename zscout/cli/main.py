@@ -41,6 +41,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "drain": ("components.moves", "Empty a host of components, and place none there any more."),
     "uncordon": ("components.moves", "Use a drained host again."),
     "keys": ("fleet.keys", "List what is alive on the mesh, and the keys it serves."),
+    "doctor": ("fleet.doctor", "Find out why there is no link, no leader or no device."),
     "cert": ("fleet.cert", "Make, renew and show the certificates of a secured fleet."),
     "view": ("fleet.view", "Watch the fleet live on a timeline, or open a recording."),
     "replay": ("lab.replay", "Schedule a workload file under virtual time."),

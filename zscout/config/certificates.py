@@ -7,6 +7,7 @@ there and looked at here, so that what is expired can be told as such, and shown
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -135,7 +136,7 @@ def read_certificates(folder: Path) -> Certificates:
         raise cert.bad(f"is not fit for this: {error.verify_message}", _MAKE) from None
     except ssl.SSLError as error:
         raise cert.bad(f"can't be used: {error.reason or error}", _MAKE) from None
-    own, issuer = _validity(told, cert), _common_name(told["issuer"])
+    own, issuer = validity(told, cert), common_name(told["issuer"])
     check_name(own.name, cert)
     last = max((one.ends for one in cas if one.name == issuer), default=own.ends)
     return Certificates(own.name, own.begins, min(own.ends, last), folder, issuer, tuple(one.name for one in cas))
@@ -164,7 +165,7 @@ def read_cas(path: Path) -> list[Validity]:
     where = Where(str(path))
     if count["x509"] != count["x509_ca"]:
         raise where.bad("holds a certificate that is no CA's", f"copy {CA} from the folder of the CA")
-    return [_validity(one, where) for one in store.get_ca_certs()]
+    return [validity(one, where) for one in store.get_ca_certs()]
 
 
 def check_mode(path: Path, forbidden: int, remedy: str) -> None:
@@ -219,7 +220,8 @@ def _shake_hands(client: ssl.SSLContext, server: ssl.SSLContext, trusted: str) -
     return ends[1].getpeercert() or {}
 
 
-def _validity(told: dict[str, Any], where: Where) -> Validity:
+def validity(told: Mapping[str, Any], where: Where) -> Validity:
+    """What a certificate says that `ssl` has read. Raises BadInput."""
     from ssl import cert_time_to_seconds
 
     try:
@@ -228,9 +230,9 @@ def _validity(told: dict[str, Any], where: Where) -> Validity:
         )
     except (KeyError, ValueError, OverflowError):
         raise where.bad("has times that can't be read", _MAKE) from None
-    return Validity(_common_name(told["subject"]), begins, ends)
+    return Validity(common_name(told["subject"]), begins, ends)
 
 
-def _common_name(name: tuple[tuple[tuple[str, str], ...], ...]) -> str:
+def common_name(name: tuple[tuple[tuple[str, str], ...], ...]) -> str:
     """All of them where there are several: a text that is no name."""
     return ", ".join(value for part in name for key, value in part if key == "commonName")

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
 from zscout.config.access import MAX_NAMES, AccessPolicy, Ceiling, Names, Quota, Roles, check_access
 from zscout.config.scheduling_policy import DEFAULT, PATIENCE, Preempt, Promise, SchedulingPolicy, StrategyName
@@ -53,8 +53,8 @@ Sites = Annotated[tuple[str, ...], Meta(max_length=MAX_SITES)]
 Endpoints = Annotated[tuple[str, ...], Meta(max_length=MAX_ENDPOINTS)]
 
 
-class MeshConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [mesh]: how a host joins the mesh."""
+class MeshTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [mesh]: how a host, and each program on it, joins the mesh."""
 
     listen: Annotated[Endpoints, key("Endpoints of this host; none: a free port.", example=["tcp/0.0.0.0:7447"])] = ()
     connect: Annotated[Endpoints, key("Endpoints of hosts to be connected to always.", example=["tcp/anvil:7447"])] = ()
@@ -63,12 +63,15 @@ class MeshConfig(Struct, frozen=True, forbid_unknown_fields=True):
     interface: Annotated[str, key("Network interfaces for multicast.", example="eth0")] = "auto"
     lease: Annotated[float, key("A host that was silent for this long is gone.", 0.2, 30, unit="s")] = 1.0
     site: Annotated[
-        str | None, key("The site of this host, where relays join several to one fleet.", example="north")
+        str | None, key("The site of this host, where a relay joins several to one fleet.", example="north")
     ] = None
-    relay: Annotated[
-        tuple[str, ...],
-        key("Makes this host the relay between these sites.", most=MAX_SITES, example=["north", "south"]),
-    ] = ()
+
+
+class MeshConfig(MeshTable, frozen=True):
+    """How one process joins the mesh."""
+
+    relay: Sites = ()
+    """It joins these sites: a node's only, not that of a program on the same host."""
 
 
 class SecurityTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -196,7 +199,7 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
     """A fleet file."""
 
     fleet: FleetTable = FleetTable()
-    mesh: MeshConfig = MeshConfig()
+    mesh: MeshTable = MeshTable()
     limits: RcmLimits = RcmLimits()
     timing: Timing = Timing()
     placement: PlacementPolicy = DEFAULT_PLACEMENT
@@ -243,7 +246,7 @@ def fleet_from_env() -> Fleet:
 
 
 def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
-    table, mesh, at = file.fleet, file.mesh, top / "fleet"
+    table, mesh, at = file.fleet, MeshConfig(**structs.asdict(file.mesh)), top / "fleet"
     check_name(table.name, at / "name")
     check_names(table.candidates, at / "candidates")
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")

@@ -125,7 +125,7 @@ class NodeMeshTable(Struct, frozen=True, forbid_unknown_fields=True):
     interface: Annotated[str | None, key("Network interface for multicast.", example="eth0")] = None
     site: Annotated[str | None, key("The site of this host.", example="north")] = None
     relay: Annotated[
-        Sites | None, key("Makes this host the relay between these sites.", example=["north", "south"])
+        Sites | None, key("Makes this node the relay between these sites.", example=["north", "south"])
     ] = None
 
 
@@ -158,6 +158,8 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     host = file.node.host if file.node.host is not None else valid_name(socket.gethostname())
     check_name(host, top / "node" / "host")
     own = {name: value for name, value in structs.asdict(file.mesh).items() if value is not None}
+    if file.mesh.relay and file.mesh.site is None:
+        own["site"] = None  # that of the fleet file is the site of those who do not relay
     mesh = structs.replace(fleet.mesh, **own)
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_sites(mesh, top / "mesh")

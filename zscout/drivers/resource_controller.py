@@ -27,7 +27,7 @@ from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Superv
 from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.terms import LastTerms
-from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
+from zscout.types import NO_TERM, SECOND, VERSION, Grant, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -343,6 +343,7 @@ class ResourceController:
             leaving=leaving,
             settle=self._settle / SECOND,
             parameters=None if leaving else self.driver.parameters(),
+            version=VERSION,
         )
 
     def _figures(self) -> messages.Figures:

@@ -4,7 +4,8 @@ Of two peers the one with the greater id makes their link: that is who joins, as
 differ. Zenoh looks for peers by multicast, once it has run for a while every 8 s: for so long two processes that live
 may be without a link after a fault of a moment. But peers that are linked to a third are told of one another by it
 (gossip), and link. So who had made a link sees whether the other listens still, asks by multicast for both addresses,
-and opens a session that links to these two until they have found each other (docs/zenoh.md)."""
+and opens a session that links to these two until they have found each other (docs/zenoh.md). A relay is a router, which
+answers nobody who looks for peers: `connect` names it."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 from zenoh.handlers import Callback
@@ -49,6 +50,9 @@ class _Lost:
     addresses: list[str] = field(default_factory=list)
     """Of the other ends of its links: where it listens, if they were made from here."""
     looks: int = 0
+    listens: bool | None = None
+    """Once it is known to, it is not asked again: each connection that a TLS listener sees closed unused keeps others
+    out for 0.1 s (docs/zenoh.md), and one that was frozen sees them all when it goes on."""
     together: bool = False
     """Whether it is looked for though it is it that makes the link."""
 
@@ -66,10 +70,15 @@ class Relinking:
         self._own = str(session.zid())
         self._lock = threading.Lock()
         self._lost: dict[str, _Lost] = {}
+        self._routers: set[str] = set()
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
         callback: Callback[zenoh.LinkEvent] = Callback(self._on_link, lambda: None, indirect=False)
-        self._listener = session.info.declare_link_events_listener(callback)
+        seen: Callback[zenoh.TransportEvent] = Callback(self._on_transport, lambda: None, indirect=False)
+        self._listeners: list[Any] = [
+            session.info.declare_transport_events_listener(seen, history=True),
+            session.info.declare_link_events_listener(callback),
+        ]
         alone = not self._linked()
         with self._lock:
             if alone and self._thread is None:  # a link may have come and gone already
@@ -79,18 +88,27 @@ class Relinking:
         """Before the session is closed. Returns when the thread has ended, in a second or two: one that is inside Zenoh
         when its process ends makes that a crash."""
         self._closed.set()
-        with suppress(zenoh.ZError):
-            self._listener.undeclare()  # type: ignore[no-untyped-call]
+        for listener in self._listeners:
+            with suppress(zenoh.ZError):
+                listener.undeclare()
         with self._lock:
             thread = self._thread
         if thread is not None:
             thread.join()
+
+    def _on_transport(self, event: zenoh.TransportEvent) -> None:
+        if event.kind == zenoh.SampleKind.PUT and event.transport.whatami == zenoh.WhatAmI.ROUTER:
+            with self._lock:
+                self._routers.add(str(event.transport.zid))
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         now, peer = time.monotonic(), str(event.link.zid)
         with self._lock:
             if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(MEETING):
                 self._lost.pop(peer, None)
+                return
+            if peer in self._routers:
+                self._routers.remove(peer)
                 return
             self._lost.setdefault(peer, _Lost(now)).addresses.append(event.link.dst)
             lately = [one for one in self._lost.values() if now - one.at < TOGETHER]
@@ -146,10 +164,10 @@ class Relinking:
             if time.monotonic() > until or self._closed.is_set():
                 break
             one.looks += 1
-            listens = _listens(one.addresses)
-            if listens or (one.together and one.looks <= LOOKS_FOR_GREATER):
+            one.listens = one.listens or _listens(one.addresses)
+            if one.listens or (one.together and one.looks <= LOOKS_FOR_GREATER):
                 wanted.add(peer)
-            elif listens is False and time.monotonic() - one.at >= TOGETHER:
+            elif one.listens is False and time.monotonic() - one.at >= TOGETHER:
                 # Its process has gone, or it is it that makes the link. Until then another may be lost.
                 one.looks = len(PAUSES)
         if wanted and not self._closed.is_set():

@@ -16,6 +16,7 @@ from typing import Any, Self, TypeAlias, TypeVar
 from msgspec import Struct
 
 from zscout import messages
+from zscout.config.certificates import Validity
 from zscout.keyexpr import MAX_NAME, BadName, FleetMember, Keys, Role, Sender, Token
 from zscout.mesh.exchange import (
     QUEUE_DEPTH,
@@ -33,7 +34,7 @@ from zscout.mesh.renewal import RenewableTransport, Suspicions
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.transport import Collector, Quality, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem
-from zscout.types import Ns
+from zscout.types import VERSION, Ns
 
 log = logging.getLogger(__name__)
 
@@ -137,6 +138,9 @@ class Mesh:
     """One process's place on the mesh, an async context manager: typed queries, publications, liveliness, and a clock.
 
     Declare once per purpose, never per request: Zenoh keeps memory for every key that was ever declared."""
+
+    validity: Validity | None = None
+    """Of this process's certificate as it is now; None on a plain mesh."""
 
     def __init__(self, transport: RenewableTransport, keys: Keys, me: Sender, now: Callable[[], Ns]) -> None:
         self.keys, self.me, self.now = keys, me, now
@@ -298,7 +302,7 @@ class Mesh:
             try:
                 message = messages.decode(b"{}" if payload is None else payload, kind, limit)
             except Malformed as error:
-                _refuse(query, "malformed", str(error))
+                _refuse(query, "malformed", str(error), VERSION)
                 return
             incoming: IncomingQuery[Any] = IncomingQuery(query, asked, asked if wild else key, message, arrived)
             try:
@@ -306,7 +310,7 @@ class Mesh:
             except Refused as refused:
                 incoming.refuse(refused.problem)
             except BadName as error:
-                incoming.refuse(Problem("bad_name", str(error)))
+                incoming.refuse(Problem("bad_name", str(error), version=VERSION))
             except Exception:
                 incoming.refuse(Problem("internal", "the request failed here; see this node's log"))
                 raise
@@ -480,5 +484,5 @@ class _Collector(Collector):
             self._over()
 
 
-def _refuse(query: TransportQuery, code: str, message: str) -> None:
-    query.reply_error(messages.encode(Problem(code, message)), Problem)
+def _refuse(query: TransportQuery, code: str, message: str, version: str = "") -> None:
+    query.reply_error(messages.encode(Problem(code, message, version=version)), Problem)

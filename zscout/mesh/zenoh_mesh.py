@@ -158,6 +158,7 @@ class ZenohMesh(Mesh):
         mesh = cls(RenewableTransport(await _open(config, security), openings), keys, me, clock.now)
         mesh._door = door
         if security is not None:
+            mesh.validity = security.certificates
             mesh._watching = asyncio.create_task(mesh._watch_certificates(security.certificates))
         return mesh
 
@@ -174,7 +175,7 @@ class ZenohMesh(Mesh):
         while True:
             await asyncio.sleep(LOOK_AT_CERTIFICATES)
             try:
-                reading = _in_thread("reads certificates", functools.partial(read_certificates, known.folder))
+                reading = in_thread("reads certificates", functools.partial(read_certificates, known.folder))
                 fresh = await asyncio.wrap_future(reading)
                 fresh.check(datetime.now(UTC), known.name)
             except BadInput as error:  # they may be half written
@@ -185,7 +186,7 @@ class ZenohMesh(Mesh):
             told = None
             if fresh.ends != known.ends:
                 log.info("%s was renewed: this process joins the mesh anew", fresh.cert)
-                known = fresh
+                known = self.validity = fresh
                 self._transport.renew()
             if (soon := fresh.expires_soon(datetime.now(UTC))) and soon != warned:
                 log.warning("%s", warned := soon)
@@ -215,21 +216,23 @@ def increasing_id() -> str:
 
 
 async def _open(config: MeshConfig, security: Security | None) -> Transport:
-    opening = _in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config, security)))
+    opening = in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config, security)))
     try:
         session = await asyncio.wrap_future(opening)
     except asyncio.CancelledError:
         # In a thread of its own: this may be the event loop's.
         opening.add_done_callback(
-            lambda opened: opened.exception() or _in_thread("closes the mesh", opened.result().close)
+            lambda opened: opened.exception() or in_thread("closes the mesh", opened.result().close)
         )
         raise
     except zenoh.ZError as error:
         raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
     try:
-        return ZenohTransport(session, _relinking(session, config, security) if config.multicast else None)
+        # A relay leaves it to its sites, which know where it is.
+        relinks = config.multicast and not config.relay
+        return ZenohTransport(session, _relinking(session, config, security) if relinks else None)
     except BaseException:
-        _in_thread("closes the mesh", session.close)
+        in_thread("closes the mesh", session.close)
         raise
 
 
@@ -243,7 +246,7 @@ def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | 
     return Relinking(session, zenoh_config(config, security), meeting)
 
 
-def _in_thread(name: str, call: Callable[[], T]) -> Future[T]:
+def in_thread(name: str, call: Callable[[], T]) -> Future[T]:
     """Calls in a daemon thread: one of asyncio's own would be joined when the loop ends, however long it takes."""
     future: Future[T] = Future()
     future.set_running_or_notify_cancel()
@@ -269,7 +272,8 @@ class ZenohTransport(Transport):
         return str(self._session.info.zid())
 
     def peers(self) -> list[str]:
-        return [one for peer in self._session.info.peers_zid() if not (one := str(peer)).startswith(MEETING)]
+        linked = (*self._session.info.peers_zid(), *self._session.info.routers_zid())
+        return [one for peer in linked if not (one := str(peer)).startswith(MEETING)]
 
     def links(self) -> int:
         return len(self._session.info.links())
@@ -280,7 +284,7 @@ class ZenohTransport(Transport):
                 self._relinking.close()
             self._session.close()  # type: ignore[no-untyped-call]
 
-        closing = _in_thread("closes the mesh", close)
+        closing = in_thread("closes the mesh", close)
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.wrap_future(closing)

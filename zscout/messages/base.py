@@ -49,6 +49,8 @@ Elapsed: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 """Likewise, of the past."""
 ShortText: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=130)]
 """A name, or `kind/name`."""
+VersionText: TypeAlias = Annotated[str, msgspec.Meta(max_length=64)]
+"""What `zscout --version` prints where it is from; empty: it is older than versions that tell theirs."""
 Figure: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 Bytes: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=1 << 60)]
 
@@ -65,6 +67,8 @@ class Problem(Message, frozen=True):
     message: str
     term: Term | None = None
     left: Seconds | None = None
+    version: VersionText = ""
+    """Of who did not understand what was asked."""
 
 
 T = TypeVar("T")

@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeAlias
 
 from msgspec import Meta
 
-from zscout.messages.base import Amounts, Elapsed, Message, Seconds
+from zscout.messages.base import Amounts, Elapsed, Message, Seconds, VersionText
 from zscout.messages.scheduling import Holder, Parameters
 from zscout.types import NO_TERM, Grant, Term
 
@@ -111,6 +111,7 @@ class RcState(Message, frozen=True):
     """Seconds that it settles at most after `leaving`; absent: it does not know how to settle."""
     parameters: Parameters | None = None
     """All bandwidth parameters that it knows; None: it does not say."""
+    version: VersionText = ""
 
 
 class FrameHead(Message, frozen=True):

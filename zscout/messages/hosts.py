@@ -6,7 +6,17 @@ from typing import Annotated
 
 import msgspec
 
-from zscout.messages.base import MAX_COUNTER, MAX_INCARNATION, Bytes, Elapsed, Figure, Message, ShortText
+from zscout.messages.base import (
+    MAX_COUNTER,
+    MAX_INCARNATION,
+    Bytes,
+    Elapsed,
+    Figure,
+    Message,
+    Seconds,
+    ShortText,
+    VersionText,
+)
 from zscout.types import Metric, Policy
 
 MAX_RANKED = 256
@@ -34,7 +44,8 @@ class LoadReport(Message, frozen=True):
     """A host's load. `number` counts one reporter's reports; memory in bytes, `cpu` in percent of all.
 
     `speed` is how fast one core does a fixed piece of work (`docs/protocol.md`), 1.0 in a millisecond;
-    clocks in MHz, 0 if unknown; `temperature` in degrees Celsius."""
+    clocks in MHz, 0 if unknown; `temperature` in degrees Celsius. `certificate_ends_in`: seconds until its node's ends,
+    negative since; `renew`: so near that people are to be told."""
 
     host: str
     number: int
@@ -49,6 +60,10 @@ class LoadReport(Message, frozen=True):
     temperature: float | None = None
     labels: Annotated[tuple[ShortText, ...], msgspec.Meta(max_length=MAX_LABELS)] = ()
     components: Annotated[tuple[ComponentUse, ...], msgspec.Meta(max_length=MAX_COMPONENTS)] = ()
+    certificate_ends_in: Seconds | None = None
+    renew: bool = False
+    version: VersionText = ""
+    """Of the node."""
 
 
 class RankAsk(Message, frozen=True):

@@ -7,7 +7,7 @@ from typing import Annotated, TypeAlias
 
 import msgspec
 
-from zscout.messages.base import NAMES_ONCE, Amounts, Elapsed, Message, Seconds, State
+from zscout.messages.base import NAMES_ONCE, Amounts, Elapsed, Message, Seconds, State, VersionText
 from zscout.types import NO_TERM, Grant, Place, Term
 
 DOOR_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
@@ -362,6 +362,7 @@ class RcmState(Message, frozen=True):
     story: list[StoryLine] = []
     more: int = 0
     instances: dict[str, tuple[str, str]] = {}
+    version: VersionText = ""
 
 
 class OpenRequest(_Wanted, frozen=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Self
 
 from zscout.behaviors.client.placer_client import PlacerClient
@@ -109,6 +110,13 @@ class FleetView:
         if not host.has(Role.LOAD) or (host.load is None and not self._settled):
             return False
         return host.load is None or self.mesh.now() - host.reported > STALE
+
+    def ending(self) -> dict[str, float]:
+        """Whose certificate ends soon, or has ended: this command's, and those of hosts; in how many seconds."""
+        own, now = self.mesh.validity, datetime.now(UTC)
+        found = {own.name: own.ends_in(now)} if own is not None and own.soon(now) else {}
+        told = {name: host.load for name, host in self.hosts.items() if host.load is not None and host.load.renew}
+        return {name: load.certificate_ends_in or 0.0 for name, load in sorted(told.items())} | found
 
     async def quiet(self) -> None:
         """Returns when no host has come into sight for a while: links are made one after another."""

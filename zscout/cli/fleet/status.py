@@ -12,11 +12,12 @@ import click
 from msgspec import structs
 
 from zscout.cli import common, completion
-from zscout.cli.device_words import remarks
+from zscout.cli.device_words import ending, remarks
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.selection import Selection
 from zscout.cli.fleet.watching import Overview, show
 from zscout.cli.requests.waiting import reason_text, whose
+from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
 from zscout.messages import HoldView, Notice, RcmState, RcView, WaitView
 from zscout.terminal import Table, clock, many, span
@@ -104,7 +105,24 @@ class Standing:
             headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
             ranks = {f"{wait.client}/{wait.id}": number for number, wait in enumerate(self.state.queue, 1)}
             tables = [self._rcs(chosen.state), self._running(chosen.state), _waiting(chosen.state, ranks)]
-        return Overview(headline, [*tables, self._hosts(chosen), self._devices(chosen)], alarm=self.state is None)
+        return Overview(
+            headline, [self._warnings(), *tables, self._hosts(chosen), self._devices(chosen)], alarm=self.state is None
+        )
+
+    def _advisory(self) -> bool:
+        """Whether rights are written down that nobody enforces."""
+        fleet = self.fleet_view.client.fleet
+        return fleet.security is None and fleet.access != AccessPolicy()
+
+    def _warnings(self) -> Table:
+        """What is to be said of the fleet itself."""
+        rows = [
+            ("certificate", f"{ending(name, left)}; renew it (zscout cert renew)")
+            for name, left in self.fleet_view.ending().items()
+        ]
+        if self._advisory():
+            rows.append(("roles", "they are advisory: nobody proves a name where [security] is not set"))
+        return Table("Warnings", ("ABOUT", "WARNING"), rows, ["yellow"] * len(rows))
 
     def _homes(self) -> dict[str, str]:
         """By RC: the host of the instance that is meant; of an RCM that does not say, one that offers it."""
@@ -180,7 +198,8 @@ class Standing:
         return Table("Devices", ("RC", "HEALTH", "FIGURES"), rows, styles)
 
     def as_object(self) -> dict[str, Any]:
-        """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none."""
+        """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none. `advisory`: rights
+        are written down that nobody enforces; `ending`: whose certificate ends soon."""
         chosen = self.selection()
         state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
@@ -202,6 +221,8 @@ class Standing:
         return {
             "fleet": self.fleet_view.client.fleet.name,
             "links": self.fleet_view.mesh.links(),
+            "advisory": self._advisory(),
+            "ending": [{"name": name, "ends_in": left} for name, left in self.fleet_view.ending().items()],
             "rcm": None if state is None else {"host": state.host, "term": state.term, "seq": state.seq},
             "rcs": list(map(rc_object, views)),
             "holds": list(map(structs.asdict, holds)),

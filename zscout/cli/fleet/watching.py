@@ -26,7 +26,7 @@ HASTE: Final = 0.1
 MAX_ROWS: Final = 500
 """Of one table at a terminal."""
 PASSING: Final = frozenset(
-    {"held", "remaining", "waited", "starts_in", "yields_in", "seq", "links", "load", "age", "gone"}
+    {"held", "remaining", "waited", "starts_in", "yields_in", "ends_in", "seq", "links", "load", "age", "gone"}
     | {"uptime", "cpu", "memory", "figures"}
 )
 """Fields that change without anything having happened."""

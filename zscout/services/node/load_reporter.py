@@ -6,13 +6,17 @@ import asyncio
 import logging
 import os
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from typing import Final, TypeAlias
+
+from msgspec.structs import replace
 
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Mesh, Supervisor
 from zscout.messages import LoadReport
 from zscout.services.node import host_figures
 from zscout.services.node.process_use import Running, TreeMeter, TreeUse, UseMeter, faded
+from zscout.types import VERSION
 
 log = logging.getLogger("zscout.load")
 
@@ -73,6 +77,13 @@ class LoadReporter:
         self._token.close()
         self._publisher.close()
 
+    def _with_certificate(self, report: LoadReport) -> LoadReport:
+        own, now = self.mesh.validity, datetime.now(UTC)
+        if own is None:
+            return report
+        left = own.ends_in(now)
+        return replace(report, certificate_ends_in=round(left, 1), renew=left <= 0 or own.soon(now))
+
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         due = loop.time() + PERIOD
@@ -92,7 +103,7 @@ class LoadReporter:
                 failed = True
             else:
                 failed = False
-                self._publisher.put(report)
+                self._publisher.put(self._with_certificate(report))
                 self._pause = RESTARTS[0]
 
 
@@ -153,6 +164,7 @@ class Gauge:
             temperature=self._temperatures(),
             labels=self._labels,
             components=self._uses(),
+            version=VERSION,
         )
 
     def _host_load(self, size: float, ram: host_figures.HostMemory) -> LoadFigures:

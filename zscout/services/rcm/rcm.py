@@ -59,7 +59,7 @@ from zscout.services.rcm.places import Places, client_id, request_id
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.services.rcm.registry import REMEMBER, RequestRegistry, reason_info
 from zscout.services.rcm.request_handler import RequestHandler
-from zscout.types import SECOND, ArcId, ClientId, Ns, RcName, Term
+from zscout.types import SECOND, VERSION, ArcId, ClientId, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -377,12 +377,13 @@ class Rcm:
         asked, now = query.message, self.mesh.now()
         if asked.devices_only:
             rcs = self._devices(self.core.status(0), now)
-            query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs))
+            query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs, version=VERSION))
             return
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
         instances = self.membership.named(sorted({rc for hold in holds for rc in hold.needs}))
-        state = messages.RcmState(self.term, self.seq, self.mesh.me.host, holds, instances=instances)
+        me = self.mesh.me.host
+        state = messages.RcmState(self.term, self.seq, me, holds, instances=instances, version=VERSION)
         if not asked.holds_only:
             starts = self.registry.starts() if asked.forecast else {}
             state = replace(

@@ -1,0 +1,303 @@
+"""`zscout doctor` beside real nodes: each cause is told, above what comes of it, by who is shut out as well."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.cli.tools import COMMAND, zscout_soon
+from tests.hang import HANG
+from tests.live.closed import DAY, ClosedLab, make_authority
+from tests.live.lab import Lab
+from tests.live.test_closed_doors import bare, tls
+from zscout.config.certificates import KEYS_VARIABLE, read_cas
+from zscout.keyexpr import Role
+
+pytestmark = pytest.mark.live
+
+
+class Told(NamedTuple):
+    code: int
+    host: str
+    findings: list[dict[str, str]]
+
+    def of(self, about: str) -> list[tuple[str, str]]:
+        return [(one["state"], one["says"]) for one in self.findings if one["about"] == about]
+
+    def mends(self) -> list[str]:
+        return [one["says"] for one in self.findings if one["state"] == "mend"]
+
+
+async def doctor(lab: Lab, *words: object, **env: object) -> Told:
+    done = await zscout_soon("doctor", "--json", *words, env=lab.env | {name: str(one) for name, one in env.items()})
+    assert (done.returncode, done.stderr) in ((0, ""), (1, "")), done
+    told = json.loads(done.stdout)
+    found = Told(done.returncode, told["host"], told["findings"])
+    assert bool(found.code) == bool(found.mends())
+    assert all(one["remedy"] for one in found.findings if one["state"] == "mend")
+    return found
+
+
+async def told_of(lab: Lab, about: str, pattern: str, *words: object, **env: object) -> Told:
+    """Asks until something like this is said: on a busy machine who is called may not answer in time."""
+    told = None
+    try:
+        async with asyncio.timeout(HANG):
+            while True:
+                told = await doctor(lab, *words, **env)
+                if any(re.fullmatch(pattern, says) for _, says in told.of(about)):
+                    return told
+    except TimeoutError:
+        raise AssertionError(f"never said {pattern}: {told}") from None
+
+
+async def shown(lab: ClosedLab, name: str, *hosts: str) -> None:
+    """Waits until these nodes are seen by this person, who leaves then."""
+    client = await lab.person(name)
+    await lab.living(client, Role.LOAD, lambda found: set(found) >= set(hosts))
+    lab.clients.remove(client)
+    await client.close()
+
+
+def plain_file(lab: Lab) -> Path:
+    """The fleet file, as on a host that does not know of certificates."""
+    file = lab.folder / "plain.toml"
+    file.write_text(re.sub(r"\[security\]\nfolder = .*\n", "", lab.fleet_file.read_text()))
+    return file
+
+
+def test_a_fleet_that_is_well_is_told_to_be_and_a_device_on_two_hosts(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=("anvil",), extra='[devices]\nanvil = ["robot/a"]') as lab:
+            lab.node("anvil", "robot/a")
+            client = await lab.client()
+            await lab.ready(client, "robot/a")
+            told = await doctor(lab)
+            assert told.code == 0
+            assert told.of("leader") == [("ok", "anvil leads, term 1")]
+            assert told.of("devices") == [("ok", "1 RC there and well")]
+            assert [state for state, _ in told.of("open")] == ["note"]
+            lab.node("bellows", "robot/a")
+            await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["bellows"]])
+            told = await doctor(lab)
+            assert told.of("devices")[0] == ("note", "robot/a is offered by anvil, bellows, and anvil is meant")
+            lab.nodes["anvil"].terminate()
+            await asyncio.to_thread(lab.nodes["anvil"].wait, HANG)
+            told = await told_of(lab, "leader", "nobody leads: of the candidates anvil none is seen")
+            assert told.code == 1
+
+    asyncio.run(story())
+
+
+def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=("forge",)) as lab:
+            lab.node("anvil", "robot/a")
+            client = await lab.client()
+            await lab.living(client, Role.RC, lambda found: found == ["anvil"])
+            assert (await doctor(lab)).mends() == ["nobody leads: of the candidates forge none is seen"]
+            file = lab.folder / "cart.toml"
+            file.write_text(
+                '[node]\nhost = "cart"\nfleet = "fleet.toml"\n[[rc]]\nname = "robot/c"\ndriver = "exclusive"'
+            )
+            told = await doctor(lab, file)
+            assert told.host == "cart"
+            assert told.mends()[1:] == ["not there: robot/c of cart, which is not seen either"]
+
+    asyncio.run(story())
+
+
+def test_another_name_of_the_fleet_is_told(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a")
+            await lab.ready(await lab.client(), "robot/a")
+            other = lab.folder / "other.toml"
+            other.write_text(lab.fleet_file.read_text().replace(lab.fleet.name, "typo"))
+            others = rf"nobody is seen of fleet typo, and of others: {lab.fleet.name} \(anvil\)"
+            assert (await told_of(lab, "links", others, ZSCOUT_FLEET=other)).code == 1
+
+    asyncio.run(story())
+
+
+def test_a_plain_host_and_a_secured_fleet_are_told_of_each_other(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ClosedLab(tmp_path) as lab:
+            lab.node("anvil", "robot/a")
+            await shown(lab, "ada", "anvil")
+            well = await doctor(lab, ZSCOUT_KEYS=tmp_path / "keys" / "ada")
+            assert (well.code, well.host) == (0, "ada")
+            plain = plain_file(lab)
+            told = await told_of(lab, "security", "anvil takes TLS only, .* have no .security.", ZSCOUT_FLEET=plain)
+            assert told.of("links")[0][0] == "mend"
+
+            cart = lab.folder / "cart.toml"
+            cart.write_text(f'[node]\nhost = "cart"\nfleet = "{plain.name}"')
+            lab.spawn([sys.executable, "-m", "zscout.node", str(cart)], log="cart.log")
+            await lab.logged("cart", "is on the mesh")
+            mixed = f"cart runs fleet {lab.fleet.name} without certificates"
+            told = await told_of(lab, "security", mixed, ZSCOUT_KEYS=tmp_path / "keys" / "ada")
+            assert told.mends() == [mixed]
+            # Each is well by itself.
+            assert told.of("leader")[0][0] == "ok"
+
+    asyncio.run(story())
+
+
+def test_certificates_of_another_ca_are_told_by_both_sides_and_expired_ones(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ClosedLab(tmp_path) as lab:
+            keys, now = tmp_path / "keys", datetime.now(UTC)
+            lab.node("anvil")
+            await shown(lab, "ada", "anvil")
+            (ours,) = (one.name for one in read_cas(keys / "ca" / "ca.pem"))
+            make_authority(tmp_path / "other").issue("bob", tmp_path / "bob", DAY, now)
+            foreign = rf"anvil \(tls/.*\) shows a certificate of {ours}, and ca.pem trusts zscout CA \w+"
+            await told_of(lab, "security", foreign, ZSCOUT_KEYS=tmp_path / "bob")
+            # Who trusts both still is refused.
+            with (tmp_path / "bob" / "ca.pem").open("a") as file:
+                file.write((keys / "ada" / "ca.pem").read_text())
+            refused = r"anvil \(tls/.*\) refuses this certificate: unknown ca"
+            told = await told_of(lab, "security", refused, ZSCOUT_KEYS=tmp_path / "bob")
+            assert told.of("links") == [("mend", "no link to anybody")]
+
+            lab.authority.issue("eve", keys / "late", timedelta(seconds=1), now - DAY)
+            told = await doctor(lab, ZSCOUT_KEYS=keys / "late")
+            assert len(told.mends()) == 1
+            assert told.of("certificate")[0][1].startswith(f"{keys}/late/cert.pem: has ended on ")
+            assert not told.of("links")
+
+            lab.authority.issue("bench", keys / "early", DAY, now - 2 * DAY)
+            with bare(lab, tls=tls(keys / "early")):
+                ended = r"the certificate of bench \(tls/.*\) has ended on .*"
+                told = await told_of(lab, "security", ended, ZSCOUT_KEYS=keys / "ada")
+            assert len(told.mends()) == 1
+
+    asyncio.run(story())
+
+
+def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ClosedLab(tmp_path) as lab:
+            file = lab.folder / "bench.toml"
+            file.write_text('[node]\nhost = "bench"\nfleet = "fleet.toml"\n[security]\nfolder = "keys/anvil"')
+            told = await doctor(lab, file)
+            keys = tmp_path / "keys" / "anvil"
+            assert told.of("certificate") == [
+                ("mend", f'{keys}/cert.pem: is the certificate of "anvil", and this is "bench"')
+            ]
+            assert not told.of("links")
+            (keys / "key.pem").chmod(0o644)
+            assert (await doctor(lab, file)).of("certificate") == [
+                ("mend", f"{keys}/key.pem: may be read by others (mode 644)")
+            ]
+
+    asyncio.run(story())
+
+
+def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ClosedLab(tmp_path) as lab:
+            for name in ("anvil", "ada"):  # of ten hours one is left
+                lab.authority.issue(name, tmp_path / "keys" / name, DAY * 10 / 24, datetime.now(UTC) - DAY * 9 / 24)
+            lab.node("anvil")
+            lab.node("cart")
+            await shown(lab, "bob", "anvil", "cart")
+            env = lab.env | {KEYS_VARIABLE: str(tmp_path / "keys" / "ada")}
+            done = await zscout_soon("status", env=env)
+            _, warnings = done.stdout.split("\nWarnings\n")
+            said = [line.split("  ") for line in warnings.split("\n\n")[0].splitlines()[1:]]
+            assert [(about, words.partition(" ends in ")[0]) for about, words in said] == [
+                ("certificate", "the certificate of anvil"),
+                ("certificate", "the certificate of ada"),
+            ]
+            state = json.loads((await zscout_soon("status", "--json", env=env)).stdout)
+            assert [one["name"] for one in state["ending"]] == ["anvil", "ada"]
+            assert all(3000 < one["ends_in"] <= 3600 for one in state["ending"])
+            assert state["advisory"] is False
+            mends = (await doctor(lab, **{KEYS_VARIABLE: env[KEYS_VARIABLE]})).mends()
+            assert [says.partition(" ends in ")[0] for says in mends] == [
+                "the certificate of ada",
+                "the certificate of anvil",
+            ]
+            await lab.logged("anvil", "renew it (zscout cert renew)")
+
+    asyncio.run(story())
+
+
+def test_status_says_that_roles_are_advisory_where_nothing_proves_a_name(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, extra='[roles]\nmanager = ["anvil"]\nclient = ["bob"]') as lab:
+            lab.node("anvil")
+            await lab.ready(await lab.client())
+            done = await zscout_soon("status", env=lab.env)
+            assert "roles  they are advisory: nobody proves a name where [security] is not set" in done.stdout
+            assert json.loads((await zscout_soon("status", "--json", env=lab.env)).stdout)["advisory"] is True
+
+    asyncio.run(story())
+
+
+@pytest.fixture
+def nowhere() -> tuple[str, ...]:
+    """Runs a command on a host without a network."""
+    words = ("unshare", "--net")
+    if shutil.which(words[0]) is None or subprocess.run([*words, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("a network namespace of one's own needs root and util-linux")
+    return words
+
+
+def test_without_a_network_multicast_is_told_to_be_impossible(tmp_path: Path, nowhere: tuple[str, ...]) -> None:
+    file = tmp_path / "fleet.toml"
+    file.write_text('[mesh]\nconnect = ["tcp/10.83.0.1:7447"]')
+    env = os.environ | {"ZSCOUT_FLEET": str(file)}
+    done = subprocess.run(
+        [*nowhere, *COMMAND, "doctor"], env=env, capture_output=True, text=True, timeout=HANG, check=False
+    )
+    assert (done.returncode, done.stderr) == (1, "")
+    lines = done.stdout.splitlines()
+    assert "it is not possible here (no interface is up for it); " in lines[2]
+    assert "tcp/10.83.0.1:7447: Network is unreachable; " in lines[3]
+    assert [line.split()[1] for line in lines[4:6]] == ["links", "leader"]
+
+
+@contextmanager
+def doctoring(lab: Lab) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen([*COMMAND, "doctor"], env=lab.env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_interrupted_it_leaves_nothing(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, candidates=("forge",)) as lab:
+            lab.node("anvil")
+            client = await lab.client()
+            seen = asyncio.Event()
+            client.mesh.watch(
+                client.mesh.keys.alive_any(Role.CLIENT), lambda token, _: seen.set() if "doctor" in token.name else None
+            )
+            with doctoring(lab) as process:
+                async with asyncio.timeout(HANG):
+                    await seen.wait()
+                process.send_signal(signal.SIGINT)
+                out, _ = await asyncio.to_thread(process.communicate, timeout=HANG)
+                assert (process.returncode, out) == (130, b"")
+            await lab.living(client, Role.CLIENT, lambda found: len(found) == 1)
+
+    asyncio.run(story())

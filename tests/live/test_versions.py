@@ -1,0 +1,194 @@
+"""Nodes and programs of the first version, v0.1.0, and of this one in one fleet: what an upgrade host by host meets."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.behaviors.components.kit import Hosts, counts, counts_on
+from tests.hang import HANG
+from tests.live import message_samples
+from tests.live.bench import running
+from tests.live.crew import Crew, Stand
+from tests.live.former import MixedLab, environment, unpack
+from tests.live.lab import PATIENT, HolderProcess
+from tests.live.placing import Placing
+from zscout.mesh import clock
+from zscout.messages import ComponentSpec, Grants, MigrateComponent, Output, PlaceComponent, Placement, ReadOutput
+from zscout.types import VERSION
+
+pytestmark = pytest.mark.live
+
+ECHO = {"name": "echo", "value": 7}
+OTHER = {"old": "new", "new": "old"}
+TELLS = {"old": "", "new": VERSION}
+"""What each says of its version."""
+leaders = pytest.mark.parametrize("leads", ["old", "new"])
+
+
+@pytest.fixture(scope="module")
+def former(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return unpack(tmp_path_factory.mktemp("v0.1.0"))
+
+
+async def enters(holder: HolderProcess, arc: str, needs: dict[str, Any]) -> dict[str, Any]:
+    """Has it ask until it has entered: one of the first version gives up where a link to an RC is not there yet."""
+    while True:
+        await holder.order("ask", arc=arc, needs=needs, min_runtime=600)
+        event = await holder.event("entered", "not_entered", "refused")
+        if event["event"] == "entered":
+            return event
+        assert event["code"] == "unknown", event
+
+
+async def commands(holder: HolderProcess, *rcs: str) -> None:
+    for rc in rcs:
+        while True:
+            await holder.order("command", rc=rc, do=ECHO, ttl=PATIENT)
+            event = await holder.event("command")
+            if event["code"] not in ("unknown", "stale"):  # on a busy machine: asked again
+                break
+        assert event.get("result") == ECHO["value"], event
+
+
+@leaders
+def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, leads: str) -> None:
+    async def story() -> None:
+        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+            with lab.at(leads):
+                lab.node("a", "robot/a")
+            with lab.at(OTHER[leads]):
+                lab.node("b", "robot/b", "camera/b", "radio/b:rate=10")
+            client = await lab.client()
+            rcs = "robot/a", "robot/b", "camera/b", "radio/b"
+            state = await lab.ready(client, *rcs)
+            assert (state.host, state.version) == ("a", TELLS[leads])
+            assert (await lab.rc(client, "robot/b")).version == TELLS[OTHER[leads]]
+            with lab.at("old"):
+                old = await lab.holder("old")
+            needs: dict[str, Any] = {"robot/a": {}, "robot/b": {}, "camera/*": {}, "radio/b": {"rate": 6}}
+            await enters(old, "first", needs)
+            await commands(old, *rcs)
+
+            second = await client.request("second", needs, min_runtime=600)
+            assert (second.state, second.ahead) == ("queued", 0)
+            await old.order("end")
+            grant = await client.granted(second)
+            assert grant is not None
+            for rc in rcs:
+                assert (await client.command(rc, grant, ECHO, ttl=PATIENT, timeout=HANG)).result == ECHO["value"]
+
+            # A higher priority takes it, from either version; and what was taken comes back at its place.
+            await old.order("ask", arc="boss", needs={"robot/a": {}}, priority=9, min_runtime=600)
+            await old.event("entered")
+            await lab.state(client, lambda state: [one.arc for one in state.queue] == ["second"])
+            assert (second.state, second.outcome) == ("queued", "preempted")
+            old.kill()
+            assert await client.granted(second) is not None
+            await lab.held_by(client, "radio/b", "second")
+
+    asyncio.run(story())
+
+
+@leaders
+def test_a_leader_is_killed_and_one_of_the_other_version_goes_on(tmp_path: Path, former: Path, leads: str) -> None:
+    async def story() -> None:
+        async with MixedLab(tmp_path, former, candidates=("a", "b")) as lab:
+            apart = "candidate = false"
+            with lab.at("old"):
+                lab.node("c", "robot/c", "robot/old", extra=apart)
+            with lab.at("new"):
+                lab.node("d", "robot/d", "robot/free", extra=apart)
+            with lab.at(leads):
+                lab.node("a")
+            client = await lab.client("asker")
+            await lab.ready(client, "robot/c", "robot/d", "robot/old", "robot/free")
+            with lab.at(OTHER[leads]):
+                lab.node("b")
+            crew = Crew()
+            await crew.assemble(lab, ["robot/c", "robot/d"], waiting=4)
+            with lab.at("old"):
+                holds, waits = await asyncio.gather(lab.holder("holds"), lab.holder("waits"))
+            await enters(holds, "holds", {"robot/old": {}})
+            await waits.order("ask", arc="waits", needs={"robot/old": {}}, min_runtime=600)
+            before = await lab.state(client, lambda state: len(state.queue) == 5)
+            stood = Stand(before)
+            assert (before.host, len(stood.holds)) == ("a", 3)
+            await lab.candidates(client, "b")
+
+            lab.signal("a", signal.SIGKILL)
+            _, free = await running(client, "free", "robot/free")
+            assert free.term > stood.term
+            stood.went_on(await lab.state(client, lambda state: len(state.holds) == 4), "free")
+            after = await crew.checked(lab, client, stood, since=clock.now())
+            assert after.host == "b"
+            await commands(holds, "robot/old")
+            await holds.order("end")
+            await waits.event("entered")
+            await commands(waits, "robot/old")
+            await asyncio.gather(*(body.finish() for body in crew.bodies))
+
+    asyncio.run(story())
+
+
+@leaders
+def test_a_component_moves_between_the_versions_with_its_hold(tmp_path: Path, former: Path, leads: str) -> None:
+    async def story() -> None:
+        async with MixedLab(tmp_path, former, candidates=("r",)) as lab:
+            for version in ("old", "new"):
+                with lab.at(version):
+                    lab.node(version)
+            with lab.at(leads):
+                lab.node("r", "robot/x", extra="[components]\nallow = false\n")
+            client = await lab.client()
+            placing, hosts = Placing(client), Hosts(client)
+            await lab.ready(client, "robot/x")
+            await placing.hosts(2)
+            said: list[Grants] = []
+            client.mesh.subscribe(client.mesh.keys.grants, Grants, lambda _, grants: said.append(grants))
+            # By each version's own program.
+            for version in ("old", "new"):
+                with lab.at(version):
+                    start = "start", "spin", "--name", version, "--set", "cpu=0.01"
+                    program = lab.spawn([sys.executable, "-m", "zscout.cli.main", *start], log=f"start-{version}.log")
+                assert await asyncio.to_thread(program.wait, HANG) == 0, lab.log(f"start-{version}")
+
+            spec = ComponentSpec("counter", {"period": 0.02, "rc": "robot/x"}, hosts=["old", "new"])
+            await placing.get(PlaceComponent("c", spec), Placement)
+            placed = await placing.until("c", lambda one: one.state == "running" and one.movable)
+            at = placed.host
+            assert at is not None
+            for _ in range(2):
+                await counts_on(hosts, at)
+                moved = await placing.get(MigrateComponent("c", OTHER[at]), Placement)
+                assert (moved.state, moved.host) == ("running", OTHER[at]), moved
+                await counts_on(hosts, OTHER[at])
+                assert (await counts(hosts, OTHER[at]))[0] == (await counts(hosts, at))[-1] + 1
+                assert "lost" not in (await hosts.get(OTHER[at], ReadOutput("c"), Output)).text
+                at = OTHER[at]
+            assert {one.outcome for grants in said for one in grants.revoked} == {"handed_over"}
+            (holder,) = (await lab.rc(client, "robot/x")).holders
+            assert (holder.arc, holder.client.partition("/")[0]) == ("c", at)
+
+    asyncio.run(story())
+
+
+def test_each_version_takes_every_message_of_the_other(former: Path) -> None:
+    def old(what: str, told: str = "") -> Any:
+        command = [sys.executable, message_samples.__file__, what]
+        env = environment(former, os.environ)
+        ran = subprocess.run(command, env=env, input=told, capture_output=True, text=True, timeout=HANG, check=True)
+        return json.loads(ran.stdout)
+
+    written = old("write")
+    assert len(written) > 40
+    assert message_samples.read(written) == []
+    assert old("read", json.dumps(message_samples.write())) == []

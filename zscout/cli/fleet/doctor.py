@@ -1,0 +1,151 @@
+"""`zscout doctor`: looks at everything that keeps hosts from one another, whether or not the mesh can be joined.
+
+What is made of it stands in `findings.py`."""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import os
+import socket
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import click
+
+from zscout import terminal
+from zscout.cli import common
+from zscout.cli.fleet.findings import Evidence, Finding, findings
+from zscout.config.certificates import MAX_FILE, read_cas, read_certificates
+from zscout.config.fleet import Fleet
+from zscout.config.node import load_node
+from zscout.config.strict import BadInput, read_text
+from zscout.keyexpr import valid_name
+from zscout.terminal import Table
+
+JOINED: Final = 7.0
+"""Seconds in which whoever is on the mesh is seen, and a candidate takes the lead."""
+LISTENS: Final = 3
+"""Addresses of one process that are called."""
+TIME_ERROR: Final = 5
+"""What adjtimex returns where nothing keeps the clock."""
+TIMEX: Final = 256
+"""Bytes that are enough for its struct on any platform."""
+STYLES: Final = {"ok": "green", "note": "yellow", "mend": "bold red"}
+
+
+@click.command()
+@click.argument("file", required=False, type=click.Path(path_type=Path))
+@common.json_option("Print one JSON object.")
+@common.runs
+async def doctor(file: Path | None, as_json: bool) -> int:
+    """Find out why there is no link, no leader or no device, and how to mend it.
+
+    FILE is a node's: looks as that node would, by its own files and certificate; without it, by the fleet's file, as
+    any command. Takes up to ten seconds, and needs nobody to be there.
+
+    Each line is `ok`, a `note`, or something to `mend`, causes first. Exit code 0: nothing is to be mended, 1:
+    something is, a mistake in a file as well.
+
+    \b
+    Examples:
+      zscout doctor
+      zscout doctor lab.toml
+      zscout doctor --json | jq -r '.findings[] | select(.state == "mend").says'
+    """
+    seen = await _look(file)
+    found = findings(seen)
+    bad = [one for one in found if one.state == "mend"]
+    if as_json:
+        lines = [{name: getattr(one, name) for name in Finding.__slots__} for one in found]
+        fleet = seen.fleet.name if seen.fleet is not None else None
+        terminal.print_json({"fleet": fleet, "host": seen.host or None, "mend": len(bad), "findings": lines})
+    else:
+        rows = [(one.state, one.about, str(one)) for one in found]
+        Table("", ("STATE", "ABOUT", "FINDING"), rows, [STYLES[one.state] for one in found]).print()
+    return int(bool(bad))
+
+
+async def _look(file: Path | None) -> Evidence:
+    seen = Evidence(datetime.now(UTC), clock_kept=_clock_kept())
+    try:
+        if file is not None:
+            seen.node = load_node(file)
+            seen.fleet, seen.host = seen.node.fleet, seen.node.host
+        else:
+            seen.fleet = common.the_fleet()
+        seen.file = str(file or common.fleet_file() or "")
+    except BadInput as error:
+        if (named := file or common.fleet_file()) is not None and not named.exists():
+            raise
+        seen.bad.append(("files", error))
+        return seen
+    cas = _look_at_certificates(seen, seen.fleet)
+    seen.host = seen.host or os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
+    from zscout.mesh import probing
+
+    mesh = seen.fleet.mesh
+    if mesh.multicast:
+        seen.interfaces = probing.multicast_problems(mesh)
+        seen.heard = await probing.heard(mesh)
+    heard = [address for one in seen.heard for address in one.addresses[:LISTENS]]
+
+    async def call() -> None:
+        seen.answers = await probing.call(mesh.connect, heard, cas, seen.certificates)
+        plain = [one.address for one in seen.answers if one.speaks == "plain"]
+        if plain:
+            seen.plain = await asyncio.to_thread(probing.plain_fleets, plain)
+
+    async with asyncio.TaskGroup() as both:  # when it is interrupted it waits until the mesh is left
+        both.create_task(call())
+        if not seen.bad:
+            both.create_task(_join(seen, seen.fleet))
+    return seen
+
+
+def _look_at_certificates(seen: Evidence, fleet: Fleet) -> str:
+    """The CAs that are trusted, in PEM; empty where there are none."""
+    if fleet.security is None:
+        return ""
+    cas = ""
+    with suppress(BadInput):
+        read_cas(fleet.security / "ca.pem")
+        cas = read_text(fleet.security / "ca.pem", max_bytes=MAX_FILE)
+    try:
+        seen.certificates = read_certificates(fleet.security)
+        seen.host = seen.host or seen.certificates.name
+        seen.certificates.check(seen.at, seen.host)
+    except BadInput as error:
+        seen.bad.append(("certificate", error))
+    return cas
+
+
+async def _join(seen: Evidence, fleet: Fleet) -> None:
+    """What is seen from inside."""
+    from zscout.cli.fleet.fleet_view import Devices, FleetView
+    from zscout.mesh import MeshError
+
+    try:
+        async with common.connected("doctor", fleet, need_rcm=False) as client:
+            with FleetView(client) as view:
+                devices = Devices(view)
+                with suppress(TimeoutError, common.NobodyThere):
+                    async with asyncio.timeout(JOINED):
+                        seen.state = await view.settled()
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(1.0):
+                        await devices.ask()
+                seen.links, seen.hosts, seen.devices = client.mesh.links(), view.hosts, devices.known()
+    except (MeshError, BadInput) as error:
+        seen.unjoined = str(error)
+
+
+def _clock_kept() -> bool | None:
+    """None where that can't be asked."""
+    try:
+        code = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX))
+    except (OSError, AttributeError):
+        return None
+    return None if code < 0 else code != TIME_ERROR

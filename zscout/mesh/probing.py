@@ -1,0 +1,273 @@
+"""What can be told of a network without being let in: who is heard, and what those say who are called.
+
+An intruder gets no link and no word, and so does a host whose files or certificate are wrong. But who is there says so
+by multicast to all, and a TLS handshake tells both sides' mind, down to why a certificate is refused."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import ipaddress
+import json
+import os
+import re
+import secrets
+import socket
+import ssl
+import struct
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final, Literal, NamedTuple
+
+import psutil
+import zenoh
+
+from zscout.config.certificates import NO_CHECK_TIME, Certificates, Validity, common_name, validity
+from zscout.config.fleet import MeshConfig, ip_of
+from zscout.config.strict import BadInput, Where
+from zscout.keyexpr import NAME, ROOT, Role
+from zscout.mesh.relinking import MEETING
+from zscout.mesh.zenoh_mesh import in_thread, zenoh_config
+from zscout.types import clean
+
+SCOUT: Final = 1.5
+"""Seconds in which all who are there have answered."""
+POLL: Final = 0.02
+CONNECT: Final = 1.5
+HANDSHAKE: Final = 2.0
+OBJECTION: Final = 0.3
+"""Seconds within which the other side says that it refuses our certificate: it looks after we have seen its own."""
+LINK: Final = 0.8
+LIST: Final = 1.0
+"""Seconds for links to a plain mesh, and for its tokens."""
+MAX_HEARD: Final = 64
+"""Processes that are called."""
+MAX_TOKENS: Final = 10_000
+_ALERT: Final = re.compile(r"alert ([a-z ]*[a-z])")
+_ADDRESS: Final = re.compile(r"(tcp|tls)/([^#?]+):(\d+)(?:[?#].*)?")
+
+
+# Multicast
+
+
+def multicast_problems(config: MeshConfig) -> dict[str, str]:
+    """The interfaces that multicast would use, with why it can't; empty where it can. Really tried, on each."""
+    host, _, port = config.multicast_address.rpartition(":")
+    group = ip_of(host.strip("[]"))
+    assert group is not None  # noqa: S101 - the fleet file was checked
+    found = psutil.net_if_stats()
+    if config.interface == "auto":
+        names = [name for name, one in found.items() if one.isup and "multicast" in one.flags.split(",")]
+    else:
+        names = config.interface.split(",")
+    return {name: _multicast_problem(name, group, int(port)) for name in names}
+
+
+def _multicast_problem(name: str, group: ipaddress.IPv4Address | ipaddress.IPv6Address, port: int) -> str:
+    v6 = group.version == 6
+    try:
+        number = socket.if_nametoindex(name)
+        with socket.socket(socket.AF_INET6 if v6 else socket.AF_INET, socket.SOCK_DGRAM) as own:
+            if v6:
+                member, level = group.packed + struct.pack("@i", number), socket.IPPROTO_IPV6
+                own.setsockopt(level, socket.IPV6_JOIN_GROUP, member)
+                own.setsockopt(level, socket.IPV6_MULTICAST_IF, number)
+            else:
+                member, level = group.packed + struct.pack("@4si", bytes(4), number), socket.IPPROTO_IP
+                own.setsockopt(level, socket.IP_ADD_MEMBERSHIP, member)
+                own.setsockopt(level, socket.IP_MULTICAST_IF, member)
+            own.sendto(b"", (str(group), port))
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A process that answered by multicast, and where it listens; `here`: on this host."""
+
+    zid: str
+    addresses: tuple[str, ...]
+    here: bool
+
+
+async def heard(config: MeshConfig) -> list[Heard]:
+    """Who answers by multicast, of whatever fleet. Takes SCOUT seconds."""
+    found: dict[str, Heard] = {}
+    own = {one.address.partition("%")[0] for several in psutil.net_if_addrs().values() for one in several}
+    until = time.monotonic() + SCOUT
+    try:
+        with zenoh.scout(what="peer|router", config=zenoh_config(config)) as scout:
+            while time.monotonic() < until and len(found) < MAX_HEARD:
+                if (hello := scout.try_recv()) is None:
+                    await asyncio.sleep(POLL)
+                elif not (zid := str(hello.zid)).startswith(MEETING):
+                    addresses = tuple(one for one in hello.locators if "[fe80:" not in one)
+                    hosts = {match[2].strip("[]") for one in addresses if (match := _ADDRESS.match(one))}
+                    found[zid] = Heard(zid, addresses, bool(hosts & own))
+    except zenoh.ZError:  # no interface for it
+        pass
+    return list(found.values())
+
+
+# Who is called
+
+
+@dataclass(frozen=True, slots=True)
+class Called:
+    """What came of calling an address. `speaks` is empty where nobody answered, and `problem` says why.
+
+    Of TLS: the certificate that was shown, by which CA, whether one that we trust has issued it, and what the other
+    side says against ours: empty where it took it, or we have shown none."""
+
+    address: str
+    speaks: Literal["tls", "plain", ""]
+    problem: str = ""
+    certificate: Validity | None = None
+    issuer: str = ""
+    trusted: bool = False
+    objection: str = ""
+
+
+async def call(
+    named: Iterable[str], heard: Iterable[str] = (), cas: str = "", own: Certificates | None = None
+) -> list[Called]:
+    """Calls all addresses of TCP and TLS at a time, within six seconds, as who trusts these CAs (PEM) and has this
+    certificate. Who was `heard` has said itself whether it speaks TLS; of those that a file has `named` it is tried."""
+    tried = dict.fromkeys(heard, False) | dict.fromkeys(named, True)
+    matches = [(match, doubted) for one, doubted in tried.items() if (match := _ADDRESS.fullmatch(one))]
+    return list(await asyncio.gather(*(_call(match, doubted, cas, own) for match, doubted in matches)))
+
+
+async def _call(match: re.Match[str], doubted: bool, cas: str, own: Certificates | None) -> Called:
+    address = match[0]
+    try:
+        async with asyncio.timeout(CONNECT):
+            at = await _reached(match[2].strip("[]"), int(match[3]))
+    except TimeoutError:
+        return Called(address, "", "no answer")
+    except OSError as error:
+        return Called(address, "", _reason(error))
+    if match[1] == "tcp" and not doubted:
+        return Called(address, "plain")
+    if cas:
+        with suppress(ssl.SSLCertVerificationError):
+            return _answer(address, await _handshake(at, _trusting(cas, own)), trusted=True)
+    # Whoever issued it, a certificate that is taken for an authority itself can be read.
+    if (shaken := await _handshake(at, _trusting(None))) is not None and shaken.encoded:
+        itself = ssl.DER_cert_to_PEM_cert(shaken.encoded)
+        with suppress(ssl.SSLCertVerificationError):
+            shaken = await _handshake(at, _trusting(itself))
+    return _answer(address, shaken, trusted=False)
+
+
+async def _reached(host: str, port: int) -> tuple[str, int]:
+    """Which of a host's addresses takes a connection. Raises OSError."""
+    # In a thread that nobody waits for: where no name server answers it takes its time.
+    look_up = functools.partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
+    error: OSError | None = None
+    for *_, found in await asyncio.wrap_future(in_thread("looks up a name", look_up)):
+        at = str(found[0]), port
+        try:
+            _, writer = await asyncio.open_connection(*at)
+        except OSError as failed:
+            error = failed
+        else:
+            writer.transport.abort()
+            return at
+    raise error or OSError("it has no address")
+
+
+class _Shaken(NamedTuple):
+    told: Mapping[str, Any]
+    """Of the other side's certificate, if that was verified."""
+    encoded: bytes
+    objection: str
+
+
+async def _handshake(at: tuple[str, int], context: ssl.SSLContext) -> _Shaken | None:
+    """None: no TLS is spoken there. Raises SSLCertVerificationError."""
+    try:
+        async with asyncio.timeout(HANDSHAKE):
+            reader, writer = await asyncio.open_connection(*at, ssl=context)
+    except ssl.SSLCertVerificationError:
+        raise
+    except (OSError, TimeoutError):
+        return None
+    end, objection = writer.get_extra_info("ssl_object"), ""
+    told, encoded = end.getpeercert() or {}, end.getpeercert(binary_form=True) or b""
+    try:
+        async with asyncio.timeout(OBJECTION):
+            await reader.read(1)
+    except ssl.SSLError as error:
+        alert = _ALERT.search(str(error))
+        objection = alert[1] if alert is not None else "no"
+    except (OSError, TimeoutError):
+        pass
+    finally:
+        writer.transport.abort()
+    return _Shaken(told, encoded, objection)
+
+
+def _trusting(cas: str | None, own: Certificates | None = None) -> ssl.SSLContext:
+    """Trusts what stands in a PEM text, or everybody; for how long something is valid is looked at later."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    if cas is None:
+        context.verify_mode = ssl.CERT_NONE
+        return context
+    context.load_verify_locations(cadata=cas)
+    context.verify_flags |= ssl.VerifyFlags(NO_CHECK_TIME) | ssl.VerifyFlags.VERIFY_X509_PARTIAL_CHAIN
+    if own is not None:
+        context.load_cert_chain(own.cert, own.key)
+    return context
+
+
+def _answer(address: str, shaken: _Shaken | None, *, trusted: bool) -> Called:
+    if shaken is None:
+        return Called(address, "plain")
+    objection = shaken.objection if trusted else ""
+    try:
+        certificate = validity(shaken.told, Where(address))
+    except (BadInput, KeyError):
+        return Called(address, "tls", objection=objection)
+    issuer = clean(common_name(shaken.told["issuer"]))
+    return Called(address, "tls", "", certificate, issuer, trusted, objection)
+
+
+def _reason(error: OSError) -> str:
+    """What stands behind it, without the address: several addresses of a name have failed alike."""
+    return os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or "can't be called"
+
+
+# A plain mesh
+
+
+def plain_fleets(addresses: Sequence[str]) -> dict[str, set[str]]:
+    """The fleets of who listens at these addresses without TLS: the hosts of each that have a node. Blocks for two
+    seconds at most."""
+    settings: dict[str, object] = {
+        "mode": "peer",
+        "id": f"{MEETING}{secrets.token_hex(10)}",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "listen/endpoints": [],
+        "connect/endpoints": list(addresses),
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    found: dict[str, set[str]] = {}
+    with suppress(zenoh.ZError), zenoh.open(config) as session:
+        until = time.monotonic() + LINK
+        while len(list(session.info.peers_zid())) < len(addresses) and time.monotonic() < until:
+            time.sleep(POLL)
+        for number, reply in enumerate(session.liveliness().get(f"{ROOT}/*/alive/*/{Role.NODE}/**", timeout=LIST)):
+            if reply.ok is None or number > MAX_TOKENS:
+                continue
+            _, fleet, _, host, *_ = str(reply.ok.key_expr).split("/")
+            if NAME.fullmatch(fleet) and NAME.fullmatch(host):
+                found.setdefault(fleet, set()).add(host)
+    return found
