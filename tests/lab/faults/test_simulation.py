@@ -30,6 +30,8 @@ MISSED = {
     "believed": 64,
     "settling": 8,
     "deadline": 8,
+    "once": 10,
+    "sealed": 10,
 }
 """Guards without which some promise breaks within a few runs, and the seed of docs/promises.md, which is tried first;
 `zscout study faults --without` tries the others."""
