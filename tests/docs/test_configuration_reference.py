@@ -42,8 +42,12 @@ def keys(table: Any, path: str = "") -> Iterator[tuple[str, inspect.Field]]:
         inner = _plain(field.type)
         if isinstance(inner, inspect.VarTupleType):
             inner = inner.item_type
-        if isinstance(_plain(field.type), inspect.DictType) and not path:  # a table whose keys are names of hosts
-            yield f"{field.encode_name}.host", field
+        whole = _plain(field.type)
+        if isinstance(whole, inspect.DictType) and not path:  # a table whose keys are names
+            if isinstance(whole.value_type, inspect.StructType):
+                yield from keys(whole.value_type, f"{field.encode_name}.")
+            else:
+                yield f"{field.encode_name}.{'host' if field.encode_name == 'devices' else 'name'}", field
             continue
         options = inner.types if isinstance(inner, inspect.UnionType) else (inner,)
         tables = [option for option in options if isinstance(option, inspect.StructType)]
