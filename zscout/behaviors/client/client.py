@@ -29,7 +29,7 @@ from zscout.behaviors.client.request import (
     check_seconds,
 )
 from zscout.config.certificates import read_certificates
-from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env
+from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
@@ -113,7 +113,7 @@ class Client(MovableClient):
             host = host or read_certificates(fleet.security).name
         host = host or os.environ.get("ZSCOUT_HOST") or machine
         me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
-        client = cls(await ZenohMesh.open(fleet, me), fleet)
+        client = cls(await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me), fleet)
         client.who = this_program(host if fleet.security is None else machine)
         return client.start()
 
