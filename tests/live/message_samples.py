@@ -1,5 +1,5 @@
-"""Messages of the version that this Python finds, as JSON: `write` prints some of each kind, with all fields and with the
-fewest; `read` takes such from stdin, and prints what it does not take. It runs under the first version as well."""
+"""Messages of the version that this Python finds, as JSON: `write` prints some of each kind, with all fields and with
+the fewest; `read` takes such from stdin, and prints what it does not take. It runs under the first version as well."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -115,7 +116,30 @@ def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_pat
             )
             told = await doctor(lab, file)
             assert told.host == "cart"
-            assert told.mends()[1:] == ["not there: robot/c of cart, which is not seen either"]
+            assert told.mends()[1:] == ["not there: robot/c of cart (that host is not seen either)"]
+
+    asyncio.run(story())
+
+
+def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewhere(tmp_path: Path) -> None:
+    async def story() -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            address = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+        async with Lab(tmp_path) as lab:
+            text = lab.fleet_file.read_text()
+            lab.fleet_file.write_text(
+                text.replace(
+                    "[mesh]\n", f'[mesh]\nlisten = ["{address}"]\nconnect = ["{address}"]\nmulticast = false\n'
+                )
+            )
+            lab.node("anvil", "robot/a")
+            await lab.logged("anvil", "is on the mesh")
+            told = await told_of(lab, "leader", "anvil leads, term 1", lab.folder / "anvil.toml")
+            assert told.code == 0
+            assert told.of("multicast") == [("note", "it is off: only the hosts under `connect` are found")]
+            done = await zscout_soon("status", env=lab.env)
+            assert (done.returncode, done.stderr) == (0, "")
 
     asyncio.run(story())
 

@@ -26,13 +26,13 @@ from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from zscout.behaviors.client.arc import hold
-from zscout.config.fleet import MeshConfig
+from zscout.config.fleet import MeshConfig, beside
 from zscout.config.node import RecorderConfig
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role, Token
 from zscout.messages import Notice, RcState
 from zscout.services.recorder.colours import OPERATOR
-from zscout.services.recorder.process import RecorderJob, Recording, beside, encode_job, new_recording, prune
+from zscout.services.recorder.process import RecorderJob, Recording, encode_job, new_recording, prune
 
 pytestmark = pytest.mark.live
 
@@ -458,3 +458,4 @@ def test_a_recorder_joins_beside_its_node() -> None:
     assert own.listen == ("tcp/0.0.0.0:0", "tls/[::]:0#x=y", "tcp/10.0.0.1:0")
     assert own.connect == ("tcp/10.0.0.2:7447", "tcp/127.0.0.1:7447", "tls/[::1]:7448#x=y")
     assert beside(MeshConfig()) == MeshConfig()
+    assert beside(MeshConfig(relay=("north", "south"))) == MeshConfig(site="north")

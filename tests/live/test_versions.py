@@ -5,25 +5,33 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from tests.behaviors.components.kit import Hosts, counts, counts_on
+from tests.cli.fleet.test_status import section
+from tests.cli.tools import COMMAND, zscout_soon
 from tests.hang import HANG
 from tests.live import message_samples
-from tests.live.bench import running
+from tests.live.bench import comes_to, running
 from tests.live.crew import Crew, Stand
 from tests.live.former import MixedLab, environment, unpack
 from tests.live.lab import PATIENT, HolderProcess
 from tests.live.placing import Placing
-from zscout.mesh import clock
-from zscout.messages import ComponentSpec, Grants, MigrateComponent, Output, PlaceComponent, Placement, ReadOutput
-from zscout.types import VERSION
+from zscout import messages
+from zscout.behaviors.client.placer_client import PlacerClient
+from zscout.behaviors.client.request import RequestRefused
+from zscout.mesh import Reply, clock, exchange
+from zscout.messages import Ask, ComponentSpec, Grants, MigrateComponent, Output, PlaceComponent, Placement, ReadOutput
+from zscout.services.placement.node_client import NodeClient
+from zscout.types import SECOND, VERSION
 
 pytestmark = pytest.mark.live
 
@@ -90,7 +98,9 @@ def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, leads:
             await old.order("ask", arc="boss", needs={"robot/a": {}}, priority=9, min_runtime=600)
             await old.event("entered")
             await lab.state(client, lambda state: [one.arc for one in state.queue] == ["second"])
-            assert (second.state, second.outcome) == ("queued", "preempted")
+            await comes_to(second, "queued")
+            assert second.ending is not None
+            assert second.ending.outcome == "preempted"
             old.kill()
             assert await client.granted(second) is not None
             await lab.held_by(client, "radio/b", "second")
@@ -151,16 +161,9 @@ def test_a_component_moves_between_the_versions_with_its_hold(tmp_path: Path, fo
             client = await lab.client()
             placing, hosts = Placing(client), Hosts(client)
             await lab.ready(client, "robot/x")
-            await placing.hosts(2)
+            await placing.hosts(3)
             said: list[Grants] = []
             client.mesh.subscribe(client.mesh.keys.grants, Grants, lambda _, grants: said.append(grants))
-            # By each version's own program.
-            for version in ("old", "new"):
-                with lab.at(version):
-                    start = "start", "spin", "--name", version, "--set", "cpu=0.01"
-                    program = lab.spawn([sys.executable, "-m", "zscout.cli.main", *start], log=f"start-{version}.log")
-                assert await asyncio.to_thread(program.wait, HANG) == 0, lab.log(f"start-{version}")
-
             spec = ComponentSpec("counter", {"period": 0.02, "rc": "robot/x"}, hosts=["old", "new"])
             await placing.get(PlaceComponent("c", spec), Placement)
             placed = await placing.until("c", lambda one: one.state == "running" and one.movable)
@@ -178,6 +181,115 @@ def test_a_component_moves_between_the_versions_with_its_hold(tmp_path: Path, fo
             (holder,) = (await lab.rc(client, "robot/x")).holders
             assert (holder.arc, holder.client.partition("/")[0]) == ("c", at)
 
+    asyncio.run(story())
+
+
+@leaders
+def test_a_component_is_started_by_either_versions_program(tmp_path: Path, former: Path, leads: str) -> None:
+    async def story() -> None:
+        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+            with lab.at(leads):
+                lab.node("a", extra="[components]\nallow = false\n")
+            with lab.at(OTHER[leads]):
+                lab.node("b")
+            client = await lab.client()
+            await lab.ready(client)
+            for version in ("old", "new"):
+                with lab.at(version):
+                    start = "start", "spin", "--name", version, "--set", "cpu=0.01"
+                    program = lab.spawn([*COMMAND, *start], log=f"start-{version}.log")
+                assert await asyncio.to_thread(program.wait, HANG) == 0, lab.log(f"start-{version}")
+                assert (await Placing(client).placement(version)).host == "b"
+
+    asyncio.run(story())
+
+
+def of_the_next_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This process, from now on."""
+    monkeypatch.setattr(exchange, "VERSION", "0.3.0")
+
+
+def refusal(reply: Reply[Any] | None) -> messages.Problem:
+    assert reply is not None
+    assert reply.problem is not None
+    return reply.problem
+
+
+class Book(messages.Message, frozen=True, tag_field="op", tag="book"):
+    """An operation of a version to come."""
+
+    id: str
+
+
+@leaders
+def test_what_the_other_side_does_not_know_is_refused_naming_both_versions(
+    tmp_path: Path, former: Path, leads: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def story() -> None:
+        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+            with lab.at(leads):
+                lab.node("a", "robot/a")
+            client = await lab.client()
+            await lab.ready(client, "robot/a")
+            link, operation = client._rcm, cast("Any", Book("b"))
+            # What this version should not have sent is its own fault.
+            assert ("upgrade" in refusal(await link.query(operation)).message) == (leads == "old")
+
+            of_the_next_version(monkeypatch)
+            theirs = "older than 0.2.0" if leads == "old" else f"version {VERSION}"
+            says = f"at a is {theirs}, this is 0.3.0: upgrade the older one"
+            ask = Ask("x", "x", {"robot/{a,b}": {}}, 0, Decimal(1))
+            for sent, code in ((operation, "malformed"), (ask, "bad_request")):
+                problem = refusal(await link.query(sent))
+                assert problem.code == code
+                assert f"the RCM {says}" in problem.message
+            with pytest.raises(RequestRefused, match=f"the component placer {re.escape(says)}"):
+                await PlacerClient(client.mesh).request(operation, Placement)
+            asked = NodeClient(client.mesh, round(HANG * SECOND))._ask("a", operation, Placement, HANG)
+            assert f"the node {says}" in refusal(await asked).message
+
+    asyncio.run(story())
+
+
+def test_status_names_who_runs_which_version_where_they_differ(tmp_path: Path, former: Path) -> None:
+    async def story() -> None:
+        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+            lab.node("a", "robot/a")
+            client = await lab.client()
+            await lab.ready(client, "robot/a")
+            alone = await zscout_soon("status", env=lab.env)
+            assert "they differ" not in alone.stdout
+            with lab.at("old"):
+                lab.node("b", "robot/b")
+            await lab.ready(client, "robot/a", "robot/b")
+            mixed = await zscout_soon("status", env=lab.env)
+            words = f"they differ: older than 0.2.0 on b; version {VERSION} on a; this zscout is {VERSION}"
+            assert section(mixed.stdout, "Warnings") == [["versions", words]]
+            shown = json.loads((await zscout_soon("status", "--json", env=lab.env)).stdout)
+            assert shown["version"] == VERSION
+            assert shown["versions"] == [{"version": None, "hosts": ["b"]}, {"version": VERSION, "hosts": ["a"]}]
+
+    asyncio.run(story())
+
+
+@leaders
+def test_a_command_is_told_that_nobody_waits_for_it(tmp_path: Path, former: Path, leads: str) -> None:
+    async def story() -> None:
+        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+            with lab.at(leads):
+                lab.node("a")
+            for version in ("old", "new"):
+                with lab.at(version):
+                    lab.node(version, f"robot/{version}")
+            client = await lab.client()
+            await lab.ready(client, "robot/old", "robot/new")
+            request = "request", "robot/old", "robot/new", "--json", "--", "sleep", "600"
+            lab.spawn([*COMMAND, *request], log="request.log")
+            await lab.logged("request", "not_settling")
+            told = map(json.loads, lab.log("request").splitlines())
+            assert [one["who"] for one in told if one["event"] == "not_settling"] == [who]
+
+    who = ["the RCM at a (older than 0.2.0, this is 0.2.0)"] * (leads == "old") + ["robot/old"]
     asyncio.run(story())
 
 

@@ -47,6 +47,7 @@ _ENDPOINT: Final = re.compile(
     r"(?P<more>[?#][A-Za-z0-9_.,:;=/#-]+)?"
 )
 _PROTOCOLS: Final = ("tcp", "tls", "udp", "quic", "ws")
+_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - read, not bound
 _INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:,@-]{1,64}")
 
 Sites = Annotated[tuple[str, ...], Meta(max_length=MAX_SITES)]
@@ -387,6 +388,18 @@ def _is_host(host: str) -> bool:
         return isinstance(ip_of(host[1:-1]), ipaddress.IPv6Address)
     # Digits and dots alone are meant as an IPv4 address.
     return ip_of(host) is not None if re.fullmatch("[0-9.]+", host) else True
+
+
+def beside(mesh: MeshConfig) -> MeshConfig:
+    """How a second process joins where a node does: on ports of its own, linked to the node's, and without relaying."""
+    listen, connect = [], list(mesh.connect)
+    for found in filter(None, map(_ENDPOINT.fullmatch, mesh.listen)):
+        protocol, host, port, more = found["protocol"], found["host"], found["port"], found["more"] or ""
+        listen.append(f"{protocol}/{host}:0{more}")
+        if int(port):
+            connect.append(f"{protocol}/{_EVERYWHERE.get(host, host)}:{port}{more}")
+    site = mesh.relay[0] if mesh.relay else mesh.site
+    return structs.replace(mesh, listen=tuple(listen), connect=tuple(dict.fromkeys(connect)), site=site, relay=())
 
 
 def ip_of(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Generic, TypeVar
 
 import msgspec
+from msgspec import structs
 
 from zscout import messages
 from zscout.mesh.transport import TransportPublisher, TransportQuery, Undeclare
-from zscout.messages import Malformed, Problem
-from zscout.types import Ns, Term
+from zscout.messages import Malformed, Problem, version_words
+from zscout.types import VERSION, Ns, Term
 
 QUEUE_DEPTH = 1_024
 """Items of one declaration that may wait for the event loop."""
+NOT_UNDERSTOOD: Final = frozenset({"malformed", "bad_name", "bad_request"})
+"""How an operation, a form of a name or a value is refused that only another version knows."""
 
 R = TypeVar("R")
 S = TypeVar("S")
@@ -47,6 +50,21 @@ class Reply(Generic[R]):
     message: R | None
     problem: Problem | None = None
     arrived: Ns = 0
+
+
+def naming_versions(reply: Reply[R] | None, who: str) -> Reply[R] | None:
+    """The same reply. Where `who` is of another version, and may not have understood what it was asked, it says so."""
+    problem = reply.problem if reply is not None else None
+    if reply is None or problem is None or problem.code not in NOT_UNDERSTOOD or problem.version == VERSION:
+        return reply
+    versions = f"{who} is {version_words(problem.version)}, this is {VERSION}"
+    words = f"{problem.message} ({versions}: upgrade the older one if it does not know this)"
+    return replace(reply, problem=structs.replace(problem, message=words))
+
+
+def refuse(query: TransportQuery, problem: Problem) -> None:
+    told = structs.replace(problem, version=VERSION) if problem.code in NOT_UNDERSTOOD else problem
+    query.reply_error(messages.encode(told), Problem)
 
 
 @dataclass(slots=True, eq=False)
@@ -94,7 +112,7 @@ class IncomingQuery(Generic[R]):
         if query is None:
             return
         if isinstance(said, Problem):
-            query.reply_error(messages.encode(said), Problem)
+            refuse(query, said)
         else:
             query.reply(self._reply_key, messages.encode(said), type(said))
         if self.outcome is not None:

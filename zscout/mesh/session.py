@@ -28,13 +28,14 @@ from zscout.mesh.exchange import (
     Publisher,
     Refused,
     Reply,
+    refuse,
 )
 from zscout.mesh.frames import FramePublisher, FrameWatch
 from zscout.mesh.renewal import RenewableTransport, Suspicions
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.transport import Collector, Quality, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem
-from zscout.types import VERSION, Ns
+from zscout.types import Ns
 
 log = logging.getLogger(__name__)
 
@@ -302,7 +303,7 @@ class Mesh:
             try:
                 message = messages.decode(b"{}" if payload is None else payload, kind, limit)
             except Malformed as error:
-                _refuse(query, "malformed", str(error), VERSION)
+                _refuse(query, "malformed", str(error))
                 return
             incoming: IncomingQuery[Any] = IncomingQuery(query, asked, asked if wild else key, message, arrived)
             try:
@@ -310,7 +311,7 @@ class Mesh:
             except Refused as refused:
                 incoming.refuse(refused.problem)
             except BadName as error:
-                incoming.refuse(Problem("bad_name", str(error), version=VERSION))
+                incoming.refuse(Problem("bad_name", str(error)))
             except Exception:
                 incoming.refuse(Problem("internal", "the request failed here; see this node's log"))
                 raise
@@ -484,5 +485,5 @@ class _Collector(Collector):
             self._over()
 
 
-def _refuse(query: TransportQuery, code: str, message: str, version: str = "") -> None:
-    query.reply_error(messages.encode(Problem(code, message, version=version)), Problem)
+def _refuse(query: TransportQuery, code: str, message: str) -> None:
+    refuse(query, Problem(code, message))

@@ -51,6 +51,8 @@ ShortText: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=130)
 """A name, or `kind/name`."""
 VersionText: TypeAlias = Annotated[str, msgspec.Meta(max_length=64)]
 """What `zscout --version` prints where it is from; empty: it is older than versions that tell theirs."""
+FIRST_TOLD = "0.2.0"
+"""The first version that tells itself."""
 Figure: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 Bytes: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=1 << 60)]
 
@@ -99,6 +101,11 @@ def of_the_last(term: Term, known: Term) -> bool:
 def disbelieved(term: Term, known: Term) -> bool:
     """Whether who refused `term` for a lower one, `known`, hears an RCM that it obeys, and goes on to do so."""
     return absurd(term, known) and not of_the_last(term, known)
+
+
+def version_words(version: str) -> str:
+    """What others told as their `version`, for people."""
+    return f"version {version}" if version else f"older than {FIRST_TOLD}"
 
 
 def encode(message: msgspec.Struct) -> bytes:

@@ -250,9 +250,9 @@ def test_devices_that_are_not_there_are_told_by_host() -> None:
     gone = view("robot/d", present=False, reason="bellows is gone", gone=60.0, host="bellows")
     told = mends(seen(fleet, hosts=leading("anvil", "robot/a"), state=led(view("robot/a"), gone)))
     assert [words.partition(";")[0].partition(" since")[0] for _, words in told] == [
-        "robot/d: bellows is gone",
         "not there: robot/b of anvil",
-        "not there: robot/c of forge, which is not seen either",
+        "not there: robot/d of bellows (bellows is gone",
+        "not there: robot/c of forge (that host is not seen either)",
     ]
 
 

@@ -29,9 +29,10 @@ from zscout.behaviors.client.request import (
     check_seconds,
 )
 from zscout.config.certificates import read_certificates
-from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env
+from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
+from zscout.mesh.exchange import naming_versions
 from zscout.mesh.renewal import PATIENCE
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import Done, Foresight, Notice, Problem, RcmState, Who
@@ -112,7 +113,7 @@ class Client(MovableClient):
             host = host or read_certificates(fleet.security).name
         host = host or os.environ.get("ZSCOUT_HOST") or machine
         me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
-        client = cls(await ZenohMesh.open(fleet, me), fleet)
+        client = cls(await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me), fleet)
         client.who = this_program(host if fleet.security is None else machine)
         return client.start()
 
@@ -517,7 +518,8 @@ class Client(MovableClient):
         asked = messages.Foresee(
             new_instance(), name, wanted, priority, seconds, keep, check=True, wait_for_device=waits
         )
-        reply = await self.mesh.ask_one(self._rcm.key, asked, Foresight, timeout=QUERY_TIMEOUT)
+        answered = await self.mesh.ask_one(self._rcm.key, asked, Foresight, timeout=QUERY_TIMEOUT)
+        reply = naming_versions(answered, self._rcm.who)
         if reply is not None and reply.problem is not None:
             raise RequestRefused(reply.problem)
         return reply.message if reply is not None else None

@@ -75,6 +75,11 @@ class DirectHold:
         return min(self._settles.values(), default=DEFAULT_SETTLE)
 
     @property
+    def never_settle(self) -> list[RcName]:
+        """Its RCs that do not know how: foreign ones, and those of v0.1.0."""
+        return [rc for rc in self.rcs if rc not in self._settles]
+
+    @property
     def grace(self) -> Ns:
         """The longest time from SIGTERM to SIGKILL for its program."""
         return self.settle - self.settle // MARGIN

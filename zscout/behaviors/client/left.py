@@ -13,10 +13,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 import msgspec
+from msgspec.structs import replace
 
 from zscout.behaviors.client.client import CONFIRM_AGAIN
 from zscout.behaviors.client.direct import DEFAULT_SETTLE, TELL_TIMEOUT, TRY_AGAIN_AFTER
-from zscout.config.fleet import fleet_from_env
+from zscout.config.fleet import beside, fleet_from_env
 from zscout.config.strict import BadInput
 from zscout.keyexpr import BadName, check_rc, client_of
 from zscout.mesh import Mesh, MeshError, ZenohMesh
@@ -44,7 +45,7 @@ async def _main(env: Mapping[str, str]) -> None:
     fleet, me = fleet_from_env(), client_of(env["ZSCOUT_CLIENT"])
     rcs = [check_rc(rc) for rc in env["ZSCOUT_RCS"].split()]
     grant = msgspec.json.decode(env["ZSCOUT_GRANT"], type=Grant)
-    mesh = await ZenohMesh.open(fleet, me)
+    mesh = await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me)
     try:
         await tell(mesh, rcs, grant, (fleet.timing.hold_lease + DEFAULT_SETTLE) / SECOND)
     finally:

@@ -9,7 +9,9 @@ from typing import Final, Self, TypeVar
 from zscout import messages
 from zscout.behaviors.client.rcm_link import TRY_AGAIN
 from zscout.behaviors.client.request import RequestRefused
+from zscout.keyexpr import Role
 from zscout.mesh import Mesh
+from zscout.mesh.exchange import naming_versions
 from zscout.mesh.supervision import done_within
 from zscout.messages import ComponentSpec, Placement, PlacementOperation, Placements, PlacerOperation, Problem
 from zscout.types import NO_TERM, SECOND, ComponentId, HostName, Term
@@ -129,9 +131,12 @@ class PlacerClient:
         for reply in replies:
             if reply.message is not None:
                 return reply.message
-        problem = next((reply.problem for reply in replies if reply.problem is not None), None)
-        if problem is not None and problem.code not in TRY_AGAIN:
-            raise RequestRefused(problem)
+        if replies:
+            leaders = await self.mesh.living(self.mesh.keys.alive_any(Role.RCM), timeout=RETRY_AFTER)
+            who = " at ".join(["the component placer", *(token.host for token in leaders[:1])])
+            refused = naming_versions(replies[0], who)
+            if refused is not None and refused.problem is not None and refused.problem.code not in TRY_AGAIN:
+                raise RequestRefused(refused.problem)
         return None
 
     def _listed(self, listed: Placements) -> None:

@@ -15,6 +15,7 @@ from zscout.behaviors.client.request import OpenArc, RequestRefused, RequestStor
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, USERS, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
+from zscout.mesh.exchange import naming_versions
 from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
@@ -101,6 +102,11 @@ class RcmLink:
     def _hears(self) -> bool:
         return self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease
 
+    @property
+    def who(self) -> str:
+        """Whom this asks, for people."""
+        return "the RCM" if self.leader is None else f"the RCM at {self.leader}"
+
     async def leader_within(self, seconds: float) -> bool:
         """Waits so long for a leader to appear since `leader_came` was cleared. False: none did."""
         return await done_within(seconds, self.leader_came.wait())
@@ -160,7 +166,7 @@ class RcmLink:
         not."""
         replies = await self.mesh.ask(self.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=self._counts)
         await self._look_for_contradictions(silent=not replies)
-        return max(replies, key=self._counts, default=None)
+        return naming_versions(max(replies, key=self._counts, default=None), self.who)
 
     def _counts(self, reply: Reply[Notice]) -> bool:
         """Whether it is not the word of an RCM that has been replaced."""

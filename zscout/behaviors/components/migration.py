@@ -13,6 +13,7 @@ from zscout import messages
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.components.component import Component, SafePointGate
 from zscout.keyexpr import Role, Sender
+from zscout.mesh.exchange import naming_versions
 from zscout.mesh.supervision import done_within
 from zscout.messages import MAX_CHECKPOINT, MAX_ERROR, MAX_MOVE, ComponentView, MoveComponent, OpenRequest, Problem
 from zscout.types import SECOND, Ns
@@ -181,5 +182,6 @@ class OutgoingMove:
 
     async def _ask(self, operation: Operation, kind: type[R], timeout: float) -> R | Problem | None:
         mesh = self._client.mesh
-        reply = await mesh.ask_one(mesh.keys.component(self.to, mesh.me), operation, kind, timeout=timeout)
+        answered = await mesh.ask_one(mesh.keys.component(self.to, mesh.me), operation, kind, timeout=timeout)
+        reply = naming_versions(answered, f"the node at {self.to}")
         return None if reply is None else reply.message or reply.problem

@@ -282,15 +282,13 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
     homes = {rc: host for host, rcs in _the_fleet(seen).devices.items() for rc in rcs}
     if seen.node is not None:
         homes |= {rc.name: seen.node.host for rc in seen.node.rcs}
-    missing = defaultdict[str, list[str]](list)
+    missing = defaultdict[tuple[str, str], list[str]](list)
     well = 0
     for rc in sorted({*homes, *offered, *views}):
         view, device = views.get(rc), seen.devices.get(rc)
         if rc not in offered and (view is None or not view.present):
-            if view is not None and view.reason and rc not in homes:
-                yield Finding("devices", "mend", f"{rc}: {absence(view)}", f"look at {view.host or 'its host'}")
-            else:
-                missing[homes.get(rc, "")].append(rc)
+            home = homes.get(rc) or (view.host if view is not None else "")
+            missing[home, absence(view) if view is not None else ""].append(rc)
         elif device is not None and device.health != "ok":
             yield Finding("devices", "mend", f"{rc} at {device.host} is lost: {device.health}", "mend the device")
         elif view is not None and not view.present:
@@ -303,18 +301,17 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
             meant = f", and {view.host} is meant" if view is not None and view.host else ""
             remedy = "unless the others are substitutes, remove it from their node files"
             yield Finding("devices", "note", f"{rc} is offered by {_listed(at)}{meant}", remedy)
-        for host in view.unseen if view is not None else ():
+        for other in view.unseen if view is not None else ():
             remedy = "is it up, is the network cut in two? If it has the device no more, it is forgotten after a day"
-            yield Finding("devices", "mend", f"{rc}: its other host {host} is not seen", remedy)
-    for home, rcs in sorted(missing.items()):
+            yield Finding("devices", "mend", f"{rc}: its other host {other} is not seen", remedy)
+    for (home, why), rcs in sorted(missing.items()):
         there = home in seen.hosts and seen.hosts[home].has(Role.NODE)
-        remedy = f"see the log of zscout-node at {home}: has its file these [[rc]] tables?"
-        yield Finding(
-            "devices",
-            "mend",
-            f"not there: {_listed(rcs)} of {home or 'no known host'}" + ("" if there else ", which is not seen either"),
-            remedy if there else f"start zscout-node at {home or 'the host that has it'}",
-        )
+        why = why or ("" if there else "that host is not seen either")
+        remedy = f"start zscout-node at {home or 'the host that has it'}"
+        if there:
+            remedy = f"see the log of zscout-node at {home}: has its file these [[rc]] tables?"
+        says = f"not there: {_listed(rcs)} of {home or 'no known host'}" + (f" ({why})" if why else "")
+        yield Finding("devices", "mend", says, remedy)
     if well and not missing:
         yield Finding("devices", "ok", f"{many(well, 'RC')} there and well")
 

@@ -19,12 +19,12 @@ from zscout.cli.fleet.watching import Overview, show
 from zscout.cli.requests.waiting import reason_text, whose
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
-from zscout.messages import HoldView, Notice, RcmState, RcView, WaitView
+from zscout.messages import HoldView, Notice, RcmState, RcView, WaitView, version_words
 from zscout.terminal import Table, clock, many, span
-from zscout.types import SECOND, Ns
+from zscout.types import SECOND, VERSION, Ns
 
 MAX_NAMED: Final = 8
-"""Components in the row of a host."""
+"""Components in the row of a host, and hosts of one version."""
 MAX_FIGURES_SHOWN: Final = 12
 
 
@@ -122,7 +122,17 @@ class Standing:
         ]
         if self._advisory():
             rows.append(("roles", "they are advisory: nobody proves a name where [security] is not set"))
+        if (versions := mixture(self._versions())) is not None:
+            rows.append(("versions", versions))
         return Table("Warnings", ("ABOUT", "WARNING"), rows, ["yellow"] * len(rows))
+
+    def _versions(self) -> dict[str, str]:
+        """By host what its node tells of its version; empty: it is too old to tell."""
+        hosts = {name: host for name, host in self.fleet_view.hosts.items() if host.has(Role.LOAD)}
+        told = {name: host.load.version for name, host in hosts.items() if host.load is not None}
+        # An RC that does not tell may be none of zscout's.
+        told |= {state.host: state.version for state in self.devices.known().values() if state.version}
+        return told | ({} if self.state is None else {self.state.host: self.state.version})
 
     def _homes(self) -> dict[str, str]:
         """By RC: the host of the instance that is meant; of an RCM that does not say, one that offers it."""
@@ -200,7 +210,7 @@ class Standing:
     def as_object(self) -> dict[str, Any]:
         """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none. `advisory`: rights
         are written down that nobody enforces; `ending`: whose certificate ends soon."""
-        chosen = self.selection()
+        chosen, versions = self.selection(), self._versions()
         state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
         known = self.devices.known()
@@ -220,6 +230,8 @@ class Standing:
 
         return {
             "fleet": self.fleet_view.client.fleet.name,
+            "version": VERSION,
+            "versions": [{"version": told or None, "hosts": hosts} for told, hosts in by_version(versions).items()],
             "links": self.fleet_view.mesh.links(),
             "advisory": self._advisory(),
             "ending": [{"name": name, "ends_in": left} for name, left in self.fleet_view.ending().items()],
@@ -247,6 +259,24 @@ class Standing:
             "load": None if host.load is None else structs.asdict(host.load),
             "age": None if host.load is None else (now - host.reported) / SECOND,
         }
+
+
+def by_version(versions: Mapping[str, str]) -> dict[str, list[str]]:
+    """Hosts by what they tell of their version."""
+    return {told: sorted(host for host in versions if versions[host] == told) for told in sorted(versions.values())}
+
+
+def mixture(versions: Mapping[str, str]) -> str | None:
+    """What is to be said where nodes, or they and this program, are of different versions."""
+    if set(versions.values()) <= {VERSION}:
+        return None
+    parts = [f"{version_words(told)} on {_some(hosts)}" for told, hosts in by_version(versions).items()]
+    return f"they differ: {'; '.join(parts)}; this zscout is {VERSION}"
+
+
+def _some(hosts: Sequence[str]) -> str:
+    more = len(hosts) - MAX_NAMED
+    return ", ".join(hosts[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _waiting(state: RcmState, ranks: Mapping[str, int]) -> Table:

@@ -13,7 +13,7 @@ import click
 from msgspec.structs import replace
 
 from zscout.behaviors.client.arc import Held
-from zscout.behaviors.client.client import Client, CommandRefused
+from zscout.behaviors.client.client import QUERY_TIMEOUT, Client, CommandRefused
 from zscout.behaviors.client.direct import DEFAULT_SETTLE, DirectHold
 from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common
@@ -23,10 +23,10 @@ from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, whose
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
-from zscout.messages import Foresight, RcmState
+from zscout.messages import Foresight, RcmState, StateAsk, version_words
 from zscout.scheduling.reason import waits
 from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
-from zscout.types import SECOND, Ns
+from zscout.types import SECOND, VERSION, Ns
 
 TAKEN_AWAY: Final = 75
 """EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""
@@ -221,7 +221,7 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
             command.terminate(hold.ended_at)
 
     try:
-        async with command:
+        async with command, common.beside(_tell_who_is_old(report, held, client, direct)):
             if direct is not None:
                 direct.watch(follow)
                 follow(direct)
@@ -241,6 +241,18 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
         if held.active:
             await client.end(held.arc)
     return None
+
+
+async def _tell_who_is_old(report: Report, held: Held, client: Client, direct: DirectHold | None) -> None:
+    """Says who does not know that the next holder is to wait until the command is gone."""
+    key, asked = client.mesh.keys.rcm_state, StateAsk(holds_only=True)
+    reply = await client.mesh.ask_one(key, asked, RcmState, timeout=QUERY_TIMEOUT)
+    state, who = reply.message if reply is not None else None, [] if direct is None else direct.never_settle
+    if state is not None and any(hold.grant == held.grant and not hold.direct for hold in state.holds):
+        who = [f"the RCM at {state.host} ({version_words(state.version)}, this is {VERSION})", *who]
+    if who:
+        told = f"the next holder may begin before the command is gone: {', '.join(who)} can't make it wait; upgrade"
+        report.event("not_settling", told, who=who)
 
 
 def _grace(wanted: HoldOptions, report: Report, direct: DirectHold | None) -> float:

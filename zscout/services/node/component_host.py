@@ -12,7 +12,7 @@ import msgspec
 
 from zscout import messages
 from zscout.behaviors.components.component import installed_kinds
-from zscout.config.fleet import Fleet
+from zscout.config.fleet import Fleet, beside
 from zscout.config.node import MAX_KINDS, ComponentsConfig
 from zscout.keyexpr import BadName, check_name
 from zscout.mesh import IncomingQuery, Mesh, Refused, Supervisor
@@ -21,7 +21,6 @@ from zscout.services.authority import Authority
 from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.services.node.process_use import RunningComponent
-from zscout.services.recorder.process import beside
 
 log = logging.getLogger("zscout.components")
 

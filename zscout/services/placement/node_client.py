@@ -10,6 +10,7 @@ import msgspec
 from zscout import messages
 from zscout.config.node import MAX_KINDS
 from zscout.mesh import Mesh, Reply
+from zscout.mesh.exchange import naming_versions
 from zscout.placement import events
 from zscout.types import SECOND, HostName, Ns
 
@@ -75,4 +76,5 @@ class NodeClient:
         return answered("moved", dead=reply.message.dead)
 
     async def _ask(self, host: HostName, message: msgspec.Struct, kind: type[R], timeout: float) -> Reply[R] | None:
-        return await self.mesh.ask_one(self.mesh.keys.component(host, self.mesh.me), message, kind, timeout=timeout)
+        key = self.mesh.keys.component(host, self.mesh.me)
+        return naming_versions(await self.mesh.ask_one(key, message, kind, timeout=timeout), f"the node at {host}")

@@ -19,7 +19,7 @@ from typing import Final
 
 import msgspec
 
-from zscout.config.fleet import Fleet, MeshConfig
+from zscout.config.fleet import Fleet, beside
 from zscout.config.node import RecorderConfig
 from zscout.config.strict import BadInput
 from zscout.mesh import Supervisor
@@ -44,9 +44,6 @@ MEGABYTE: Final = 1_000_000
 HALF_DONE: Final = 3_600.0
 """Seconds after which what was to become a finished recording is a leftover."""
 MAX_A_SECOND: Final = 100
-
-_ENDPOINT: Final = re.compile(r"([a-z]+)/(\[[^\]]*\]|[^:]*):(\d+)(.*)")
-_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - read, not bound
 
 
 class RecorderJob(msgspec.Struct, frozen=True):
@@ -77,17 +74,6 @@ def decode_job(line: bytes) -> RecorderJob:
         return msgspec.json.decode(line, type=RecorderJob, dec_hook=lambda path, value: path(value))
     except (msgspec.MsgspecError, UnicodeDecodeError, TypeError) as error:
         raise BadInput(f"standard input: no job for a recorder ({error}); let zscout-node start it") from None
-
-
-def beside(mesh: MeshConfig) -> MeshConfig:
-    """How a second process joins where a node does: on ports of its own, and linked to the node's."""
-    listen, connect = [], list(mesh.connect)
-    for found in filter(None, map(_ENDPOINT.fullmatch, mesh.listen)):
-        protocol, host, port, more = found.groups()
-        listen.append(f"{protocol}/{host}:0{more}")
-        if int(port):
-            connect.append(f"{protocol}/{_EVERYWHERE.get(host, host)}:{port}{more}")
-    return msgspec.structs.replace(mesh, listen=tuple(listen), connect=tuple(dict.fromkeys(connect)))
 
 
 def new_recording(folder: Path, fleet: str) -> Path:
