@@ -36,8 +36,9 @@ def test_it_hears_what_becomes_of_the_service(tmp_path: Path, abstract: bool) ->
         run(story())
 
 
-@pytest.mark.parametrize("pid", ["", str(os.getpid()), "1"])
-def test_the_watchdog_hears_of_it_three_times_in_its_time_from_when_it_is_ready(tmp_path: Path, pid: str) -> None:
+@pytest.mark.parametrize("whose", ["nobody's", "own", "another's"])
+def test_the_watchdog_hears_of_it_three_times_in_its_time_from_when_it_is_ready(tmp_path: Path, whose: str) -> None:
+    pid = {"nobody's": "", "own": str(os.getpid()), "another's": "1"}[whose]
     with NotifySocket(str(tmp_path / "notify")) as heard:
         variables = {"NOTIFY_SOCKET": heard.address, "WATCHDOG_USEC": "30000000"}
         manager = ServiceManager.from_env(variables | ({"WATCHDOG_PID": pid} if pid else {}))
