@@ -19,7 +19,7 @@ from zscout.cli.fleet.watching import Overview, show
 from zscout.cli.requests.waiting import reason_text, whose
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
-from zscout.messages import HoldView, Notice, RcmState, RcView, WaitView, version_words
+from zscout.messages import HoldView, Notice, RcmState, RcState, RcView, WaitView, version_words
 from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -127,12 +127,7 @@ class Standing:
         return Table("Warnings", ("ABOUT", "WARNING"), rows, ["yellow"] * len(rows))
 
     def _versions(self) -> dict[str, str]:
-        """By host what its node tells of its version; empty: it is too old to tell."""
-        hosts = {name: host for name, host in self.fleet_view.hosts.items() if host.has(Role.LOAD)}
-        told = {name: host.load.version for name, host in hosts.items() if host.load is not None}
-        # An RC that does not tell may be none of zscout's.
-        told |= {state.host: state.version for state in self.devices.known().values() if state.version}
-        return told | ({} if self.state is None else {self.state.host: self.state.version})
+        return versions(self.fleet_view.hosts, self.devices.known(), self.state)
 
     def _homes(self) -> dict[str, str]:
         """By RC: the host of the instance that is meant; of an RCM that does not say, one that offers it."""
@@ -259,6 +254,15 @@ class Standing:
             "load": None if host.load is None else structs.asdict(host.load),
             "age": None if host.load is None else (now - host.reported) / SECOND,
         }
+
+
+def versions(hosts: Mapping[str, Host], devices: Mapping[str, RcState], state: RcmState | None) -> dict[str, str]:
+    """By host what its node tells of its version; empty: it is too old to tell."""
+    loads = {name: host.load for name, host in hosts.items() if host.has(Role.LOAD)}
+    told = {name: load.version for name, load in loads.items() if load is not None}
+    # An RC that does not tell may be none of zscout's.
+    told |= {device.host: device.version for device in devices.values() if device.version}
+    return told | ({} if state is None else {state.host: state.version})
 
 
 def by_version(versions: Mapping[str, str]) -> dict[str, list[str]]:
