@@ -41,7 +41,8 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
     what has to do with them: an RC with who holds it and who waits for it, an ARC with its RCs and their holders, a
     host with its RCs and programs. Exit code 1: nothing has one of these names.
 
-    The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
+    Warnings come first: of certificates that end within 14 days, roles that nobody enforces, versions that differ. The
+    queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
     where they are not there; other hosts that died only with --watch. A device that says that something is wrong with
     it is shown with its words, and counts as lost until it is well; one that was seen within a day, or that the fleet
     file expects, with why it is gone; one that several hosts offer, with those that stand by. --watch refreshes once a
