@@ -10,6 +10,7 @@ import pytest
 
 from tests.deploy.machine import PROJECT
 from tests.hang import HANG
+from zscout.config.fleet import load_fleet
 from zscout.config.node import load_node
 
 SAMPLE = PROJECT / "deploy" / "sample"
@@ -27,6 +28,15 @@ def test_a_sample_file_is_read_and_offers_what_its_fleet_expects(host: str) -> N
     roles = node.fleet.access.roles
     assert roles.manager == HOSTS
     assert all(any(fnmatchcase(rc.name, pattern) for pattern in roles.node[host]) for rc in node.rcs)
+
+
+def test_the_sample_relay_joins_the_site_of_the_sample_fleet_to_another() -> None:
+    relay = load_node(SAMPLE / "relay.toml")
+    hall = load_fleet(SAMPLE / "fleet.toml")
+    assert hall.mesh.site in relay.fleet.mesh.relay
+    assert (relay.fleet.mesh.site, relay.candidate, relay.rcs) == (None, False, ())
+    assert relay.fleet.access.roles.relay == (relay.host,)
+    assert [one for one in hall.mesh.connect if f"/{relay.host}." in one]
 
 
 def instructions() -> list[tuple[str, str]]:

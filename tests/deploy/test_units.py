@@ -5,22 +5,28 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import AsyncExitStack, closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import cv2
 import pytest
+from msgspec.structs import replace
 
 from tests.cli import tools
 from tests.deploy.machine import PROJECT, Machine, missing
 from tests.drivers.mjpeg import numbered
 from tests.hang import HANG
+from tests.live.closed import make_keys
 from tests.live.lab import Lab
+from zscout.behaviors.client.client import Client
 from zscout.config.certificate_authority import CertificateAuthority
+from zscout.config.fleet import load_fleet
+from zscout.keyexpr import Role
 
 UNITS = sorted((PROJECT / "deploy" / "systemd").glob("*.service"))
 EXPOSURE = 2.0
@@ -194,6 +200,46 @@ def test_a_certificate_that_ends_soon_is_among_what_failed(machine: Machine, tmp
             machine.run("systemctl", "start", "zscout-cert-renew")
             machine.until("zscout-cert-renew", ActiveState="inactive", ExecMainStatus="0")
     assert "ends soon: renew it" in machine.log()
+
+
+@pytest.mark.live
+def test_the_sample_relay_joins_two_sites_as_its_unit_has_it(machine: Machine, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        endpoint = f"tls/127.0.0.1:{free.getsockname()[1]}"
+    sample = PROJECT / "deploy" / "sample"
+    fleet = (sample / "fleet.toml").read_text().replace("[mesh]", "[mesh]\nmulticast = false")
+    machine.write("/etc/zscout/fleet.toml", fleet)
+    machine.write("/etc/zscout/relay.toml", (sample / "relay.toml").read_text().replace("tls/0.0.0.0:7447", endpoint))
+    make_keys(tmp_path, "gate", "ada", "ben")
+    machine.path("/etc/zscout/keys").mkdir(exist_ok=True)
+    for file in (tmp_path / "gate").iterdir():
+        machine.write(f"/etc/zscout/keys/{file.name}", file.read_text())
+        machine.run("chgrp", "zscout", f"/etc/zscout/keys/{file.name}")
+        machine.path(f"/etc/zscout/keys/{file.name}").chmod(0o640)
+    machine.write("/etc/systemd/system/zscout-relay.service.d/strict.conf", "[Service]\nSystemCallErrorNumber=kill\n")
+    machine.run("systemctl", "daemon-reload")
+    machine.run("systemctl", "start", "zscout-relay")  # returns when it is ready
+
+    async def story() -> None:
+        hall = load_fleet(sample / "fleet.toml")
+        mesh = replace(hall.mesh, multicast=False, listen=(), connect=(endpoint,))
+        async with AsyncExitStack() as stack:
+            for name, site in (("ada", "hall"), ("ben", "annex")):
+                fleet = replace(hall, security=tmp_path / name, mesh=replace(mesh, site=site))
+                client = await stack.enter_async_context(Client.connect(fleet=fleet))
+            found: set[str] = set()
+            while found != {"ada", "ben"}:
+                tokens = await client.mesh.living(client.mesh.keys.alive_any(Role.CLIENT), timeout=1)
+                found = {token.host for token in tokens}
+
+    async def within() -> None:
+        async with asyncio.timeout(HANG):
+            await story()
+
+    asyncio.run(within())
+    assert machine.show("zscout-relay", "NRestarts", "ActiveState") == {"NRestarts": "0", "ActiveState": "active"}
+    machine.run("systemctl", "stop", "zscout-relay")
+    machine.until("zscout-relay", ActiveState="inactive", Result="success", ExecMainStatus="0")
 
 
 def test_the_keys_of_a_host_are_not_of_the_group_that_people_may_be_in() -> None:

@@ -19,8 +19,8 @@ from zscout.config.node import default_node
 from zscout.config.strict import BadInput, Where
 from zscout.keyexpr import Role, Token
 from zscout.mesh.probing import Called, Heard
-from zscout.messages import LoadReport, RcmState, RcState, RcView
-from zscout.types import Term
+from zscout.messages import LoadReport, RcmState, RcState, RcView, version_words
+from zscout.types import VERSION, Term
 
 NOW = datetime(2026, 5, 1, 12, tzinfo=UTC)
 DAY = timedelta(days=1)
@@ -46,11 +46,11 @@ def host(name: str, *roles: str, rcs: Collection[str] = (), **load: object) -> d
 
 
 def leading(name: str = "anvil", *rcs: str, **load: object) -> dict[str, Host]:
-    return host(name, Role.NODE, Role.CANDIDATE, Role.RCM, Role.LOAD, rcs=rcs, **({"version": "1"} | load))
+    return host(name, Role.NODE, Role.CANDIDATE, Role.RCM, Role.LOAD, rcs=rcs, **({"version": VERSION} | load))
 
 
 def led(*views: RcView, by: str = "anvil") -> RcmState:
-    return RcmState(Term(3, by), 1, by, rcs=list(views), version="1")
+    return RcmState(Term(3, by), 1, by, rcs=list(views), version=VERSION)
 
 
 def seen(fleet: Fleet = PLAIN, **more: object) -> Evidence:
@@ -95,16 +95,21 @@ def test_a_bad_file_is_told_with_its_remedy_and_is_all_that_is_looked_at() -> No
 
 def test_a_certificate_that_ends_soon_is_told_of_every_host_and_of_ones_own_once() -> None:
     hosts = leading(certificate_ends_in=86_400.0, renew=True) | host(
-        "bellows", Role.NODE, Role.LOAD, certificate_ends_in=-60.0, renew=True, version="1"
+        "bellows", Role.NODE, Role.LOAD, certificate_ends_in=-60.0, renew=True, version=VERSION
     )
     ends = [
         "the certificate of anvil ends in 1 d; renew it (zscout cert renew)",
         "the certificate of bellows has ended 1 min ago; renew it (zscout cert renew)",
     ]
     for own in (certificates("anvil", lasts=40 * DAY, begun=39 * DAY), certificates()):
-        assert [words for _, words in mends(seen(CLOSED, certificates=own, hosts=hosts))] == ends
+        assert [words for _, words in mends(seen(CLOSED, certificates=own, seals=True, hosts=hosts))] == ends
     healthy = leading(certificate_ends_in=200 * 86_400.0)
     assert not mends(seen(CLOSED, certificates=certificates(), hosts=healthy))
+
+
+def test_a_manager_without_the_key_of_places_is_told() -> None:
+    assert the_mend(seen(CLOSED, certificates=certificates("anvil"))).says.startswith("keys has no places.key: ")
+    assert not mends(seen(CLOSED, certificates=certificates("anvil"), seals=True))
 
 
 def test_who_has_no_role_is_told_so() -> None:
@@ -283,7 +288,7 @@ def test_a_mixture_of_versions_is_noted_and_nothing_to_mend() -> None:
     mixed = seen(hosts=leading() | host("bellows", Role.NODE, Role.LOAD))
     assert not mends(mixed)
     assert [(one.state, one.says) for one in findings(mixed) if one.about == "versions"] == [
-        ("note", "several run: 1 (anvil), older than 0.2.0 (bellows)")
+        ("note", f"they differ: {version_words('')} on bellows; version {VERSION} on anvil; this zscout is {VERSION}")
     ]
 
 

@@ -18,7 +18,7 @@ import click
 from zscout import terminal
 from zscout.cli import common
 from zscout.cli.fleet.findings import Evidence, Finding, findings
-from zscout.config.certificates import MAX_FILE, read_cas, read_certificates
+from zscout.config.certificates import MAX_FILE, read_cas, read_certificates, read_places_key
 from zscout.config.fleet import Fleet
 from zscout.config.node import load_node
 from zscout.config.strict import BadInput, read_text
@@ -117,6 +117,7 @@ def _look_at_certificates(seen: Evidence, fleet: Fleet) -> str:
         seen.certificates = read_certificates(fleet.security)
         seen.host = seen.host or seen.certificates.name
         seen.certificates.check(seen.at, seen.host)
+        seen.seals = read_places_key(fleet.security) is not None
     except BadInput as error:
         seen.bad.append(("certificate", error))
     return cas

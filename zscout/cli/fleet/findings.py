@@ -9,10 +9,12 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Final, Literal
 
 from zscout.cli.device_words import absence, ending
-from zscout.config.certificates import CA, Certificates, Validity, shown
+from zscout.cli.fleet.status import mixture, versions
+from zscout.config.certificates import CA, PLACES_KEY, Certificates, Validity, shown
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role
 from zscout.terminal import many
+from zscout.types import VERSION
 
 if TYPE_CHECKING:
     from zscout.cli.fleet.fleet_view import Host
@@ -53,6 +55,8 @@ class Evidence:
     bad: list[tuple[str, BadInput]] = field(default_factory=list)
     """About what, and what is wrong with it."""
     certificates: Certificates | None = None
+    seals: bool = False
+    """Whether the key by which managers seal places is there."""
     interfaces: Mapping[str, str] = field(default_factory=dict)
     """Those that multicast would use, with why it can't."""
     heard: Sequence[Heard] = ()
@@ -99,13 +103,18 @@ def _certificate(seen: Evidence) -> Iterator[Finding]:
     fleet, own = _the_fleet(seen), seen.certificates
     if own is None or any(about == "certificate" for about, _ in seen.bad):
         return
-    if not fleet.access.ranks_of(own.name):
+    ranks = fleet.access.ranks_of(own.name)
+    if not ranks:
         says = f"{own.cert}: {own.name} has no role in fleet {fleet.name}"
         yield Finding("certificate", "mend", says, "name it under [roles] of the fleet file, on all hosts")
     elif own.soon(seen.at):
         yield _ends_soon(own.name, own.ends_in(seen.at))
     else:
         yield Finding("certificate", "ok", f"{own.cert}: {own.name}, by {own.issuer}, until {shown(own.ends)}")
+
+    if "manager" in ranks and not seen.seals:
+        says = f"{own.folder} has no {PLACES_KEY}: the places that {own.name} gives, when it leads, are not sealed"
+        yield Finding("certificate", "mend", says, "copy it from the CA's folder")
 
 
 def _ends_soon(name: str, left: float) -> Finding:
@@ -323,16 +332,11 @@ def _hosts(seen: Evidence) -> Iterator[Finding]:
     for name, report in reports.items():
         if report.renew and name != own:
             yield _ends_soon(name, report.certificate_ends_in or 0.0)
-    told = {state.host: state.version for state in seen.devices.values()}
-    told |= {} if seen.state is None else {seen.state.host: seen.state.version}
-    versions = defaultdict[str, list[str]](list)
-    for name, version in sorted((told | {name: report.version for name, report in reports.items()}).items()):
-        versions[version or "older than 0.2.0"].append(name)
-    if len(versions) > 1:
-        mixture = ", ".join(f"{version} ({_listed(names)})" for version, names in sorted(versions.items()))
-        yield Finding("versions", "note", f"several run: {mixture}", "upgrade what is old, and use new settings then")
-    elif versions:
-        yield Finding("versions", "ok", f"all hosts run {next(iter(versions))}")
+    told = versions(seen.hosts, seen.devices, seen.state)
+    if (words := mixture(told)) is not None:
+        yield Finding("versions", "note", words, "upgrade what is old, and use new settings then")
+    elif told:
+        yield Finding("versions", "ok", f"all run {VERSION}, as this command does")
 
 
 def _clock(seen: Evidence) -> Iterator[Finding]:

@@ -19,7 +19,7 @@ from zscout.cli.fleet.watching import Overview, show
 from zscout.cli.requests.waiting import reason_text, whose
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
-from zscout.messages import HoldView, Notice, RcmState, RcView, WaitView, version_words
+from zscout.messages import HoldView, Notice, RcmState, RcState, RcView, WaitView, version_words
 from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -41,7 +41,8 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
     what has to do with them: an RC with who holds it and who waits for it, an ARC with its RCs and their holders, a
     host with its RCs and programs. Exit code 1: nothing has one of these names.
 
-    The queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
+    Warnings come first: of certificates that end within 14 days, roles that nobody enforces, versions that differ. The
+    queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
     where they are not there; other hosts that died only with --watch. A device that says that something is wrong with
     it is shown with its words, and counts as lost until it is well; one that was seen within a day, or that the fleet
     file expects, with why it is gone; one that several hosts offer, with those that stand by. --watch refreshes once a
@@ -127,12 +128,7 @@ class Standing:
         return Table("Warnings", ("ABOUT", "WARNING"), rows, ["yellow"] * len(rows))
 
     def _versions(self) -> dict[str, str]:
-        """By host what its node tells of its version; empty: it is too old to tell."""
-        hosts = {name: host for name, host in self.fleet_view.hosts.items() if host.has(Role.LOAD)}
-        told = {name: host.load.version for name, host in hosts.items() if host.load is not None}
-        # An RC that does not tell may be none of zscout's.
-        told |= {state.host: state.version for state in self.devices.known().values() if state.version}
-        return told | ({} if self.state is None else {self.state.host: self.state.version})
+        return versions(self.fleet_view.hosts, self.devices.known(), self.state)
 
     def _homes(self) -> dict[str, str]:
         """By RC: the host of the instance that is meant; of an RCM that does not say, one that offers it."""
@@ -259,6 +255,15 @@ class Standing:
             "load": None if host.load is None else structs.asdict(host.load),
             "age": None if host.load is None else (now - host.reported) / SECOND,
         }
+
+
+def versions(hosts: Mapping[str, Host], devices: Mapping[str, RcState], state: RcmState | None) -> dict[str, str]:
+    """By host what its node tells of its version; empty: it is too old to tell."""
+    loads = {name: host.load for name, host in hosts.items() if host.has(Role.LOAD)}
+    told = {name: load.version for name, load in loads.items() if load is not None}
+    # An RC that does not tell may be none of zscout's.
+    told |= {device.host: device.version for device in devices.values() if device.version}
+    return told | ({} if state is None else {state.host: state.version})
 
 
 def by_version(versions: Mapping[str, str]) -> dict[str, list[str]]:
