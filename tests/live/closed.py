@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -41,11 +41,11 @@ def make_authority(folder: Path) -> CertificateAuthority:
     return CertificateAuthority.read(folder, datetime.now(UTC))
 
 
-def make_keys(folder: Path, *names: str) -> CertificateAuthority:
+def make_keys(folder: Path, *names: str, managers: Sequence[str] = MANAGERS) -> CertificateAuthority:
     """A CA, and a certificate for each name, in folders of their names."""
     authority = make_authority(folder / "ca")
     for name in names:
-        authority.issue(name, folder / name, DAY, datetime.now(UTC), manager=name in MANAGERS)
+        authority.issue(name, folder / name, DAY, datetime.now(UTC), manager=name in managers)
     return authority
 
 

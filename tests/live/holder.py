@@ -4,10 +4,10 @@
 
 Orders come as JSON lines on stdin, what happens goes out as JSON lines on stdout, with `at` in ns of this host's clock.
 Orders: {"order": "ask", "arc", "needs", "priority", "min_runtime", "keep"}, {"order": "command", "rc", "do", "ttl"}
-under the last grant of this process, {"order": "work", "rcs"}: commands these RCs all the time, until one refuses it
-("disturbed"); {"order": "beats"}: how often they have obeyed since it was asked last; {"order": "state"}: the RCM's;
-{"order": "time", "rc"}: how long it takes from a request to the confirmed grant; {"order": "end"}. It ends when its
-stdin does.
+under the last grant of this process, with "anew" one without an id, {"order": "work", "rcs"}: commands these RCs all
+the time, until one refuses it ("disturbed"); {"order": "beats"}: how often they have obeyed since it was asked last;
+{"order": "state"}: the RCM's; {"order": "time", "rc"}: how long it takes from a request to the confirmed grant;
+{"order": "end"}. It ends when its stdin does.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from zscout.behaviors.client.client import Client, CommandRefused, RequestRefuse
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Mesh, clock
+from zscout.messages import Command, Done
 from zscout.types import Grant
 
 HOST = sys.argv[2] if len(sys.argv) > 2 else None
@@ -106,8 +107,13 @@ class Holder:
             while asked.grant == grant:
                 await self.client.changed(asked)
 
-    async def _command(self, rc: str, do: dict[str, Any], ttl: float = 1.0) -> None:
+    async def _command(self, rc: str, do: dict[str, Any], ttl: float = 1.0, *, anew: bool = False) -> None:
         assert self.grant is not None
+        if anew:
+            key = self.client.mesh.keys.command(rc, self.client.mesh.me)
+            await self.client.mesh.ask_one(key, Command(do, self.grant, ttl), Done, timeout=ttl)
+            say("command", code="done")
+            return
         try:
             done = await self.client.command(rc, self.grant, do, ttl=ttl)
         except CommandRefused as refused:

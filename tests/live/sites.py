@@ -37,6 +37,9 @@ from zscout.types import Grant, Ns
 SITES: Final = ("a", "b")
 GATE: Final = "gate"
 """The relay."""
+SPARE: Final = "spare"
+"""A second one, where there are two."""
+GATES: Final = (GATE, SPARE)
 NODES: Final = {
     "a1": ("robot/a1",),
     "a2": ("robot/a2", "robot/a3"),
@@ -76,12 +79,12 @@ class SitesNet:
         return f"{self.mark}-{host}"
 
     def address(self, host: str, site: str) -> str:
-        number = 1 if host == GATE else 2 + self.hosts[site].index(host)
+        number = 1 + GATES.index(host) if host in GATES else 3 + self.hosts[site].index(host)
         return f"10.84.{SITES.index(site)}.{number}"
 
     def open(self) -> None:
         net.remove_leftovers()
-        for host in (GATE, *self.hosts["a"], *self.hosts["b"]):
+        for host in (*GATES, *self.hosts["a"], *self.hosts["b"]):
             net.ip("netns", "add", self.space(host))
             net.ip("-n", self.space(host), "link", "set", "lo", "up")
         for number, site in enumerate(SITES):
@@ -90,8 +93,8 @@ class SitesNet:
             net.ip("netns", "add", lan)
             net.ip("-n", lan, "link", "add", "lan", "type", "bridge", "mcast_snooping", "0")
             net.ip("-n", lan, "link", "set", "lan", "up")
-            for host in (GATE, *self.hosts[site]):
-                space, card = self.space(host), f"eth{number if host == GATE else 0}"
+            for host in (*GATES, *self.hosts[site]):
+                space, card = self.space(host), f"eth{number if host in GATES else 0}"
                 net.ip("-n", lan, "link", "add", host, "type", "veth", "peer", "name", card, "netns", space)
                 net.ip("-n", lan, "link", "set", host, "master", "lan", "up")
                 net.ip("-n", space, "addr", "add", f"{self.address(host, site)}/24", "dev", card)
@@ -166,24 +169,26 @@ class Program(HolderProcess):
 class Sites:
     """The fleet: in each site two nodes and a desk for programs. Use as an async context manager."""
 
-    def __init__(self, folder: Path, *, secured: bool = False, lease: float = 1.0) -> None:
+    def __init__(self, folder: Path, *, secured: bool = False, lease: float = 1.0, relays: int = 1) -> None:
         self.folder, self.net, self.secured = folder, SitesNet(), secured
+        self.gates = GATES[:relays]
         self.processes = net.Processes(self.net, folder)
         self.programs: list[Program] = []
+        self.log_level = "info"
         name = f"sites-{self.net.mark}"
         self._write(
             "gate", f'relay = ["a", "b"]\nlisten = ["{self._endpoint("[::]")}"]\ninterface = "eth0,eth1"', name, lease
         )
         for site in SITES:
-            gate = self._endpoint(self.net.address(GATE, site))
-            self._write(site, f'site = "{site}"\nconnect = ["{gate}"]\ninterface = "eth0"', name, lease)
+            gates = ", ".join(f'"{self._endpoint(self.net.address(gate, site))}"' for gate in self.gates)
+            self._write(site, f'site = "{site}"\nconnect = [{gates}]\ninterface = "eth0"', name, lease)
         if secured:
-            make_keys(folder / "certificates", GATE, "ada", *NODES)
-        for host in (GATE, *NODES):
+            make_keys(folder / "certificates", GATE, "ada", *NODES, managers=("a1", "b1"))
+        for host in (*self.gates, *NODES):
             rcs = "".join(f'[[rc]]\nname = "{rc}"\ndriver = "exclusive"\n' for rc in NODES.get(host, ()))
             more = f'[security]\nfolder = "certificates/{host}"\n' if secured else ""
             site = "a"
-            if host == GATE:
+            if host in GATES:
                 listen = self._endpoint("[::]")
                 more += f'[mesh]\nrelay = ["a", "b"]\nlisten = ["{listen}"]\nconnect = []\ninterface = "eth0,eth1"\n'
             else:
@@ -204,8 +209,9 @@ class Sites:
     async def __aenter__(self) -> Self:
         try:
             self.net.open()
-            for host in (GATE, *NODES):
+            for host in (*self.gates, *NODES):
                 command = [sys.executable, "-m", "zscout.node", str(self.folder / f"{host}.toml")]
+                command += ["--log-level", self.log_level]
                 self.processes.start(host, command)
         except BaseException:
             await self.__aexit__(None, None, None)

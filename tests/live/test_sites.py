@@ -97,6 +97,43 @@ def test_the_next_in_the_other_site_follows_a_holder_that_was_killed(tmp_path: P
     asyncio.run(story())
 
 
+def test_what_two_relays_bring_twice_is_carried_out_once(tmp_path: Path) -> None:
+    count, do = 20, {"name": "echo", "value": 1}
+
+    async def story() -> None:
+        sites = Sites(tmp_path, lease=PATIENT, relays=2)
+        sites.log_level = "debug"
+        async with sites:
+            program = await sites.program("a", "across")
+            await sites.whole(program)
+            await program.asks("across", "robot/b1")
+            await program.enters()
+
+            async def commands(number: int, **how: bool) -> None:
+                for _ in range(number):
+                    await program.order("command", rc="robot/b1", do=do, ttl=30, **how)
+                    assert (await program.event("command"))["code"] == "done"
+
+            def carried_out() -> int:
+                return (tmp_path / "b1.log").read_text().count('"do":"command"')
+
+            async def reaches(number: int) -> None:
+                async with asyncio.timeout(HANG):
+                    while carried_out() < number:  # noqa: ASYNC110
+                        await asyncio.sleep(0.05)
+
+            before = carried_out()
+            await commands(count, anew=True)
+            await reaches(before + 2 * count)  # so it arrives twice
+            before = carried_out()
+            await commands(count)
+            await commands(1, anew=True)
+            await reaches(before + count + 2)
+            assert carried_out() == before + count + 2
+
+    asyncio.run(story())
+
+
 @DOORS
 @pytest.mark.parametrize("fault", get_args(Fault))
 def test_each_site_leads_itself_without_the_relay_and_the_merge_ends_no_hold(
