@@ -31,6 +31,7 @@ def _number(default: str, low: str, high: str, below: str, above: str) -> Key:
 
 
 TRUTH: Final = ('"yes"', "1")
+ROLES: Final = ("viewer", "client", "operator", "manager", "relay")
 NAMES: Final = ('"a/b"', '""', "5")
 
 FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
@@ -84,6 +85,20 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "gain": _number("0.3", "0.05", "100", "0.04", "101"),
         "steady": _number("10.0", "0.05", "3600", "0.04", "3601"),
         "rest": _number("60.0", "0.05", "86_400", "0.04", "86_401"),
+    },
+    "roles": {
+        **{role: Key("[]", ('["ada"]',), ('["a/b"]', '["ada", "ada"]', '"ada"')) for role in ROLES},
+        "node": Key(
+            "{}", ('{ anvil = ["robot/scout33", "radio/*"] }',), ('{ anvil = ["robot"] }', '{ "a/b" = [] }', "1")
+        ),
+    },
+    "ceilings.client": {
+        "priority": Key(None, ("5",), ("1_000_001", '"5"')),
+        "runtime": _number("0.0", "1", "31_622_400", "-1", "31_622_401"),
+    },
+    "quotas.bob": {
+        "arcs": Key(None, ("5",), ("-1", "100_001", '"5"')),
+        "rcs": Key(None, ("5",), ("-1", "100_001", '"5"')),
     },
 }
 NODE: Final[Mapping[str, Mapping[str, Key]]] = {
