@@ -36,6 +36,8 @@ BAD_NODES = {
     f"[node]\nlabels = {['a'] * 33}": "node.labels: has 33 entries; at most 32 are allowed",
     "[mesh]\nlease = 1": "mesh.lease: unknown key; known here: connect, interface, listen, relay, site",
     '[mesh]\nrelay = ["a"]': 'mesh.relay: joins a to nothing; name the sites, as in ["north", "south"]',
+    '[mesh]\nrelay = ["a", "b"]\n[recorder]': "recorder: its process would be a second relay; "
+    "let the node of a site record",
     '[mesh]\nsite = "a"\nrelay = ["a", "b"]': "mesh.site: a relay is of none of its sites; remove site, or relay",
     '[mesh]\nconnect = ["anvil"]': f'mesh.connect[0]: "anvil" is not an endpoint; {ENDPOINT_RULE}',
     '[mesh]\ninterface = "a b"': 'mesh.interface: "a b" names no interface; write "auto", or as in "eth0"',

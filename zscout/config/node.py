@@ -163,6 +163,8 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     mesh = structs.replace(fleet.mesh, **own)
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_sites(mesh, top / "mesh")
+    if mesh.relay and file.recorder is not None:
+        raise (top / "recorder").bad("its process would be a second relay", "let the node of a site record")
     security = fleet.security if file.security is None else keys_folder(file.security, folder, top)
     fleet = structs.replace(fleet, mesh=mesh, security=security)
     check_security(fleet, top)
