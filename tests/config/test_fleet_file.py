@@ -185,7 +185,7 @@ def test_an_empty_fleet_file_means_the_defaults() -> None:
     assert made.mesh == MeshConfig(
         listen=(), connect=(), multicast=True, multicast_address="224.0.0.224:7446", interface="auto", lease=1.0
     )
-    assert made.limits == RcmLimits(10_000, 64, 256, 65_536)
+    assert made.limits == RcmLimits(10_000, 64, 256, 2_500, 65_536)
     assert made.min_runtime == 60 * SECOND
     assert made.timing == Timing(500_000_000, 3_000_000_000, 250_000_000, 200_000_000)
 
@@ -213,6 +213,7 @@ def test_every_key_of_a_fleet_file() -> None:
         max_queued = 1
         max_needs = 2
         max_requests_per_client = 3
+        max_requests_per_host = 4
         max_payload = 4096
         max_running_per_host = 5
         max_runtime = "1d12h"
@@ -236,7 +237,7 @@ def test_every_key_of_a_fleet_file() -> None:
             interface="eth0,wlan0",
             lease=2.0,
         ),
-        limits=RcmLimits(1, 2, 3, 4096, 5, 129_600 * SECOND),
+        limits=RcmLimits(1, 2, 3, 4, 4096, 5, 129_600 * SECOND),
         timing=Timing(SECOND // 10, 5 * SECOND, 3 * SECOND // 10, 5 * SECOND // 4),
         min_runtime=90 * SECOND,
     )

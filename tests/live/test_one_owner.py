@@ -176,8 +176,9 @@ COMMANDS = 30
 """That tell that it goes on."""
 PROGRAM = f"""
 import sys, time, zscout
+from pathlib import Path
 from zscout.config.fleet import load_fleet
-with zscout.connect("program", fleet=load_fleet(sys.argv[1]), host=sys.argv[2]) as lab:
+with zscout.connect("program", fleet=load_fleet(Path(sys.argv[1])), host=sys.argv[2]) as lab:
     while True:
         try:
             with lab.hold("work", {{"{RC}": {{}}}}, min_runtime=0.5, wait_for_device=True, interrupt=False) as held:

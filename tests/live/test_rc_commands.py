@@ -16,7 +16,7 @@ from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, running, u
 from tests.live.lab import Lab
 from zscout.behaviors.client.arc import Revoked, hold
 from zscout.behaviors.client.client import Client
-from zscout.drivers.resource_controller import COMMAND_QUEUE, MAX_TTL
+from zscout.drivers.resource_controller import COMMANDS_PER_HOST, MAX_TTL
 from zscout.mesh import clock
 from zscout.mesh.zenoh_mesh import zenoh_config
 from zscout.messages import Done, EndedHold, Problem, RcState, decode
@@ -61,8 +61,8 @@ def test_every_refusal(tmp_path: Path) -> None:
                 slow = asyncio.create_task(client.command("robot/bench", grant, WAIT, timeout=HANG))
                 await bench.waiting.wait()
                 stale = asyncio.create_task(echo(grant, ttl=0.05, timeout=HANG))
-                many = [asyncio.create_task(echo(grant, ttl=60, timeout=HANG)) for _ in range(COMMAND_QUEUE - 1)]
-                await until(lambda: rc.queue.commands == COMMAND_QUEUE)
+                many = [asyncio.create_task(echo(grant, ttl=60, timeout=HANG)) for _ in range(COMMANDS_PER_HOST - 1)]
+                await until(lambda: rc.queue.commands == COMMANDS_PER_HOST)
                 assert await answer(echo(grant)) == "busy"
                 sent = clock.now()
                 await until(lambda: clock.now() - sent > 0.1 * SECOND)

@@ -54,9 +54,10 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
             queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
             assert queries[:2] == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
             assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=HANG) is not None
-            assert queries[2:] == [f"{base}/balancer/rank", f"{base}/placer/component"]
+            assert queries[2:] == [f"{base}/balancer/rank", f"{base}/placer/component/*/*"]
+            placer = queries[3].replace("*/*", str(client.mesh.me))
             assert await client.mesh.ask_one(queries[2], RankAsk(), HostRanking, timeout=HANG) is not None
-            assert await client.mesh.ask_one(queries[3], ListPlacements(), Placements, timeout=HANG) is not None
+            assert await client.mesh.ask_one(placer, ListPlacements(), Placements, timeout=HANG) is not None
             (host,) = [key["key"] for key in alive["anvil", "node", "node"]["keys"]]
             assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=HANG) is not None
             for rc in ("robot/a", "radio/rf0"):
