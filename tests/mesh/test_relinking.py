@@ -9,6 +9,8 @@ import socket
 from collections.abc import Sequence
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import zenoh
@@ -98,6 +100,26 @@ def test_a_link_that_is_lost_is_made_again() -> None:
     asyncio.run(story())
 
 
+def test_a_link_that_came_and_went_without_a_word_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh tells of some that come that they do, and not that they are gone."""
+    monkeypatch.setattr(relinking, "PAUSES", (0.5, *relinking.PAUSES))
+
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            world = _World(stack)
+            await world.peer()
+            here = await world.peer(relinks=True, makes_links=True)
+            there = (await world.peer()).id()
+            looking = here._relinking
+            assert looking is not None
+            _cut(before := _ends(here, there))
+            await until(lambda: there in looking._lost)
+            looking._on_link(cast("Any", SimpleNamespace(kind=zenoh.SampleKind.PUT, link=SimpleNamespace(zid=there))))
+            await until(lambda: _ends(here, there) - before)
+
+    asyncio.run(story())
+
+
 def test_who_lost_two_links_made_by_others_sees_to_both(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was away itself. The second may be lost when it has looked for the first in vain."""
     looked: list[object] = []
@@ -117,9 +139,10 @@ def test_who_lost_two_links_made_by_others_sees_to_both(monkeypatch: pytest.Monk
             here = await world.peer(relinks=True, makes_links=True)
             there = [(await world.peer()).id() for _ in range(2)]
             before = [_ends(here, one) for one in there]
-            for number, ends in enumerate(before, 1):
+            for number, (one, ends) in enumerate(zip(there, before, strict=True), 1):
                 _cut(ends)
-                await until(lambda: len(looked) >= number)  # noqa: B023 - awaited here
+                # Or Zenoh was about to try another of its addresses.
+                await until(lambda: len(looked) >= number or _ends(here, one) - ends)  # noqa: B023 - awaited here
             for one, ends in zip(there, before, strict=True):
                 await until(lambda: _ends(here, one) - ends)  # noqa: B023 - awaited here
 

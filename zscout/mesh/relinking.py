@@ -105,8 +105,7 @@ class Relinking:
         now, peer = time.monotonic(), str(event.link.zid)
         with self._lock:
             if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(MEETING):
-                self._lost.pop(peer, None)
-                return
+                return  # of a link that is there a look tells: one may come and go without another event
             if peer in self._routers:
                 self._routers.remove(peer)
                 return
@@ -155,10 +154,13 @@ class Relinking:
             return None
 
     def _look(self) -> None:
-        linked = self._linked()
+        linked, now = self._linked(), time.monotonic()
         with self._lock:
-            self._lost = {peer: one for peer, one in self._lost.items() if peer not in linked}
-            lost = dict(self._lost)
+            # One that has just been lost may be on the list still.
+            self._lost = {
+                peer: one for peer, one in self._lost.items() if peer not in linked or now - one.at < TOGETHER
+            }
+            lost = {peer: one for peer, one in self._lost.items() if peer not in linked}
         wanted, until = set(), time.monotonic() + PROBES_TIMEOUT
         for peer, one in sorted(lost.items(), key=lambda known: known[1].looks):
             if time.monotonic() > until or self._closed.is_set():
