@@ -51,7 +51,7 @@ def test_a_dry_run_says_all_that_would_be_done_and_does_nothing(wheel: Path, tmp
         f"{home}/bin/pip install --quiet --disable-pip-version-check --require-hashes -r",
         f"--no-deps {wheel}",
         f"touch {home}/complete",
-        "zscout-node --check /",
+        f"zscout-node --check {node}",
         "systemd-sysusers /etc/sysusers.d/zscout.conf",
         "-m 750 -o root -g zscout /etc/zscout/keys",
         "/etc/zscout/node.toml",
