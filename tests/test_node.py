@@ -143,6 +143,17 @@ def test_a_node_that_can_not_go_on_exits_with_1(monkeypatch: pytest.MonkeyPatch)
     assert "zscout-node: a service failed: KeyError('x'); see the log" in done.stderr
 
 
+def test_a_file_is_checked_with_its_drivers_and_nothing_begins(tmp_path: Path) -> None:
+    file = tmp_path / "node.toml"
+    file.write_text('[node]\nhost = "anvil"\n[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n')
+    done = CliRunner().invoke(node_module.main, ["--check", str(file)])
+    assert (done.exit_code, done.stdout) == (0, f"anvil of fleet zscout: {file} can be used here\n")
+    file.write_text(file.read_text().replace("exclusive", "exclusiv"))
+    done = CliRunner().invoke(node_module.main, ["--check", str(file)])
+    assert done.exit_code == 2
+    assert f'{file}: rc[0].driver (robot/a): no driver "exclusiv" is installed here' in done.stderr
+
+
 def test_an_rc_that_another_process_of_its_host_offers_is_refused_and_free_when_that_has_ended(node: Node) -> None:
     program = (
         "import sys\n"

@@ -168,8 +168,7 @@ def _places_key(fleet: Fleet) -> bytes | None:
 def _say_if_alone(mesh: Mesh) -> None:
     if mesh.links() == 0:
         log.warning(
-            "no link to any other node or program yet; if there should be: is the fleet name the same, does "
-            "multicast reach them, or else is `connect` set under [mesh]?"
+            "no link to any other node or program yet; if there should be, `zscout doctor` with the node file says why"
         )
 
 
@@ -198,9 +197,10 @@ def _end() -> None:
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("file", required=False, type=click.Path(path_type=Path))
+@click.option("--check", is_flag=True, help="Say whether FILE can be used here, with its drivers, and begin nothing.")
 @click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="info")
 @click.version_option(__version__)
-def main(file: Path | None, log_level: str) -> None:
+def main(file: Path | None, check: bool, log_level: str) -> None:
     """Runs this host's part of a fleet, as the node FILE (TOML) says.
 
     Without FILE the node stands as a candidate for the RCM of the fleet "zscout" and reports the host's load.
@@ -211,6 +211,7 @@ def main(file: Path | None, log_level: str) -> None:
     Examples:
       zscout-node
       zscout-node lab.toml
+      zscout-node --check lab.toml
     """
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     manager = ServiceManager.from_env()
@@ -219,7 +220,13 @@ def main(file: Path | None, log_level: str) -> None:
         return load_node(file) if file is not None else default_node()
 
     try:
-        uvloop.run(_main(read(), read, manager))
+        node = read()
+        if check:
+            for rc in node.rcs:
+                driver_for(rc)
+            click.echo(f"{node.host} of fleet {node.fleet.name}: {file or 'the defaults'} can be used here")
+            return
+        uvloop.run(_main(node, read, manager))
     except (BadInput, MeshError, NodeFailed) as error:
         manager.stopping(str(error))
         click.echo(f"zscout-node: {error}", err=True)

@@ -13,7 +13,7 @@ import pytest
 from tests.deploy.machine import PROJECT
 from tests.hang import HANG
 
-SCRIPTS = ("deploy/install-host", "deploy/renew-certificate", "tests/deploy/machine.sh", ".ci/run")
+SCRIPTS = ("deploy/install-host", "deploy/renew-certificate", "deploy/zscout", "tests/deploy/machine.sh", ".ci/run")
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_a_dry_run_says_all_that_would_be_done_and_does_nothing(wheel: Path, tmp
         f"{home}/bin/pip install --quiet --disable-pip-version-check --require-hashes -r",
         f"--no-deps {wheel}",
         f"touch {home}/complete",
-        "load_node",
+        f"zscout-node --check {node}",
         "systemd-sysusers /etc/sysusers.d/zscout.conf",
         "-m 750 -o root -g zscout /etc/zscout/keys",
         "/etc/zscout/node.toml",
@@ -77,6 +77,7 @@ def test_a_dry_run_says_all_that_would_be_done_and_does_nothing(wheel: Path, tmp
         (("--wheel", __file__), "is no wheel of zscout"),
         (("--wheel", "{wheel}", "--sha256", "0"), "is not what it should be: its SHA-256 is"),
         (("--wheel", "{wheel}", "--node", "/nowhere.toml"), "/nowhere.toml can't be read"),
+        (("--wheel", "{wheel}", "--keys", "/nowhere"), "/nowhere has no key.pem that can be read"),
     ],
 )
 def test_what_is_asked_for_wrongly_is_refused_in_one_line(wheel: Path, words: tuple[str, ...], said: str) -> None:

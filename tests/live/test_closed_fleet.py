@@ -26,7 +26,7 @@ SECOND = timedelta(seconds=1)
 
 
 def test_two_persons_and_a_node_on_one_machine(tmp_path: Path) -> None:
-    """Each is known by its own name, and a person's machine by a field."""
+    """Each is known by its own name, whatever its user is called there, and a person's machine by a field."""
 
     async def story() -> None:
         async with ClosedLab(tmp_path) as lab:
@@ -38,7 +38,8 @@ def test_two_persons_and_a_node_on_one_machine(tmp_path: Path) -> None:
                 state = await lab.state(ada, lambda state: len(state.holds) == 2)
                 assert {view.client for view in state.holds} == {"ada/arm", "bob/arm"}
                 machine = valid_name(socket.gethostname())
-                assert [view.who.host for view in state.holds if view.who is not None] == [machine, machine]
+                whose = sorted((view.who.user, view.who.host) for view in state.holds if view.who is not None)
+                assert whose == [("ada", machine), ("bob", machine)]
 
     asyncio.run(story())
 

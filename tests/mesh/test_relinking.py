@@ -64,6 +64,12 @@ class _World:
         with zenoh.scout(what="router", config=settings) as scout:
             return relay, next(hello.locators[0] for hello in scout if str(hello.zid) == relay.id())
 
+    def meeting(self) -> zenoh.Config:
+        """For a session by which the first peer is introduced to others."""
+        settings = zenoh_config(replace(self._config, multicast=False, connect=tuple(self._connect)))
+        settings.insert_json5("id", f'"{relinking.MEETING}01"')
+        return settings
+
     async def peer(
         self, *, relinks: bool = False, makes_links: bool = False, known: bool = True, connect: Sequence[str] = ()
     ) -> ZenohTransport:
@@ -145,6 +151,19 @@ def test_who_lost_two_links_made_by_others_sees_to_both(monkeypatch: pytest.Monk
                 await until(lambda: len(looked) >= number or _ends(here, one) - ends)  # noqa: B023 - awaited here
             for one, ends in zip(there, before, strict=True):
                 await until(lambda: _ends(here, one) - ends)  # noqa: B023 - awaited here
+
+    asyncio.run(story())
+
+
+def test_the_session_that_introduces_it_is_no_link_to_anybody() -> None:
+    async def story() -> None:
+        async with AsyncExitStack() as stack:
+            world = _World(stack)
+            here = await world.peer()
+            settings = world.meeting()
+            with zenoh.open(settings):
+                await until(lambda: here._session.info.links())
+                assert (here.links(), here.peers()) == (0, [])
 
     asyncio.run(story())
 

@@ -206,6 +206,7 @@ CALLS: Final = (
     "node bad.toml",
     "node node.toml",
     "node --log-level loud",
+    "node --check node.toml",
 )
 """Words after `zscout` (or, after `node`, those of `zscout-node`), parted by spaces."""
 

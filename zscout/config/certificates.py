@@ -108,6 +108,14 @@ def read_certificates(folder: Path) -> Certificates:
     others, key and certificate are no pair, no CA in `ca.pem` has issued it, or its name is none of zscout's."""
     import ssl
 
+    instead = f"or name your own folder by ${KEYS_VARIABLE}"
+    try:
+        if not any((folder / name).exists() for name in (CA, CERT, KEY)):
+            raise Where(str(folder)).bad(
+                "no certificate is there", f"copy there what `zscout cert issue` made, {instead}"
+            )
+    except PermissionError:
+        raise Where(str(folder)).bad("may not be entered by this user", f"mend its mode, {instead}") from None
     cas = read_cas(folder / CA)
     cert, key = Where(str(folder / CERT)), Where(str(folder / KEY))
     check_mode(folder / CERT, 0o002, "644")

@@ -276,7 +276,7 @@ class ZenohTransport(Transport):
         return [one for peer in linked if not (one := str(peer)).startswith(MEETING)]
 
     def links(self) -> int:
-        return len(self._session.info.links())
+        return sum(not str(link.zid).startswith(MEETING) for link in self._session.info.links())
 
     async def close(self) -> None:
         def close() -> None:

@@ -9,11 +9,13 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import Final
 
+from msgspec import structs
+
 from zscout.config.fleet import Fleet
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy
 from zscout.keyexpr import NODES, USERS, Rank, Sender, as_pattern, is_pattern
 from zscout.mesh import Refused
-from zscout.messages import Ask, Foresee, duration
+from zscout.messages import Ask, Foresee, Who, duration
 from zscout.types import ClientId, RcName
 
 OPERATORS: Final[frozenset[Rank]] = frozenset({"operator"})
@@ -76,6 +78,10 @@ class Authority:
                 raise Refused("not_allowed", f"{owner} may hold {quota.rcs} RCs at one time, and this asks for more")
             if quota.arcs is not None and open_by(members) >= quota.arcs:
                 raise Refused("not_allowed", f"{owner} has {quota.arcs} ARCs open, its quota; release or cancel one")
+
+    def known_as(self, sender: Sender, who: Who | None) -> Who | None:
+        """Who asks, as people are told it: whoever it says to be, its user is the one that its certificate names."""
+        return structs.replace(who, user=sender.host) if who is not None and self._enforced else who
 
     def check_hand_over(self, to: Sender, rcs: Iterable[RcName]) -> None:
         """Raises Refused where the new client may not hold what it is given."""

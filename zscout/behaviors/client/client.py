@@ -222,10 +222,10 @@ class Client(MovableClient):
             names = ", ".join(sorted(token.host for token in candidates)[:MAX_NAMED])
             raise NoRcm(f"{nobody}, though {names} could lead; see the log of zscout-node there")
         links = self.mesh.links()
-        who = f"{links} links to other programs" if links else "no other program either"
+        who = f"{links} link{'s' * (links > 1)} to other programs" if links else "no other program either"
         raise NoRcm(
-            f"{nobody} ({who}); start zscout-node on a host, or check the fleet's name, `interface` and `connect` in "
-            f"its file (--fleet, ${FLEET_VARIABLE})"
+            f"{nobody} ({who}); start zscout-node on a host, or check the fleet's file (--fleet, ${FLEET_VARIABLE}): "
+            "`zscout doctor` says what keeps them apart"
         )
 
     # Requests

@@ -10,6 +10,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import TypeAlias
 
+from msgspec import structs
+
 from zscout.config.fleet import Fleet, RcmLimits
 from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
@@ -164,6 +166,7 @@ class RequestHandler:
             query.answer(self._registry.handed_over(arc, ask.arc))
         else:
             self._check_room(str(sender))
+            ask = structs.replace(ask, who=self._authority.known_as(sender, ask.who))
             request = admit(ask, sender, arc, self.core, self.limits)
             place = self._own_place(ask, str(sender))
             if ask.check and ask.place is None and ask.grant is None:
@@ -245,7 +248,8 @@ class RequestHandler:
             if self.core.arc(arc) is None:
                 self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
         event = Cancelled if isinstance(operation, Cancel) else Released
-        by = str(sender) if operation.who is None else named(operation.who, str(sender), operation.id)
+        who = self._authority.known_as(sender, operation.who)
+        by = str(sender) if who is None else named(who, str(sender), operation.id)
         self._gather(query, arc, event(arc, "its client" if owner == sender else by))
 
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
