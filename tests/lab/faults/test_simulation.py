@@ -26,7 +26,7 @@ MISSED = {
     "away": 72,
     "reopen": 3,
     "places": 2,
-    "withdrawn": 55,
+    "withdrawn": 222,
     "believed": 64,
     "settling": 8,
     "deadline": 8,
