@@ -15,12 +15,14 @@ import time
 import tty
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
 from tests.deploy.machine import Machine, missing
 from tests.docs.test_tutorial_device import files
 from tests.hang import HANG
+from zscout.config.certificate_authority import CertificateAuthority
 from zscout.keyexpr import new_instance
 
 ROOT: Final = Path(__file__).parents[2]
@@ -232,12 +234,16 @@ def check_light(programs: Path, folder: Path) -> None:
 
 
 def check_host(wheel: Path, folder: Path) -> None:
-    """`deploy/install-host`: its node runs under its unit, and once more it changes nothing."""
+    """`deploy/install-host`, in a secured fleet: its node runs under its unit, and once more it changes nothing."""
     folder.mkdir(mode=0o755)
     with Machine(folder, installed=False) as host:
         host.path("/srv/new").mkdir()
         host.path(f"/srv/new/{wheel.name}").write_bytes(wheel.read_bytes())
-        host.write("/srv/new/fleet.toml", f'[fleet]\nname = "{new_instance()}"\n[mesh]\ninterface = "lo"\n')
+        fleet = f'[fleet]\nname = "{new_instance()}"\n[mesh]\ninterface = "lo"\n[roles]\nmanager = ["anvil"]\n'
+        host.write("/srv/new/fleet.toml", f'{fleet}[security]\nfolder = "/etc/zscout/keys"\n')
+        now, keys = datetime.now(UTC), host.path("/srv/new/anvil")
+        CertificateAuthority.make(folder / "ca", timedelta(days=2), now)
+        CertificateAuthority.read(folder / "ca", now).issue("anvil", keys, timedelta(days=1), now)
         host.write("/srv/new/anvil.toml", '[node]\nhost = "anvil"\nfleet = "fleet.toml"\n[components]\nmax = 0\n')
         words = ["/opt/zscout/project/deploy/install-host", "--python", "/opt/zscout/python/bin/python3"]
         words += ["--wheel", f"/srv/new/{wheel.name}"]
@@ -246,14 +252,19 @@ def check_host(wheel: Path, folder: Path) -> None:
         expect("components.max: is 0" in refused, f"a bad node file is taken: {refused}")
         expect(not host.path("/etc/zscout").exists(), "a bad node file leaves something in /etc")
         host.write("/srv/new/anvil.toml", '[node]\nhost = "anvil"\nfleet = "fleet.toml"\n')
+        ended = host.fails(*words, timeout=INSTALL)
+        expect("zscout-node does not run: /etc/zscout/keys: no certificate is there" in ended, f"no keys: {ended}")
+        host.run("rm", "-r", "/etc/zscout", "/etc/systemd/system/zscout-node.service")
+        words += ["--keys", "/srv/new/anvil"]
         said = host.run(*words, timeout=INSTALL)
         expect("/etc/zscout/node.toml" in said and "/etc/systemd/system/zscout-node.service" in said, said)
         host.until("zscout-node", ActiveState="active", SubState="running", UnitFileState="enabled")
         host.until("zscout-cert-renew.timer", ActiveState="active", UnitFileState="enabled")
-        status = host.run("sh", "-c", "ZSCOUT_FLEET=/etc/zscout/fleet.toml zscout status")
+        status = host.run("zscout", "status")
         expect("anvil" in status, f"status says {status}")
-        modes = host.run("stat", "-c", "%a %U:%G", "/etc/zscout", "/etc/zscout/keys", "/etc/zscout/renew-certificate")
-        expect(modes.splitlines() == ["755 root:root", "750 root:zscout", "755 root:root"], f"modes are {modes}")
+        files = ("/etc/zscout", "/etc/zscout/keys", "/etc/zscout/renew-certificate", "/etc/zscout/keys/key.pem")
+        modes = host.run("stat", "-c", "%a %U:%G", *files).splitlines()
+        expect(modes == ["755 root:root", "750 root:zscout", "755 root:root", "640 root:zscout"], f"modes are {modes}")
         before = host.show("zscout-node", "MainPID")
         again = host.run(*words, timeout=INSTALL)
         expect("new or changed" not in again, f"the second time it says {again}")
