@@ -15,6 +15,7 @@ from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, FakeRc
 from zscout.config.fleet import default_fleet
 from zscout.lab.faults.link import Disturbance
+from zscout.lab.faults.virtual_time import VirtualTimeLoop
 from zscout.mesh import IncomingQuery
 from zscout.messages import Holder, OpenRequest, RcAsk, RcmState, RcState, StateAsk
 from zscout.scheduling.core import Core
@@ -216,6 +217,42 @@ def test_what_somebody_asked_for_long_ago_is_waited_for_whoever_believes_to_hold
         assert (await first).state == "queued"
         fleet.rc("robot/c", term=HELD.grant.term, holders=[later])
         assert (await asking).grant == later.grant
+
+    run(story())
+
+
+def test_a_leader_that_stood_still_waits_for_what_may_be_held_as_if_it_had_just_been_asked() -> None:
+    """What has come meanwhile is not handled yet."""
+
+    async def story() -> None:
+        fleet, loop = FakeFleet(), asyncio.get_running_loop()
+        assert isinstance(loop, VirtualTimeLoop)
+        rcm = fleet.rcm(5)
+        alone = replace(OTHER, rcs=["robot/c"])
+        asking = asyncio.create_task(fleet.client("one").ask("other", "robot/c", grant=alone.grant, rcs=["robot/c"]))
+        await asyncio.sleep(0.5)
+        loop.jump(1.2)
+        fleet.rc("robot/c", term=alone.grant.term, holders=[replace(alone, client="desk/one")])
+        assert (await asking).grant == alone.grant
+        rcm.stop()
+
+    run(story())
+
+
+def test_a_leader_that_stood_still_waits_for_the_rest_of_a_gang_as_if_its_links_had_just_come_back() -> None:
+    async def story() -> None:
+        fleet, loop = FakeFleet(), asyncio.get_running_loop()
+        assert isinstance(loop, VirtualTimeLoop)
+        rcm, client = fleet.rcm(5), fleet.client("one")
+        client.open = [OpenRequest("tally", "tally", {rc: {} for rc in HELD.rcs}, 0, Decimal(60), grant=HELD.grant)]
+        first = holding(fleet, HELD.rcs[0])
+        await asyncio.sleep(0.5)
+        loop.jump(1.2)
+        second = holding(fleet, HELD.rcs[1])
+        await fleet.joined(first, second)
+        assert [rc.arcs for rc in (first, second)] == [["tally"]] * 2
+        assert not [one for grants in fleet.published for one in grants.revoked]
+        rcm.stop()
 
     run(story())
 

@@ -58,7 +58,7 @@ class Program:
 
 
 async def steal_places(mesh: Mesh, over: Callable[[], bool]) -> None:
-    """Asks at the places of others that wait, and says to new leaders that they are its own."""
+    """Asks at the places of others that wait, and says to new leaders that they are its own. Leaves when it is over."""
     rng, listed, seals = RANDOM.get(), list[OpenRequest](), dict[Place | None, str | None]()
     hear = lambda _, notice: seals.update({notice.place: notice.seal})  # noqa: E731
     answer = lambda query: query.answer(ClientRequests(str(mesh.me), listed))  # noqa: E731
@@ -78,9 +78,9 @@ async def steal_places(mesh: Mesh, over: Callable[[], bool]) -> None:
             listed[:] = [replace(stolen, place=one.place, was=rng.choice((None, one.id)))]
             ask = Ask(place=one.place, **{name: getattr(listed[0], name) for name in ASKED})
             await mesh.ask_one(mesh.keys.schedule(mesh.me), ask, Notice, timeout=STEALS_EVERY)
-    listed.clear()
     for left in declared:
         left.close()
+    await mesh.close()
 
 
 @dataclass(slots=True)

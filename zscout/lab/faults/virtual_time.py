@@ -166,7 +166,9 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         self._forget_cancelled()
         scheduled, ready = self._scheduled, self._ready
         if not self.isolated or not (ready or self._stopping or scheduled):
-            timeout = 0.0 if ready or self._stopping else scheduled[0][0] - self._now if scheduled else None
+            # What is overdue, as after a jump of its own, turns no clock back.
+            left = max(0.0, scheduled[0][0] - self._now) if scheduled else None
+            timeout = 0.0 if ready or self._stopping else left
             self._process_events(self._selector.select(timeout))
         elif not (ready or self._stopping):
             self._now += max(0.0, scheduled[0][0] - self._now)

@@ -308,7 +308,7 @@ class Membership:
     def awaits(self, arc: ArcId, rcs: Iterable[RcName]) -> bool:
         """Whether it may soon be known whether `arc` holds one of `rcs`: that is pending; or it has not answered, and
         its token was seen for less than a lease, or this reign has never seen one and was asked for `arc` less than a
-        lease ago: links come back one after the other."""
+        lease ago: links come back one after the other. A lease through which this leader stood still was none."""
         now, lease = self.mesh.now(), round(self._lease * SECOND)
         for rc in rcs:
             if rc in self._pending:
@@ -316,7 +316,7 @@ class Membership:
             since = self._rc_seen.get(rc)
             if since is None and rc not in self._named:
                 since = self._asked_since(arc, now, lease)
-            if rc not in self._joined and since is not None and now - since < lease:
+            if rc not in self._joined and since is not None and (now - since < lease or self._absence.stood_still):
                 return True
         return False
 
@@ -473,6 +473,10 @@ class Membership:
             self._supervisor.call_later(wait, self._wait_over, pending, wait)
 
     def _wait_over(self, pending: _Pending, wait: float) -> None:
+        if self._absence.stood_still:
+            # What has come meanwhile is not handled yet.
+            self._supervisor.call_later(wait, self._wait_over, pending, wait)
+            return
         pending.waited = wait
         self._settle()
 
