@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import subprocess
 from fnmatch import fnmatchcase
+from pathlib import Path
 
 import pytest
 
@@ -16,6 +18,13 @@ from zscout.config.node import load_node
 SAMPLE = PROJECT / "deploy" / "sample"
 HOSTS = ("anvil", "bellows", "crucible")
 INSTRUCTIONS = {"CMD", "COPY", "ENTRYPOINT", "ENV", "FROM", "RUN", "STOPSIGNAL", "USER", "VOLUME", "WORKDIR"}
+
+
+def with_sites(fleet: str) -> str:
+    """The sample fleet as it is where there are other sites."""
+    text, count = re.subn(r'^(\s*)# (site = |"tls/gate|relay = )', r"\1\2", fleet, flags=re.MULTILINE)
+    assert count == 3
+    return text
 
 
 @pytest.mark.parametrize("host", HOSTS)
@@ -30,9 +39,10 @@ def test_a_sample_file_is_read_and_offers_what_its_fleet_expects(host: str) -> N
     assert all(any(fnmatchcase(rc.name, pattern) for pattern in roles.node[host]) for rc in node.rcs)
 
 
-def test_the_sample_relay_joins_the_site_of_the_sample_fleet_to_another() -> None:
-    relay = load_node(SAMPLE / "relay.toml")
-    hall = load_fleet(SAMPLE / "fleet.toml")
+def test_the_sample_relay_joins_the_site_of_the_sample_fleet_to_another(tmp_path: Path) -> None:
+    (tmp_path / "fleet.toml").write_text(with_sites((SAMPLE / "fleet.toml").read_text()))
+    (tmp_path / "relay.toml").write_text((SAMPLE / "relay.toml").read_text())
+    relay, hall = load_node(tmp_path / "relay.toml"), load_fleet(tmp_path / "fleet.toml")
     assert hall.mesh.site in relay.fleet.mesh.relay
     assert (relay.fleet.mesh.site, relay.candidate, relay.rcs) == (None, False, ())
     assert relay.fleet.access.roles.relay == (relay.host,)

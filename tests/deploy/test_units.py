@@ -19,6 +19,7 @@ from msgspec.structs import replace
 
 from tests.cli import tools
 from tests.deploy.machine import PROJECT, Machine, missing
+from tests.deploy.test_files import with_sites
 from tests.drivers.mjpeg import numbered
 from tests.hang import HANG
 from tests.live.closed import make_keys
@@ -207,8 +208,9 @@ def test_the_sample_relay_joins_two_sites_as_its_unit_has_it(machine: Machine, t
     with socket.create_server(("127.0.0.1", 0)) as free:
         endpoint = f"tls/127.0.0.1:{free.getsockname()[1]}"
     sample = PROJECT / "deploy" / "sample"
-    fleet = (sample / "fleet.toml").read_text().replace("[mesh]", "[mesh]\nmulticast = false")
-    machine.write("/etc/zscout/fleet.toml", fleet)
+    text = with_sites((sample / "fleet.toml").read_text())
+    machine.write("/etc/zscout/fleet.toml", text.replace("[mesh]", "[mesh]\nmulticast = false"))
+    (tmp_path / "fleet.toml").write_text(text)
     machine.write("/etc/zscout/relay.toml", (sample / "relay.toml").read_text().replace("tls/0.0.0.0:7447", endpoint))
     make_keys(tmp_path, "gate", "ada", "ben")
     machine.path("/etc/zscout/keys").mkdir(exist_ok=True)
@@ -221,7 +223,7 @@ def test_the_sample_relay_joins_two_sites_as_its_unit_has_it(machine: Machine, t
     machine.run("systemctl", "start", "zscout-relay")  # returns when it is ready
 
     async def story() -> None:
-        hall = load_fleet(sample / "fleet.toml")
+        hall = load_fleet(tmp_path / "fleet.toml")
         mesh = replace(hall.mesh, multicast=False, listen=(), connect=(endpoint,))
         async with AsyncExitStack() as stack:
             for name, site in (("ada", "hall"), ("ben", "annex")):
