@@ -93,12 +93,6 @@ def test_a_bad_file_is_told_with_its_remedy_and_is_all_that_is_looked_at() -> No
     assert [(one.about, one.state) for one in told[1:]] == [("clock", "note")]
 
 
-def test_a_driver_that_is_missing_stands_first_and_all_else_is_looked_at() -> None:
-    told = findings(seen(bad=[("drivers", BadInput("lab.toml: rc[0].driver: no driver; install it"))]))
-    assert told[0] == Finding("drivers", "mend", "lab.toml: rc[0].driver: no driver", "install it")
-    assert ("leader", "ok") in [(one.about, one.state) for one in told]
-
-
 def test_a_certificate_that_ends_soon_is_told_of_every_host_and_of_ones_own_once() -> None:
     hosts = leading(certificate_ends_in=86_400.0, renew=True) | host(
         "bellows", Role.NODE, Role.LOAD, certificate_ends_in=-60.0, renew=True, version=VERSION
