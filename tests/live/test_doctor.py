@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+import zenoh
+from msgspec.structs import replace
 
 from tests.cli.tools import COMMAND, zscout_soon
 from tests.hang import HANG
@@ -26,6 +28,7 @@ from tests.live.lab import Lab
 from tests.live.test_closed_doors import bare, tls
 from zscout.config.certificates import KEYS_VARIABLE, read_cas
 from zscout.keyexpr import Role
+from zscout.mesh.zenoh_mesh import zenoh_config
 
 pytestmark = pytest.mark.live
 
@@ -117,6 +120,10 @@ def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_pat
             told = await doctor(lab, file)
             assert told.host == "cart"
             assert told.mends()[1:] == ["not there: robot/c of cart (that host is not seen either)"]
+            file.write_text(file.read_text().replace("exclusive", "none-such"))
+            missing, nobody, *_ = (await doctor(lab, file)).mends()
+            assert missing == f'{file}: rc[0].driver (robot/c): no driver "none-such" is installed here'
+            assert nobody.startswith("nobody leads")  # it joins all the same
 
     asyncio.run(story())
 
@@ -133,6 +140,8 @@ def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewher
                     "[mesh]\n", f'[mesh]\nlisten = ["{address}"]\nconnect = ["{address}"]\nmulticast = false\n'
                 )
             )
+            says = f"this host's node does not run ({address}: Connection refused)"
+            assert (await doctor(lab)).of("connect") == [("mend", says)]
             lab.node("anvil", "robot/a")
             await lab.logged("anvil", "is on the mesh")
             told = await told_of(lab, "leader", "anvil leads, term 1", lab.folder / "anvil.toml")
@@ -140,6 +149,43 @@ def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewher
             assert told.of("multicast") == [("note", "it is off: only the hosts under `connect` are found")]
             done = await zscout_soon("status", env=lab.env)
             assert (done.returncode, done.stderr) == (0, "")
+
+    asyncio.run(story())
+
+
+def test_a_relay_that_is_not_linked_is_told(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            plain = lab.fleet_file.read_text()
+            lab.fleet_file.write_text(plain.replace("[mesh]\n", '[mesh]\nsite = "north"\n'))
+            lab.node("anvil", "robot/a")
+            await lab.logged("anvil", "is on the mesh")
+            alone = r"no relay is linked: this host sees its own site only \(north\)"
+            assert (await told_of(lab, "site", alone)).code == 1
+            with zenoh.open(zenoh_config(replace(lab.fleet.mesh, relay=("north", "south")))):
+                assert (await told_of(lab, "site", "site north, linked to 1 relay")).code == 0
+                file = lab.folder / "nowhere.toml"
+                file.write_text(plain)
+                lost = r"no `site` is set, so no link to the relay \(tcp/.*\): if it is this fleet's, .*"
+                assert (await told_of(lab, "site", lost, ZSCOUT_FLEET=file)).code == 0
+
+    asyncio.run(story())
+
+
+def test_whose_role_is_taken_away_is_told_first(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with ClosedLab(tmp_path) as lab:
+            before = lab.folder / "before.toml"
+            before.write_text(lab.fleet_file.read_text())
+            lab.fleet_file.write_text(before.read_text().replace('"ada"', ""))
+            lab.node("anvil")
+            await shown(lab, "bob", "anvil")
+            keys = tmp_path / "keys" / "ada"
+            unseen = f"1 link, and nobody of fleet {lab.fleet.name} is seen by ada"
+            told = await told_of(lab, "certificate", unseen, ZSCOUT_KEYS=keys, ZSCOUT_FLEET=before)
+            assert told.mends() == [unseen]
+            told = await doctor(lab, ZSCOUT_KEYS=keys)
+            assert told.mends() == [f"{keys}/cert.pem: ada has no role in fleet {lab.fleet.name}"]
 
     asyncio.run(story())
 
@@ -224,10 +270,14 @@ def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_path: Pa
                 ("mend", f'{keys}/cert.pem: is the certificate of "anvil", and this is "bench"')
             ]
             assert not told.of("links")
+            lab.node("cart")
+            await lab.logged("cart", "is on the mesh")
             (keys / "key.pem").chmod(0o644)
-            assert (await doctor(lab, file)).of("certificate") == [
-                ("mend", f"{keys}/key.pem: may be read by others (mode 644)")
-            ]
+            told = await doctor(lab, file)
+            assert told.mends() == [f"{keys}/key.pem: may be read by others (mode 644)"]
+            (keys / "ca.pem").chmod(0o666)
+            mend = f"{keys}/ca.pem: may be written by others (mode 666)"
+            assert (await told_of(lab, "multicast", "1 process heard .*", file)).mends() == [mend]
 
     asyncio.run(story())
 

@@ -91,12 +91,13 @@ class Heard:
     zid: str
     addresses: tuple[str, ...]
     here: bool
+    relay: bool = False
 
 
 async def heard(config: MeshConfig) -> list[Heard]:
     """Who answers by multicast, of whatever fleet. Takes SCOUT seconds."""
     found: dict[str, Heard] = {}
-    own = {one.address.partition("%")[0] for several in psutil.net_if_addrs().values() for one in several}
+    own = _own_addresses()
     until = time.monotonic() + SCOUT
     try:
         with zenoh.scout(what="peer|router", config=zenoh_config(config)) as scout:
@@ -106,10 +107,14 @@ async def heard(config: MeshConfig) -> list[Heard]:
                 elif not (zid := str(hello.zid)).startswith(MEETING):
                     addresses = tuple(one for one in hello.locators if "[fe80:" not in one)
                     hosts = {match[2].strip("[]") for one in addresses if (match := _ADDRESS.match(one))}
-                    found[zid] = Heard(zid, addresses, bool(hosts & own))
+                    found[zid] = Heard(zid, addresses, bool(hosts & own), str(hello.whatami) == "router")
     except zenoh.ZError:  # no interface for it
         pass
     return list(found.values())
+
+
+def _own_addresses() -> set[str]:
+    return {one.address.partition("%")[0] for several in psutil.net_if_addrs().values() for one in several}
 
 
 # Who is called
@@ -129,6 +134,8 @@ class Called:
     issuer: str = ""
     trusted: bool = False
     objection: str = ""
+    here: bool = False
+    """Of who does not answer: whether it is an address of this host's."""
 
 
 async def call(
@@ -142,14 +149,16 @@ async def call(
 
 
 async def _call(match: re.Match[str], doubted: bool, cas: str, own: Certificates | None) -> Called:
-    address = match[0]
+    address, found = match[0], list[tuple[str, int]]()
     try:
         async with asyncio.timeout(CONNECT):
-            at = await _reached(match[2].strip("[]"), int(match[3]))
+            found = await _looked_up(match[2].strip("[]"), int(match[3]))
+            at = await _reached(found)
     except TimeoutError:
         return Called(address, "", "no answer")
     except OSError as error:
-        return Called(address, "", _reason(error))
+        here = any(host in _own_addresses() or host.startswith("127.") for host, _ in found)
+        return Called(address, "", _reason(error), here=here)
     if match[1] == "tcp" and not doubted:
         return Called(address, "plain")
     if cas:
@@ -163,13 +172,17 @@ async def _call(match: re.Match[str], doubted: bool, cas: str, own: Certificates
     return _answer(address, shaken, trusted=False)
 
 
-async def _reached(host: str, port: int) -> tuple[str, int]:
-    """Which of a host's addresses takes a connection. Raises OSError."""
+async def _looked_up(host: str, port: int) -> list[tuple[str, int]]:
+    """A host's addresses. Raises OSError."""
     # In a thread that nobody waits for: where no name server answers it takes its time.
     look_up = functools.partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
+    return [(str(one[0]), port) for *_, one in await asyncio.wrap_future(in_thread("looks up a name", look_up))]
+
+
+async def _reached(found: Iterable[tuple[str, int]]) -> tuple[str, int]:
+    """Which of these takes a connection. Raises OSError."""
     error: OSError | None = None
-    for *_, found in await asyncio.wrap_future(in_thread("looks up a name", look_up)):
-        at = str(found[0]), port
+    for at in found:
         try:
             _, writer = await asyncio.open_connection(*at)
         except OSError as failed:

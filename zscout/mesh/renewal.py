@@ -166,6 +166,9 @@ class RenewableTransport(Transport):
     def links(self) -> int:
         return self.current.links()
 
+    def relays(self) -> int:
+        return self.current.relays()
+
     async def close(self) -> None:
         self._closed = True
         if self._renewing is not None:

@@ -164,6 +164,10 @@ class Mesh:
         """How many peers this process is linked to."""
         return self._transport.links()
 
+    def relays(self) -> int:
+        """How many of those are relays."""
+        return self._transport.relays()
+
     async def close(self) -> None:
         """Leaves the mesh: tokens die, and no handler is called any more. Bounded in time."""
         self._inbox.close()

@@ -278,6 +278,9 @@ class ZenohTransport(Transport):
     def links(self) -> int:
         return sum(not str(link.zid).startswith(MEETING) for link in self._session.info.links())
 
+    def relays(self) -> int:
+        return len(list(self._session.info.routers_zid()))
+
     async def close(self) -> None:
         def close() -> None:
             if self._relinking is not None:

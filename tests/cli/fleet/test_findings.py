@@ -150,6 +150,26 @@ def test_what_stands_under_connect_is_called(answer: Called, says: str) -> None:
     assert not [one for one in findings(seen(answers=[answer])) if one.about == "connect"]
 
 
+def test_the_own_host_is_not_told_to_be_elsewhere() -> None:
+    refused = [
+        Called("tcp/anvil.lab:7447", "", "Connection refused"),
+        Called("tcp/10.0.0.7:7447", "", "Connection refused", here=True),
+        Called("tcp/bellows:7447", "", "no answer"),
+    ]
+    fleet = replace(PLAIN, mesh=MeshConfig(connect=tuple(one.address for one in refused)))
+
+    def told(hosts: dict[str, Host]) -> list[str]:
+        alone = seen(fleet, answers=refused, hosts=hosts)
+        alone.host = "anvil"
+        return [str(one) for one in findings(alone) if one.about == "connect"]
+
+    own, other = told({})
+    assert own == "this host's node does not run (tcp/anvil.lab:7447: Connection refused); start zscout-node here"
+    assert other.startswith("tcp/bellows:7447: no answer; ")
+    # One that runs may well listen at another of its addresses.
+    assert told(leading()) == [other]
+
+
 def test_a_plain_host_among_secured_ones_is_told_whose_they_are() -> None:
     closed = Called("tls/10.0.0.2:7447", "tls", "", shown("bellows"), "CA one")
     shut_out = seen(answers=[closed], links=0, hosts={}, state=None)
@@ -209,6 +229,41 @@ def test_an_own_certificate_that_is_bad_is_not_told_again_by_those_who_refuse_it
     assert mends(shut_out) == [("certificate", "keys/cert.pem: has ended on x; renew it")]
 
 
+def test_where_keys_cannot_be_read_it_is_told_once() -> None:
+    bad = [("certificate", BadInput("keys: may not be entered by this user; mend its mode"))]
+    foreign = [Called(f"tls/{name}:1", "tls", "", shown(name), "CA one") for name in ("anvil", "bellows", "x")]
+    told = seen(CLOSED, bad=bad, answers=foreign, links=None, hosts={}, state=None)
+    assert mends(told) == [("certificate", "keys: may not be entered by this user; mend its mode")]
+    assert not [one for one in findings(told) if one.about == "security"]
+
+
+def test_a_relay_and_the_site_that_belong_together_are_told() -> None:
+    north = MeshConfig(site="north")
+
+    def told(mesh: MeshConfig, fleet: Fleet = PLAIN, **more: object) -> list[tuple[str, str]]:
+        asked = seen(replace(fleet, mesh=mesh), **({"certificates": certificates()} | more))
+        return [(one.state, str(one)) for one in findings(asked) if one.about == "site"]
+
+    ((state, words),) = told(north)
+    assert (state, words.partition(";")[0]) == ("mend", "no relay is linked: this host sees its own site only (north)")
+    assert told(north, relays=1) == [("ok", "site north, linked to 1 relay")]
+    assert not told(north, links=0)
+    assert not told(north, links=None)
+    assert not told(MeshConfig())
+    assert not told(MeshConfig(relay=("north", "south")))
+
+    alone = "no `site` is set, so no link to the relay"
+    relay = Heard("2", ("tcp/10.0.0.9:7447",), here=False, relay=True)
+    ((state, words),) = told(MeshConfig(), heard=[HERE, relay])
+    assert state == "note"  # of which fleet it is can't be told
+    assert words.startswith(f"{alone} (tcp/10.0.0.9:7447): if it is this fleet's, this host sees its own site only; ")
+    ((state, _),) = told(MeshConfig(connect=relay.addresses), heard=[relay])
+    assert state == "mend"
+    gate = replace(CLOSED, access=replace(ROLES, roles=replace(ROLES.roles, relay=("gate",))))
+    ((state, words),) = told(MeshConfig(), gate)
+    assert (state, words.partition(";")[0]) == ("mend", f"{alone} (gate): this host sees its own site only")
+
+
 def test_links_without_anybody_of_the_fleet_are_explained() -> None:
     alone: dict[str, object] = {"hosts": {}, "state": None}
 
@@ -220,7 +275,10 @@ def test_links_without_anybody_of_the_fleet_are_explained() -> None:
     assert said(PLAIN, links=0).startswith("no link to anybody; ")
     assert said(PLAIN, links=2).startswith("2 links, and nobody of fleet zscout is seen through them; ")
     assert "nobody is seen of fleet zscout, and of others: lab (anvil)" in said(PLAIN, plain={"lab": {"anvil"}})
-    assert "is ada named under [roles] in the files of the others" in said(CLOSED, links=1)
+    shut_out = seen(CLOSED, links=1, certificates=certificates(), **alone)
+    told = findings(shut_out)
+    assert mends(shut_out)[0][1].startswith("1 link, and nobody of fleet zscout is seen by ada; name it under [roles] ")
+    assert [one.about for one in told if one.state == "mend"] == ["certificate"]
     refused = Called("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="unknown ca")
     assert said(CLOSED, links=1, answers=[refused]).startswith("no link to anybody; ")
     assert said(PLAIN, unjoined="the mesh can't be joined: x") == "the mesh can't be joined: x"
@@ -259,6 +317,15 @@ def test_devices_that_are_not_there_are_told_by_host() -> None:
         "not there: robot/d of bellows (bellows is gone",
         "not there: robot/c of forge (that host is not seen either)",
     ]
+
+
+def test_what_no_file_names_may_be_forgotten() -> None:
+    gone = led(view("robot/d", present=False, reason="dock is gone", gone=60.0, host="dock"))
+    assert the_mend(seen(state=gone)).remedy == "start zscout-node at dock, or forget it: it is shown for a day"
+    named = replace(PLAIN, devices={"dock": ("robot/d",)})
+    assert the_mend(seen(named, state=gone)).remedy == "start zscout-node at dock, or remove it from [devices]"
+    there = leading() | host("dock", Role.NODE, version=VERSION)
+    assert the_mend(seen(hosts=there, state=gone)).remedy.endswith(" or forget it: it is shown for a day")
 
 
 def test_what_a_node_should_offer_is_expected_of_it() -> None:

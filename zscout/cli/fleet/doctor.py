@@ -20,13 +20,15 @@ from zscout.cli import common
 from zscout.cli.fleet.findings import Evidence, Finding, findings
 from zscout.config.certificates import MAX_FILE, read_cas, read_certificates, read_places_key
 from zscout.config.fleet import Fleet
-from zscout.config.node import load_node
+from zscout.config.node import Node, load_node
 from zscout.config.strict import BadInput, read_text
 from zscout.keyexpr import valid_name
 from zscout.terminal import Table
 
 JOINED: Final = 7.0
 """Seconds in which whoever is on the mesh is seen, and a candidate takes the lead."""
+RELAY: Final = 1.0
+"""Seconds more for a link to the relay."""
 LISTENS: Final = 3
 """Addresses of one process that are called."""
 TIME_ERROR: Final = 5
@@ -86,6 +88,8 @@ async def _look(file: Path | None) -> Evidence:
     seen.host = seen.host or os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
     from zscout.mesh import probing
 
+    if seen.node is not None:
+        _look_at_drivers(seen, seen.node)
     mesh = seen.fleet.mesh
     if mesh.multicast:
         seen.interfaces = probing.multicast_problems(mesh)
@@ -100,7 +104,7 @@ async def _look(file: Path | None) -> Evidence:
 
     async with asyncio.TaskGroup() as both:  # when it is interrupted it waits until the mesh is left
         both.create_task(call())
-        if not seen.bad:
+        if _may_join(seen, seen.fleet):
             both.create_task(_join(seen, seen.fleet))
     return seen
 
@@ -123,10 +127,32 @@ def _look_at_certificates(seen: Evidence, fleet: Fleet) -> str:
     return cas
 
 
+def _look_at_drivers(seen: Evidence, node: Node) -> None:
+    """As `zscout-node --check`."""
+    from zscout.drivers.registry import driver_for
+
+    try:
+        for rc in node.rcs:
+            driver_for(rc)
+    except BadInput as error:
+        seen.bad.append(("drivers", error))
+
+
+def _may_join(seen: Evidence, fleet: Fleet) -> bool:
+    if fleet.security is None:
+        return True
+    own = seen.certificates
+    return (
+        own is not None
+        and bool(fleet.access.ranks_of(own.name))
+        and not any(about == "certificate" for about, _ in seen.bad)
+    )
+
+
 async def _join(seen: Evidence, fleet: Fleet) -> None:
     """What is seen from inside."""
     from zscout.cli.fleet.fleet_view import Devices, FleetView
-    from zscout.mesh import MeshError
+    from zscout.mesh import MeshError, probing
 
     try:
         async with common.connected("doctor", fleet, need_rcm=False) as client:
@@ -138,6 +164,11 @@ async def _join(seen: Evidence, fleet: Fleet) -> None:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(1.0):
                         await devices.ask()
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(RELAY if fleet.mesh.site is not None else 0):
+                        while not client.mesh.relays():  # noqa: ASYNC110 - nothing tells
+                            await asyncio.sleep(probing.POLL)
+                seen.relays = client.mesh.relays()
                 seen.links, seen.hosts, seen.devices = client.mesh.links(), view.hosts, devices.known()
     except (MeshError, BadInput) as error:
         seen.unjoined = str(error)

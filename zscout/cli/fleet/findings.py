@@ -68,6 +68,8 @@ class Evidence:
     """Why the mesh could not be joined."""
     links: int | None = None
     """None: it was not joined."""
+    relays: int = 0
+    """Of the links, those to one."""
     hosts: Mapping[str, Host] = field(default_factory=dict)
     state: RcmState | None = None
     devices: Mapping[str, RcState] = field(default_factory=dict)
@@ -80,7 +82,8 @@ def findings(seen: Evidence) -> list[Finding]:
     found = [_bad(about, error) for about, error in seen.bad]
     if seen.fleet is None:
         return [*found, *_clock(seen)]
-    parts = (_files, _certificate, _multicast, _called, _security, _links, _leader, _devices, _hosts, _clock, _open)
+    network = (_security, _multicast, _called, _links, _site)
+    parts = (_files, _certificate, *network, _leader, _devices, _hosts, _clock, _open)
     return [*found, *(one for part in parts for one in part(seen))]
 
 
@@ -107,6 +110,12 @@ def _certificate(seen: Evidence) -> Iterator[Finding]:
     if not ranks:
         says = f"{own.cert}: {own.name} has no role in fleet {fleet.name}"
         yield Finding("certificate", "mend", says, "name it under [roles] of the fleet file, on all hosts")
+    elif _shut_out(seen):
+        says = f"{many(seen.links or 0, 'link')}, and nobody of fleet {fleet.name} is seen by {own.name}"
+        remedy = (
+            "name it under [roles] in the files of the others (did it lose its role?); is the fleet's name the same?"
+        )
+        yield Finding("certificate", "mend", says, remedy)
     elif own.soon(seen.at):
         yield _ends_soon(own.name, own.ends_in(seen.at))
     else:
@@ -115,6 +124,13 @@ def _certificate(seen: Evidence) -> Iterator[Finding]:
     if "manager" in ranks and not seen.seals:
         says = f"{own.folder} has no {PLACES_KEY}: the places that {own.name} gives, when it leads, are not sealed"
         yield Finding("certificate", "mend", says, "copy it from the CA's folder")
+
+
+def _shut_out(seen: Evidence) -> bool:
+    """Whether its certificate is taken, and its name may not see anybody."""
+    refused = any(one.objection for one in seen.answers)  # a link that is refused lives for a moment
+    secured = seen.fleet is not None and seen.fleet.security is not None
+    return secured and bool(seen.links) and not refused and not any(host.tokens for host in seen.hosts.values())
 
 
 def _ends_soon(name: str, left: float) -> Finding:
@@ -156,8 +172,14 @@ def _multicast(seen: Evidence) -> Iterator[Finding]:
 def _called(seen: Evidence) -> Iterator[Finding]:
     """The addresses that files name, and who is not heard as it says."""
     fleet = _the_fleet(seen)
-    for one in seen.answers:
-        if one.address not in fleet.mesh.connect:
+    named = [one for one in seen.answers if one.address in fleet.mesh.connect]
+    # Of a host that is seen to run one of its own addresses is no matter: it may well listen at another.
+    own = [one for one in named if not one.speaks and (one.here or _host_in(one.address) == seen.host)]
+    if own and not (seen.host in seen.hosts and seen.hosts[seen.host].has(Role.NODE)):
+        says = f"this host's node does not run ({own[0].address}: {own[0].problem})"
+        yield Finding("connect", "mend", says, "start zscout-node here")
+    for one in named:
+        if one in own:
             continue
         if not one.speaks:
             remedy = "is the host up, does zscout-node run and listen there, does a firewall let it through?"
@@ -168,6 +190,11 @@ def _called(seen: Evidence) -> Iterator[Finding]:
         elif one.speaks == "tls" and one.address.startswith("tcp/"):
             remedy = f"write tls/ there, and [security] ({SECURE})"
             yield Finding("connect", "mend", f"{one.address}: takes TLS only", remedy)
+
+
+def _host_in(address: str) -> str:
+    """The name in it, without its domain."""
+    return address.partition("/")[2].rpartition(":")[0].partition(".")[0]
 
 
 def _security(seen: Evidence) -> Iterator[Finding]:
@@ -188,10 +215,10 @@ def _security(seen: Evidence) -> Iterator[Finding]:
     if mixed := sorted(seen.plain.get(fleet.name, ())):
         says = f"{_listed(mixed)} {'runs' if len(mixed) == 1 else 'run'} fleet {fleet.name} without certificates"
         yield Finding("security", "mend", says, "give them the fleet file with [security], and restart their nodes")
-    own = seen.certificates
+    if (own := seen.certificates) is None:  # why is told already, and whom they trust is not known
+        return
     for (name, issuer), addresses in _by_name(one for one in closed if not one.trusted):
-        trusts = ", ".join(own.trusted) if own is not None else "nobody here"
-        says = f"{name} ({addresses[0]}) shows a certificate of {issuer}, and {CA} trusts {trusts}"
+        says = f"{name} ({addresses[0]}) shows a certificate of {issuer}, and {CA} trusts {', '.join(own.trusted)}"
         if name in members:
             yield Finding("security", "mend", says, f"issue both by one CA, or put both CAs into {CA} ({SECURE})")
         else:
@@ -227,7 +254,7 @@ def _links(seen: Evidence) -> Iterator[Finding]:
     if seen.unjoined is not None:
         yield Finding("links", "mend", seen.unjoined)
         return
-    if seen.links is None:
+    if seen.links is None or _shut_out(seen):
         return
     others = {name: hosts for name, hosts in seen.plain.items() if name != fleet.name}
     known = _listed([f"{name} ({_listed(sorted(hosts))})" for name, hosts in sorted(others.items())])
@@ -237,21 +264,39 @@ def _links(seen: Evidence) -> Iterator[Finding]:
     elif others and fleet.security is None:
         remedy = "mend the fleet's name in the file, or start zscout-node with it"
         yield Finding("links", "mend", f"nobody is seen of fleet {fleet.name}, and of others: {known}", remedy)
-    elif seen.links and not any(one.objection for one in seen.answers):  # a link that is refused lives for a moment
+    elif seen.links and fleet.security is None:
         says = f"{many(seen.links, 'link')}, and nobody of fleet {fleet.name} is seen through them"
-        remedy = "is the fleet's name the same there?"
-        if fleet.security is not None:
-            remedy = f"is {seen.host} named under [roles] in the files of the others, and the fleet's name the same?"
-        yield Finding("links", "mend", says, remedy)
+        yield Finding("links", "mend", says, "is the fleet's name the same there?")
     else:
         yield Finding("links", "mend", "no link to anybody", "mend what stands above, or start zscout-node")
     if here and others:
         yield Finding("links", "note", f"other fleets on this network: {known}")
 
 
+def _site(seen: Evidence) -> Iterator[Finding]:
+    """A relay links only to those whose `site` it names, and refuses the others without a word."""
+    fleet = _the_fleet(seen)
+    if fleet.mesh.relay:
+        return
+    if (site := fleet.mesh.site) is not None:
+        if seen.relays:
+            yield Finding("site", "ok", f"site {site}, linked to {many(seen.relays, 'relay')}")
+        elif seen.links and not _shut_out(seen):
+            remedy = "does zscout-relay run, is it under connect, does its `relay` name this site?"
+            yield Finding("site", "mend", f"no relay is linked: this host sees its own site only ({site})", remedy)
+        return
+    heard = {address: one for one in seen.heard if one.relay for address in one.addresses}
+    called = [one.address for one in seen.answers if one.address in heard and one.trusted]
+    ours = [*fleet.access.roles.relay, *called, *(one for one in fleet.mesh.connect if one in heard)]
+    if names := ours or [one.addresses[0] for one in heard.values() if one.addresses][:1]:
+        whose = "" if ours else " if it is this fleet's,"
+        says = f"no `site` is set, so no link to the relay ({names[0]}):{whose} this host sees its own site only"
+        yield Finding("site", "mend" if ours else "note", says, "set `site` under [mesh] as the relay's file names it")
+
+
 def _leader(seen: Evidence) -> Iterator[Finding]:
     fleet = _the_fleet(seen)
-    if seen.links is None:
+    if seen.links is None or _shut_out(seen):
         return
     leads = sorted(name for name, host in seen.hosts.items() if host.has(Role.RCM))
     # One that the file does not name leads nobody.
@@ -280,7 +325,7 @@ def _leader(seen: Evidence) -> Iterator[Finding]:
 
 
 def _devices(seen: Evidence) -> Iterator[Finding]:
-    if seen.links is None:
+    if seen.links is None or _shut_out(seen):
         return
     offered = defaultdict[str, set[str]](set)
     for name, host in seen.hosts.items():
@@ -289,15 +334,18 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
                 offered[token.name].add(name)
     views = {view.rc: view for view in (seen.state.rcs if seen.state is not None else ())}
     homes = {rc: host for host, rcs in _the_fleet(seen).devices.items() for rc in rcs}
+    files = dict.fromkeys(homes, "remove it from [devices]")
     if seen.node is not None:
         homes |= {rc.name: seen.node.host for rc in seen.node.rcs}
-    missing = defaultdict[tuple[str, str], list[str]](list)
+        files |= dict.fromkeys((rc.name for rc in seen.node.rcs), "remove its [[rc]] table")
+    missing = defaultdict[tuple[str, str, str], list[str]](list)
     well = 0
     for rc in sorted({*homes, *offered, *views}):
         view, device = views.get(rc), seen.devices.get(rc)
         if rc not in offered and (view is None or not view.present):
             home = homes.get(rc) or (view.host if view is not None else "")
-            missing[home, absence(view) if view is not None else ""].append(rc)
+            else_do = files.get(rc, "forget it: it is shown for a day")
+            missing[home, absence(view) if view is not None else "", else_do].append(rc)
         elif device is not None and device.health != "ok":
             yield Finding("devices", "mend", f"{rc} at {device.host} is lost: {device.health}", "mend the device")
         elif view is not None and not view.present:
@@ -313,14 +361,14 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
         for other in view.unseen if view is not None else ():
             remedy = "is it up, is the network cut in two? If it has the device no more, it is forgotten after a day"
             yield Finding("devices", "mend", f"{rc}: its other host {other} is not seen", remedy)
-    for (home, why), rcs in sorted(missing.items()):
+    for (home, why, else_do), rcs in sorted(missing.items()):
         there = home in seen.hosts and seen.hosts[home].has(Role.NODE)
         why = why or ("" if there else "that host is not seen either")
         remedy = f"start zscout-node at {home or 'the host that has it'}"
         if there:
             remedy = f"see the log of zscout-node at {home}: has its file these [[rc]] tables?"
         says = f"not there: {_listed(rcs)} of {home or 'no known host'}" + (f" ({why})" if why else "")
-        yield Finding("devices", "mend", says, remedy)
+        yield Finding("devices", "mend", says, f"{remedy}{'' if there else ','} or {else_do}")
     if well and not missing:
         yield Finding("devices", "ok", f"{many(well, 'RC')} there and well")
 

@@ -315,6 +315,9 @@ class MemoryTransport(Transport):
     def links(self) -> int:
         return len(self.peers())
 
+    def relays(self) -> int:
+        return 0
+
     async def close(self) -> None:
         self.leave()
 
