@@ -90,16 +90,19 @@ class _World:
         await until(lambda: all(ids <= {one.id(), *one.peers()} for one in self._peers))
         return peer
 
+    async def pair(self, connect: Sequence[str] = ()) -> tuple[ZenohTransport, str]:
+        """Two peers among three: one that makes its links again, and the id of another."""
+        await self.peer()
+        here = await self.peer(relinks=True, makes_links=True, connect=connect)
+        return here, (await self.peer()).id()
+
 
 def test_a_link_that_is_lost_is_made_again() -> None:
     """By who made it."""
 
     async def story() -> None:
         async with AsyncExitStack() as stack:
-            world = _World(stack)
-            await world.peer()
-            here = await world.peer(relinks=True, makes_links=True)
-            there = (await world.peer()).id()
+            here, there = await _World(stack).pair()
             _cut(before := _ends(here, there))
             await until(lambda: _ends(here, there) - before)
 
@@ -112,10 +115,7 @@ def test_a_link_that_came_and_went_without_a_word_is_made_again(monkeypatch: pyt
 
     async def story() -> None:
         async with AsyncExitStack() as stack:
-            world = _World(stack)
-            await world.peer()
-            here = await world.peer(relinks=True, makes_links=True)
-            there = (await world.peer()).id()
+            here, there = await _World(stack).pair()
             looking = here._relinking
             assert looking is not None
             _cut(before := _ends(here, there))
@@ -238,10 +238,8 @@ def test_a_relay_is_not_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     async def story() -> None:
         async with AsyncExitStack() as stack:
             world = _World(stack)
-            await world.peer()
             relay, address = world.relay()
-            here = await world.peer(relinks=True, makes_links=True, connect=[address])
-            there = (await world.peer()).id()
+            here, there = await world.pair([address])
             before = _ends(here, there)
             await until(lambda: _ends(here, relay.id()))
             await relay.close()

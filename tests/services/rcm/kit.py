@@ -221,8 +221,8 @@ class FakeFleet:
         rc.start()
         return rc
 
-    def client(self, name: str) -> FakeClient:
-        client = FakeClient(self.mesh("desk", name), self.log)
+    def client(self, name: str, host: str = "desk") -> FakeClient:
+        client = FakeClient(self.mesh(host, name), self.log)
         client.start()
         return client
 

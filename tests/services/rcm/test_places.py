@@ -62,6 +62,20 @@ def test_a_place_goes_with_its_arc_and_may_be_kept_for_a_while() -> None:
     assert mine == [False, False, True]
 
 
+def test_a_place_that_ended_twice_is_kept_until_the_later_date() -> None:
+    for first, second in ((MINUTE, 3 * MINUTE), (3 * MINUTE, MINUTE)):
+        of, place = places(), Place(NEW, 1)
+        for keep in (first, second):
+            of.bind(place, "desk/one/q", 0)
+            of.end("desk/one/q", 0, keep)
+        for now, is_its_own in ((2 * MINUTE, True), (4 * MINUTE, False)):
+            of.bind(Place(NEW, 9), "desk/two/q", now)
+            of.end("desk/two/q", now)
+            assert of.may_claim(place, "desk/one", "q", None, seen=True) == is_its_own
+        assert not of._owners
+        assert not of._until
+
+
 def test_places_that_are_kept_have_a_limit() -> None:
     of = places()
     for arrival in range(MAX_KEPT + 10):
@@ -75,7 +89,10 @@ def test_an_unknown_place_of_an_earlier_term_is_taken_once_by_who_is_seen() -> N
     place = Place(OLD, 7)
     assert not of.may_claim(place, "desk/one", "q1", None, seen=False)
     assert of.may_claim(place, "desk/one", "q1", None, seen=True)
+    assert of.takes_the_word_for(place)
+    assert not places(KEY).takes_the_word_for(place)
     of.bind(place, "desk/one/q1", 0)
+    assert not of.takes_the_word_for(place)
     assert not of.may_claim(place, "desk/two", "q2", None, seen=True)
 
 

@@ -342,3 +342,29 @@ def test_rcs_settle_unless_the_client_says_that_its_program_is_gone() -> None:
             assert [one.own for one in fleet.published[-1].revoked] == [left]
 
     run(story())
+
+
+def test_a_hand_over_needs_room_at_the_new_client_and_on_its_host() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        limits = msgspec.structs.replace(fleet.fleet.limits, max_requests_per_client=2, max_requests_per_host=3)
+        fleet.fleet = msgspec.structs.replace(fleet.fleet, limits=limits)
+        fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"))
+        old, new, beside = (fleet.client(name, host) for name, host in (("old", "desk"), ("new", "h2"), ("more", "h2")))
+        for client, arcs in ((old, "ab"), (new, "c"), (beside, "de")):
+            for arc in arcs:
+                await client.ask(arc, "robot/a")
+        with pytest.raises(Refusal, match="too_many: h2/new has room for 1 more requests, not for 2"):
+            await old.do(HandOver("a", new.name, ["b"]))
+        with pytest.raises(Refusal, match="too_many: the clients of h2 have room for 0 more requests, not for 1"):
+            await old.do(HandOver("a", new.name))
+        await beside.do(Cancel("e"))
+        assert (await old.do(HandOver("a", new.name))).client == new.name
+        # What is there already needs none.
+        assert (await old.do(HandOver("a", new.name))).client == new.name
+        # Among the programs of one host nothing is added to what it has.
+        await old.ask("f", "robot/a")
+        await old.do(HandOver("b", fleet.client("next").name))
+
+    run(story())

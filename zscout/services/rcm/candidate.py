@@ -290,7 +290,7 @@ class Candidate:
             open_requests,
             self.mesh.now(),
             self.inventory.devices.home_of,
-            lambda client, one, place: places.was_sealed(place, client, one.was or one.id, one.seal),
+            lambda client, one, place: places.may_recover(place, client, one.was or one.id, one.seal),
         )
         recovered.patient = self.election.links_return(self.mesh.now(), self._leader)
         self.known, self._goes_above = term, False

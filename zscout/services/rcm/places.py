@@ -7,12 +7,9 @@ from __future__ import annotations
 
 import heapq
 import hmac
-import logging
 from collections.abc import Collection
 
 from zscout.types import ArcId, ClientId, Ns, Place, Term
-
-log = logging.getLogger(__name__)
 
 MAX_KEPT = 20_000
 """Places of ARCs that are over, but might be asked for again."""
@@ -42,7 +39,9 @@ class Places:
         self._owners: dict[Place, dict[ClientId, int]] = {}
         """By place: its clients, each with how many open ARCs there."""
         self._over: list[tuple[Ns, Place]] = []
-        """A heap of those without an open ARC, and until when they are kept."""
+        """A heap of dates up to which places without an open ARC are kept."""
+        self._until: dict[Place, Ns] = {}
+        """By place: the latest of its dates in that heap, which counts."""
 
     def seal(self, place: Place, arc: ArcId) -> str | None:
         """What proves to every leader that this place is this ARC's; None: there is no key."""
@@ -63,12 +62,13 @@ class Places:
         if self._key is not None:
             expected = self.seal(place, arc_id(client, id_)) or ""
             return seal is not None and hmac.compare_digest(expected.encode(), seal.encode())
-        if owners is not None or not seen:
-            return False
-        log.warning("%s shows a place of term %d that is not known here: it has it", client, place.term.counter)
-        return True
+        return owners is None and seen
 
-    def was_sealed(self, place: Place, client: ClientId, id_: str, seal: str | None) -> bool:
+    def takes_the_word_for(self, place: Place) -> bool:
+        """Whether whoever shows this place first has it: nothing here tells whose it is."""
+        return self._key is None and place not in self._owners
+
+    def may_recover(self, place: Place, client: ClientId, id_: str, seal: str | None) -> bool:
         """Whether that place is to be recovered for who lists it as its own."""
         return self._key is None or self.may_claim(place, client, id_, seal, seen=True)
 
@@ -93,9 +93,13 @@ class Places:
             return
         owners = self._owners[place]
         owners[client_id(arc)] -= 1
-        if not any(owners.values()):
+        if not any(owners.values()) and now + keep > self._until.get(place, -1):
+            self._until[place] = now + keep
             heapq.heappush(self._over, (now + keep, place))
         while self._over and (self._over[0][0] <= now or len(self._over) > MAX_KEPT):
-            _, place = heapq.heappop(self._over)
-            if not any(self._owners.get(place, {}).values()):
-                self._owners.pop(place, None)
+            date, place = heapq.heappop(self._over)
+            if self._until[place] != date:
+                continue
+            del self._until[place]
+            if not any(self._owners[place].values()):
+                del self._owners[place]

@@ -192,6 +192,9 @@ class RequestHandler:
         check_place(ask.place, self.core)
         seen = client in self._membership.clients
         if self._places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
+            if self._places.takes_the_word_for(ask.place):
+                told = "%s shows a place of term %d that is not known here: it has it"
+                self._strange.warning(client, told, client, ask.place.term.counter)
             return ask.place
         self._strange.warning(client, "%s shows a place that is not its own: it has none for that", client)
         return None
@@ -391,9 +394,7 @@ class RequestHandler:
         if not moves or moves[0].arc != arc_id(sender, operation.id):
             self._answer_handed_over(query, operation, sender, to)
             return
-        room = self.limits.max_requests_per_client - len(self.core.arcs_of(to))
-        if len(moves) > room:
-            raise Refused("too_many", f"{to} has room for {max(0, room)} more requests, not for {len(moves)}")
+        self._check_room_for(moves, sender, to)
         for move in moves:
             known = self.core.arc(move.arc)
             self._authority.check_hand_over(client_of(to), known.needs if known is not None else ())
@@ -406,6 +407,16 @@ class RequestHandler:
         self._emit(*shown, *moves)
         self._registry.publish(move.renamed for move in moves if self.core.is_queued(move.renamed))
         query.answer(self._registry.notice(moves[0].renamed))
+
+    def _check_room_for(self, moves: Collection[HandedOver], sender: ClientId, to: ClientId) -> None:
+        added = sum(self.core.arc(move.renamed) is None for move in moves)
+        host = to.partition("/")[0]
+        rooms = [(f"{to} has", self.limits.max_requests_per_client - len(self.core.arcs_of(to)))]
+        if host != sender.partition("/")[0]:
+            rooms.append((f"the clients of {host} have", self.limits.max_requests_per_host - self._open_of((host,))))
+        for who, room in rooms:
+            if added > room:
+                raise Refused("too_many", f"{who} room for {max(0, room)} more requests, not for {added}")
 
     def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[HandedOver]:
         """What a hand-over comes to: of the ARCs that it names, those that are open at the sender."""
