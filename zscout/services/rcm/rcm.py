@@ -104,6 +104,7 @@ class Rcm:
         devices = self.inventory.devices
         self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer, devices)
         self.membership.on_requests = self._on_requests
+        self.registry.hosts_of = self.membership.hosts_of
         self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(
             mesh,
@@ -244,8 +245,9 @@ class Rcm:
                         self.membership.heard(client)
                         self.membership.expect(client)
                     self._recover(request)
+        answered = self.requests.answer_grants(effects)
         self._publish(effects, named)
-        self.registry.report(effects, self.requests.waiting, self.requests.given_up)
+        self.registry.report(effects, answered | self.requests.waiting.keys(), self.requests.given_up)
         self.requests.answer(effects)
         for effect in effects:
             match effect:

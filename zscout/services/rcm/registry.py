@@ -22,7 +22,7 @@ from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.reason import Party, Reason, ended, waits
 from zscout.services.rcm.places import Places, client_id, request_id
-from zscout.types import SECOND, ArcId, Grant, Ns, Term
+from zscout.types import SECOND, ArcId, Grant, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +74,8 @@ class RequestRegistry:
         """ARCs whose notices say when they will start."""
         self.may_be_held: Callable[[ArcId], bool] = lambda _: False
         """Whether a queued ARC's client believes in a hold that RCs may yet report: it is not told to wait before."""
+        self.hosts_of: Callable[[Iterable[RcName]], dict[RcName, HostName]] = lambda _: {}
+        """Where RCs are that are granted."""
         self._changed: dict[ArcId, None] = {}
         """Queued ARCs whose reason to wait has changed and has not been published yet."""
         self._starts: Mapping[ArcId, Ns] = {}
@@ -147,6 +149,7 @@ class RequestRegistry:
             bound=dict(arc.bound) if hold is not None else {},
             remaining=(hold.end - self._mesh.now()) / SECOND if hold is not None else None,
             starts_in=self._starts_in(arc),
+            hosts=self.hosts_of(arc.needs) if hold is not None else {},
         )
 
     def interrupted(self, arc: ArcId, believed: Grant) -> Notice:

@@ -338,8 +338,15 @@ class RequestHandler:
             # Votes are out: they decide the first answer, if they come.
             self._supervisor.call_later(self._first_answer_timeout, self._answer, undecided)
 
+    def answer_grants(self, effects: Iterable[Effect]) -> set[ArcId]:
+        """Answers those whose ARCs an instant has granted, before anybody else is told. Returns those ARCs."""
+        granted = {effect.arc for effect in effects if isinstance(effect, Granted)} & self.waiting.keys()
+        running = {one for one in granted if (arc := self.core.arc(one)) is not None and arc.hold is not None}
+        self._answer(sorted(running))
+        return running
+
     def answer(self, effects: Iterable[Effect]) -> None:
-        """Answers the operations that an instant's effects have decided."""
+        """Answers the other operations that an instant's effects have decided."""
         for effect in effects:
             match effect:
                 case Granted(arc=arc) | Dropped(arc=arc):
