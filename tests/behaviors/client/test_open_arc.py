@@ -280,8 +280,8 @@ def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(answers: l
             client._store.notify(again)
             assert again.ask(NOW).unconfirmed == []
 
-        client._confirmations._command = command  # type: ignore[assignment]
-        client.end, client._rcm.submit = end, submit  # type: ignore[method-assign]
+        client._confirmations._command = command
+        client.end, client._rcm.submit = end, submit  # type: ignore[assignment,method-assign]
         if told == "failed":
             with pytest.raises(CommandRefused, match="failed"):
                 await client.granted(known, confirmed=True)
@@ -306,7 +306,7 @@ def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> N
                 raise CommandRefused(rc, Problem("unknown", "no answer, at once"))
             return Done()
 
-        client._confirmations._command = command  # type: ignore[assignment]
+        client._confirmations._command = command
         assert await client.granted(known, confirmed=True) == FIRST
 
     kit.run(story())
@@ -328,7 +328,7 @@ def test_a_client_that_stood_still_itself_gives_its_rcs_a_second_all_the_same() 
             return Done()
 
         wakes = loop.time() + 0.3
-        client._confirmations._command = command  # type: ignore[assignment]
+        client._confirmations._command = command
         assert await client.granted(known, confirmed=True) == FIRST
 
     kit.run(story())
