@@ -12,13 +12,13 @@ import pytest
 from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
 from tests.hang import HANG
 from tests.mesh.kit import run, until
+from zscout.drivers.confirm_server import CommandQuery
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
 from zscout.drivers.resource_controller import (
     COMMANDS_PER_HOST,
     EARLY_PER_HOST,
     SAY_AGAIN,
-    CommandQuery,
     ResourceController,
     WorkQueue,
 )

@@ -20,9 +20,9 @@ The body begins at the grant. Whether its RCs know of it is seen to beside: one 
 ends the body, and what is commanded meanwhile waits at the RC for as long as its `ttl`. A body that needs its devices
 ready from the first line on says `confirmed=True`, or awaits `held.confirmed()`.
 
-A body that touches devices past their RCs says `direct=True`. It begins when all have confirmed. When its hold ends it is
-cancelled, and its `finally` and `except CancelledError` run to their end, in at most nine tenths of what its RCs settle;
-the next holder waits for that.
+A body that touches devices past their RCs says `direct=True`. It begins when all have confirmed. When its hold ends it
+is cancelled, and its `finally` and `except CancelledError` run to their end, in at most nine tenths of what its RCs
+settle; the next holder waits for that.
 """
 
 from __future__ import annotations
