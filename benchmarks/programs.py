@@ -63,12 +63,14 @@ class Programs:
     async def body(self, needs: Any) -> float:
         began = time.perf_counter()
         async with hold(self.client, "bench", needs, min_runtime=HOLD):
-            return time.perf_counter() - began
+            took = time.perf_counter() - began
+        return took
 
     async def confirmed(self, needs: Any) -> float:
         began = time.perf_counter()
         async with hold(self.client, "bench", needs, min_runtime=HOLD, **self._confirmed):
-            return time.perf_counter() - began
+            took = time.perf_counter() - began
+        return took
 
     async def release(self, needs: Any) -> float:
         """To the next grant."""
