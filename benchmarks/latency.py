@@ -85,8 +85,8 @@ def programs(folder: Path, tree: Path = ROOT, strategy: StrategyName = "adaptive
 async def latencies(
     lab: Lab, folder: Path, rounds: int, progress: Callable[[str], None], before: str | None = None
 ) -> list[Row]:
-    """Rows for the bare query, its asyncio face, and what programs wait for: of this tree, of the commit `before`, and of
-    a fleet under the strategy `priority`."""
+    """Rows for the bare query, its asyncio face, and what programs wait for: of this tree, of the commit `before`,
+    and of a fleet under the strategy `priority`."""
     client = await lab.client("bench")
     ask = len(messages.encode(Ask("0123456789ab", "bench", {EXCLUSIVE[0]: {}}, 0, 60)))  # type: ignore[arg-type]
     address = lab.fleet.mesh.multicast_address.replace("224.0.0.224", "224.0.0.225")

@@ -63,14 +63,12 @@ class Programs:
     async def body(self, needs: Any) -> float:
         began = time.perf_counter()
         async with hold(self.client, "bench", needs, min_runtime=HOLD):
-            took = time.perf_counter() - began
-        return took
+            return time.perf_counter() - began
 
     async def confirmed(self, needs: Any) -> float:
         began = time.perf_counter()
         async with hold(self.client, "bench", needs, min_runtime=HOLD, **self._confirmed):
-            took = time.perf_counter() - began
-        return took
+            return time.perf_counter() - began
 
     async def release(self, needs: Any) -> float:
         """To the next grant."""
