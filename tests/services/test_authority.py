@@ -12,7 +12,9 @@ from zscout.config.scheduling_policy import DEFAULT
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused
 from zscout.messages import Ask
+from zscout.scheduling.model import ArcRequest, ArcStatus, Hold
 from zscout.services.authority import Authority
+from zscout.types import NO_TERM, SECOND, Grant, Place
 
 FILE = """
 [security]
@@ -81,6 +83,55 @@ def test_a_name_has_no_more_arcs_open_than_its_quota(tmp_path: Path) -> None:
     told.check_ask(Sender("bob", "c1"), ask("robot/scout1"), lambda names: len(names))
     with pytest.raises(Refused, match="bob has 2 ARCs open, its quota; release or cancel one"):
         told.check_ask(Sender("bob", "c1"), ask("robot/scout1"), lambda names: 2 * len(names))
+
+
+def given(*needs: str, priority: int = 1, keep: bool = False, runs: bool = False) -> ArcStatus:
+    """An ARC that somebody hands over."""
+    request = ArcRequest("ada/c1/q1", "ada/c1", {need: {} for need in needs}, priority, 5 * SECOND, keep)
+    hold = Hold(Grant(NO_TERM, 1), 0, 5 * SECOND) if runs else None
+    return ArcStatus(request, Place(NO_TERM, 1), hold, request.needs, {}, 0, 0, None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("to", "arcs", "why"),
+    [
+        ("bob", [given("robot/s1")], ""),
+        ("bob", [given("robot/s1"), given("robot/s2")], "bob may have 2 ARCs open, and would have more"),
+        ("bob", [given("robot/arm1")], "bob (client) may not hold robot/arm1; ada, eve may"),
+        ("bob", [given("robot/s1", priority=10)], "bob (client) may not ask for priority 10; at most 9; ada may"),
+        ("bob", [given("robot/s1", keep=True)], "bob (client) may not keep a hold; ada may"),
+        (
+            "wall",
+            [given("robot/s1")],
+            "wall (viewer) may not take over an ARC; ada, anvil, bellows, bob and 1 more may",
+        ),
+        # Of one group: it has no more than before.
+        ("eve", [given("a/1", "a/2", runs=True)], ""),
+        (
+            "eve",
+            [given("a/1", "a/2", "a/3", "a/4", runs=True)],
+            "arms may hold 3 RCs at one time, and this asks for more",
+        ),
+    ],
+)
+def test_who_is_handed_an_arc_has_no_more_than_it_may_ask_for(
+    tmp_path: Path, to: str, arcs: list[ArcStatus], why: str
+) -> None:
+    told, open_by = authority(tmp_path), lambda names: len(names)
+    if not why:
+        told.check_hand_over(Sender("ada", "c1"), Sender(to, "c1"), arcs, open_by, lambda _: 3)
+        return
+    with pytest.raises(Refused) as refused:
+        told.check_hand_over(Sender("ada", "c1"), Sender(to, "c1"), arcs, open_by, lambda _: 3)
+    assert (refused.value.problem.code, refused.value.problem.message) == ("not_allowed", why)
+
+
+def test_who_is_handed_a_hold_has_no_more_rcs_than_its_quota(tmp_path: Path) -> None:
+    told, to, arcs = authority(tmp_path), Sender("eve", "c1"), [given("a/1", runs=True)]
+    told.check_hand_over(Sender("bob", "c1"), to, arcs, lambda _: 0, lambda _: 2)
+    told.check_hand_over(Sender("bob", "c1"), to, [given("a/1")], lambda _: 0, lambda _: 3)
+    with pytest.raises(Refused, match="arms may hold 3 RCs at one time, and would hold more"):
+        told.check_hand_over(Sender("bob", "c1"), to, arcs, lambda _: 0, lambda _: 3)
 
 
 def test_the_scheduler_is_told_of_quotas_and_of_what_a_pattern_is_not_bound_to(tmp_path: Path) -> None:

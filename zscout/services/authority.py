@@ -5,7 +5,7 @@ plain mesh nothing proves a name, and nothing is refused here."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Final
 
@@ -15,7 +15,8 @@ from zscout.config.fleet import Fleet
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy
 from zscout.keyexpr import NODES, USERS, Rank, Sender, as_pattern, is_pattern
 from zscout.mesh import Refused
-from zscout.messages import Ask, Foresee, Who, duration
+from zscout.messages import Amounts, Ask, Foresee, Who, decimal_seconds, duration
+from zscout.scheduling.model import ArcStatus
 from zscout.types import ClientId, RcName
 
 OPERATORS: Final[frozenset[Rank]] = frozenset({"operator"})
@@ -83,13 +84,32 @@ class Authority:
         """Who asks, as people are told it: whoever it says to be, its user is the one that its certificate names."""
         return structs.replace(who, user=sender.host) if who is not None and self._enforced else who
 
-    def check_hand_over(self, to: Sender, rcs: Iterable[RcName]) -> None:
-        """Raises Refused where the new client may not hold what it is given."""
-        if self._enforced:
-            self._check_rank(to.host, "take over an ARC", USERS)
-            for rc in rcs:
-                if not self.may_hold(to.host, rc):
-                    raise self._not_its(to.host, rc)
+    def check_hand_over(
+        self,
+        sender: Sender,
+        to: Sender,
+        arcs: Collection[ArcStatus],
+        open_by: Callable[[Collection[str]], int],
+        held_by: Callable[[Collection[str]], int],
+    ) -> None:
+        """Raises Refused where the new client may not have what it is given. `open_by`, `held_by`: how many ARCs some
+        names have open, and how many RCs they hold."""
+        if not self._enforced:
+            return
+        self._check_rank(to.host, "take over an ARC", USERS)
+        for arc in arcs:
+            request = arc.request
+            wanted: dict[str, Amounts] = {need: {} for need in (request.needs if arc.hold is None else arc.needs)}
+            seconds = decimal_seconds(request.min_runtime)
+            self.check_ask(to, Ask("", "", wanted, request.priority, seconds, request.keep), lambda _: 0)
+        running = sum(len(arc.needs) for arc in arcs if arc.hold is not None)
+        for owner, members, quota in self._policy.quotas_of(to.host):
+            if sender.host in members:
+                continue  # it has no more than before
+            if quota.arcs is not None and open_by(members) + len(arcs) > quota.arcs:
+                raise Refused("not_allowed", f"{owner} may have {quota.arcs} ARCs open, and would have more")
+            if running and quota.rcs is not None and held_by(members) + running > quota.rcs:
+                raise Refused("not_allowed", f"{owner} may hold {quota.rcs} RCs at one time, and would hold more")
 
     def check_operator(self, sender: Sender, what: str) -> None:
         """Raises Refused for all but operators. `what` stands behind `may not`."""

@@ -266,6 +266,11 @@ class RequestHandler:
         owned = {arc for arc in coming if client_id(arc).partition("/")[0] in names}
         return len({*owned, *self.core.arcs_of_owners(names)} - {but})
 
+    def _held_by(self, names: Collection[str]) -> int:
+        """How many RCs these hold."""
+        arcs = filter(None, map(self.core.arc, self.core.arcs_of_owners(names)))
+        return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
+
     def _check_room(self, client: ClientId) -> None:
         """Refuses what is too much at once; what this burst has brought already counts."""
         coming = [event for event in self._batch.values() if isinstance(event, Requested)]
@@ -402,9 +407,8 @@ class RequestHandler:
             self._answer_handed_over(query, operation, sender, to)
             return
         self._check_room_for(moves, sender, to)
-        for move in moves:
-            known = self.core.arc(move.arc)
-            self._authority.check_hand_over(client_of(to), known.needs if known is not None else ())
+        arcs = [arc for move in moves if (arc := self.core.arc(move.arc)) is not None]
+        self._authority.check_hand_over(client_of(sender), client_of(to), arcs, self._open_of, self._held_by)
         for move in moves:
             self._registry.enter(move.renamed, self._registry.name(move.arc))
         places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
