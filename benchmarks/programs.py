@@ -61,14 +61,17 @@ class Programs:
         return took
 
     async def body(self, needs: Any) -> float:
-        began = time.perf_counter()
-        async with hold(self.client, "bench", needs, min_runtime=HOLD):
-            return time.perf_counter() - began
+        return await self._entered(hold(self.client, "bench", needs, min_runtime=HOLD))
 
     async def confirmed(self, needs: Any) -> float:
-        began = time.perf_counter()
-        async with hold(self.client, "bench", needs, min_runtime=HOLD, **self._confirmed):
-            return time.perf_counter() - began
+        return await self._entered(hold(self.client, "bench", needs, min_runtime=HOLD, **self._confirmed))
+
+    @staticmethod
+    async def _entered(attempt: Any) -> float:
+        began, took = time.perf_counter(), 0.0
+        async with attempt:
+            took = time.perf_counter() - began
+        return took
 
     async def release(self, needs: Any) -> float:
         """To the next grant."""

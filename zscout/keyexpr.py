@@ -282,17 +282,7 @@ class Keys:
 
     def sender_of(self, key: str) -> Sender:
         """The sender of a request or command, or the owner of the key of a client or a building."""
-        match self._chunks(key):
-            case (
-                ["rcm", "schedule", host, client]
-                | ["rc", _, _, "command", host, client]
-                | ["client", host, client, "notice" | "requests" | "behavior"]
-                | ["building", host, client, "plan" | "poses"]
-                | ["placer", "component", host, client]
-                | ["host", _, "component" | "confirm", host, client]
-            ):
-                return Sender(check_name(host, "host"), check_name(client, "client"))
-        raise BadName(f"{key[:200]!r} does not name its sender")
+        return _sender_of(self, key)
 
     def rc_of(self, key: str) -> str:
         match self._chunks(key):
@@ -321,6 +311,21 @@ class Keys:
         if not key.startswith(f"{self.base}/"):
             raise BadName(f"{key[:200]!r} is not a key of fleet {self.fleet}")
         return key[len(self.base) + 1 :].split("/")
+
+
+@lru_cache(REMEMBERED)
+def _sender_of(keys: Keys, key: str) -> Sender:
+    match keys._chunks(key):
+        case (
+            ["rcm", "schedule", host, client]
+            | ["rc", _, _, "command", host, client]
+            | ["client", host, client, "notice" | "requests" | "behavior"]
+            | ["building", host, client, "plan" | "poses"]
+            | ["placer", "component", host, client]
+            | ["host", _, "component" | "confirm", host, client]
+        ):
+            return Sender(check_name(host, "host"), check_name(client, "client"))
+    raise BadName(f"{key[:200]!r} does not name its sender")
 
 
 def client_of(text: str) -> Sender:

@@ -118,7 +118,8 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
         raise Malformed(f"{len(payload)} bytes are too many; at most {limit} are taken")
     try:
         message: T = _decoder(kind).decode(payload)
-        if kind in NAMES_ONCE:
+        # What is as this encodes it has no name twice.
+        if kind in NAMES_ONCE and _ENCODER.encode(message) != payload:
             _ONCE.decode(payload.decode())
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         name = getattr(kind, "__name__", "operation")

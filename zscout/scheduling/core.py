@@ -141,6 +141,20 @@ class Core:
         """All ARCs, those that wait first."""
         return [arc.id for arc in self._state.all_arcs()]
 
+    def is_open(self, arc_id: ArcId) -> bool:
+        """Whether it waits or runs."""
+        return self._state.arc(arc_id) is not None
+
+    def is_running(self, arc_id: ArcId) -> bool:
+        return arc_id in self._state.running
+
+    def count_of(self, client: ClientId) -> int:
+        """How many ARCs one client has."""
+        return len(self._state.arcs_of(client))
+
+    def count_of_owners(self, owners: Collection[str]) -> int:
+        return sum(len(self._state.arcs_of_owner(owner)) for owner in owners)
+
     def arcs_of_owners(self, owners: Collection[str]) -> list[ArcId]:
         """The ARCs of all clients of these hosts and people."""
         return [arc.id for owner in owners for arc in self._state.arcs_of_owner(owner)]

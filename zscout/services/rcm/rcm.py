@@ -229,13 +229,37 @@ class Rcm:
         over = self.registry.ended
         events = [one for one in events if not (isinstance(one, Adopted) and over(one.held.request.arc))]
         effects = self.core.handle(self.mesh.now(), *events)
+        answered = self.requests.answer_grants(effects)
+        self._publish(effects, named)
+        self._note(events)
+        self.registry.report(effects, answered | self.requests.waiting.keys(), self.requests.given_up)
+        self.requests.answer(effects)
+        for effect in effects:
+            match effect:
+                case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self.core.is_open(
+                    arc
+                ):
+                    self.places.end(arc, self.mesh.now(), KEPT.get(outcome, REMEMBER))
+                case Propose():
+                    self._propose(effect)
+                case WakeAt(at):
+                    self._set_wake(at)
+        if line := self.core.strategy.log_line():
+            log.info("%s", line)
+
+    def _note(self, events: Iterable[Event]) -> None:
+        """What is remembered of an instant."""
         seen = self.membership.clients
         for event in events:
             match event:
                 case Requested(ArcRequest(client=client)) | HandedOver(to=client) if client not in seen:
                     self.membership.expect(client)
             match event:
-                case PlaceShown(arc) | HandedOver(renamed=arc) | Requested(ArcRequest(arc=arc)):
+                case Requested(request):
+                    self._bind(request.arc)
+                    asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
+                    self.registry.record(request.arc, asked)
+                case PlaceShown(arc) | HandedOver(renamed=arc):
                     self._bind(arc)
                 case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
                     self._bind(request.arc)
@@ -245,23 +269,6 @@ class Rcm:
                         self.membership.heard(client)
                         self.membership.expect(client)
                     self._recover(request)
-        answered = self.requests.answer_grants(effects)
-        self._publish(effects, named)
-        self.registry.report(effects, answered | self.requests.waiting.keys(), self.requests.given_up)
-        self.requests.answer(effects)
-        for effect in effects:
-            match effect:
-                case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self._is_open(arc):
-                    self.places.end(arc, self.mesh.now(), KEPT.get(outcome, REMEMBER))
-                case Propose():
-                    self._propose(effect)
-                case WakeAt(at):
-                    self._set_wake(at)
-        if line := self.core.strategy.log_line():
-            log.info("%s", line)
-
-    def _is_open(self, arc: ArcId) -> bool:
-        return self.core.place_of(arc) is not None
 
     def _bind(self, arc: ArcId) -> None:
         if (place := self.core.place_of(arc)) is not None:
