@@ -68,10 +68,10 @@ class Programs:
 
     @staticmethod
     async def _entered(attempt: Any) -> float:
-        began, took = time.perf_counter(), 0.0
+        began = entered = time.perf_counter()
         async with attempt:
-            took = time.perf_counter() - began
-        return took
+            entered = time.perf_counter()
+        return entered - began
 
     async def release(self, needs: Any) -> float:
         """To the next grant."""
