@@ -316,8 +316,13 @@ async def times(sites: Sites, rounds: int) -> dict[str, list[Ns]]:
 
 
 async def successions(sites: Sites, rounds: int) -> list[Ns]:
-    """From `kill -9` of a holder in one site until the next one, in the other, has entered its body."""
+    """From `kill -9` of a holder in one site until the next one, in the other, has entered its body.
+
+    Another program stays at each desk: a leader that loses the last programs of two hosts within a quarter of a lease
+    takes itself for cut off, and the next client that goes for unseen, for a lease."""
     found = []
+    stay = [await sites.program(site, f"stays-{site}") for site in SITES]
+    await sites.whole(*stay)
     rcs = "robot/a3", "robot/b3"
     for number in range(rounds):
         site, other = SITES[number % 2], SITES[number % 2 - 1]
@@ -330,6 +335,8 @@ async def successions(sites: Sites, rounds: int) -> list[Ns]:
         found.append(await following.enters() - killed)
         await following.gives_back()
         following.kill()
+    for program in stay:
+        program.kill()
     return found
 
 
