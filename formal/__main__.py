@@ -1,5 +1,5 @@
-"""`make model`: what TLC says of `ownership.tla`, `entering.tla` and `settling.tla`. Each guard of the protocol is taken
-out in turn as well, and must break something.
+"""`make model`: what TLC says of `ownership.tla`, `entering.tla` and `settling.tla`. Each guard of the protocol is
+taken out in turn as well, and must break something.
 
 `python -m formal traces FILE...` and `--simulated COUNT`: whether what a fleet did is a behaviour of the model."""
 

@@ -265,15 +265,15 @@ class RequestHandler:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
         return ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place))
 
-    def _open_of(self, names: Collection[str], but: ArcId = "") -> int:
+    def _open_of(self, names: Collection[str], *but: ArcId) -> int:
         """How many ARCs these have, waiting or running; what this burst has brought counts."""
         coming = [event.request.client for event in self._batch.values() if isinstance(event, Requested)]
         owned = sum(client.partition("/")[0] in names for client in coming) + self.core.count_of_owners(names)
-        return owned - (self.core.is_open(but) and but.partition("/")[0] in names)
+        return owned - sum(self.core.is_open(arc) and arc.partition("/")[0] in names for arc in but)
 
-    def _held_by(self, names: Collection[str]) -> int:
+    def _held_by(self, names: Collection[str], *but: ArcId) -> int:
         """How many RCs these hold."""
-        arcs = filter(None, map(self.core.arc, self.core.arcs_of_owners(names)))
+        arcs = filter(None, map(self.core.arc, {*self.core.arcs_of_owners(names)} - {*but}))
         return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
 
     def _check_room(self, client: ClientId) -> None:
@@ -415,7 +415,15 @@ class RequestHandler:
             return
         self._check_room_for(moves, sender, to)
         arcs = [arc for move in moves if (arc := self.core.arc(move.arc)) is not None]
-        self._authority.check_hand_over(client_of(sender), client_of(to), arcs, self._open_of, self._held_by)
+        # An ARC that is open at its new client already is replaced by the one that comes.
+        replaced = [move.renamed for move in moves]
+        self._authority.check_hand_over(
+            client_of(sender),
+            client_of(to),
+            arcs,
+            lambda names: self._open_of(names, *replaced),
+            lambda names: self._held_by(names, *replaced),
+        )
         for move in moves:
             self._registry.enter(move.renamed, self._registry.name(move.arc))
         places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
