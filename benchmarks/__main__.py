@@ -23,6 +23,8 @@ def progress(text: str) -> None:
 async def measure(rounds: int, crowds: int, members: int, before: str | None) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="zscout-bench-") as name:
         folder = Path(name)
+        (folder / "latencies").mkdir()
+        latencies = await latency.latencies(folder / "latencies", rounds, progress, before)
         async with latency.fleet_of(folder) as lab:
             programs.start(lab)
             first = await lab.client("first")
@@ -33,8 +35,8 @@ async def measure(rounds: int, crowds: int, members: int, before: str | None) ->
             rows = await process.idle(lab)
             progress("zscout --help")
             rows += process.help_time(rounds=15)
-            (folder / "latencies").mkdir()
-            rows = await latency.latencies(lab, folder / "latencies", rounds, progress, before) + rows
+            (folder / "questions").mkdir()
+            rows = latencies + await latency.questions(lab, folder / "questions", rounds, progress) + rows
             (folder / "empty").mkdir()
             rows += await crowd.crowd(lab, folder / "empty", crowds, 3.0, progress, members)
             rows += process.memory_after(lab)

@@ -9,7 +9,7 @@ import sys
 import tarfile
 import time
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
@@ -25,6 +25,10 @@ from zscout.config.scheduling_policy import StrategyName
 from zscout.messages import Ask, HostRanking, Notice, RankAsk, StateAsk
 
 ROOT = Path(__file__).parents[1]
+TURNS = 5
+WARM_UP = 10
+ANSWER = len(messages.encode(face.NOTICE))
+"""Bytes."""
 MEASURED = [
     ("grant", "1 RC"),
     ("grant", "5 RCs"),
@@ -82,68 +86,72 @@ def programs(folder: Path, tree: Path = ROOT, strategy: StrategyName = "adaptive
         process.close()
 
 
-async def latencies(
-    lab: Lab, folder: Path, rounds: int, progress: Callable[[str], None], before: str | None = None
-) -> list[Row]:
-    """Rows for the bare query, its asyncio face, and what programs wait for: of this tree, of the commit `before`,
-    and of a fleet under the strategy `priority`."""
-    client = await lab.client("bench")
+async def latencies(folder: Path, rounds: int, progress: Callable[[str], None], before: str | None = None) -> list[Row]:
+    """Rows for the bare query and what programs wait for: of this tree, of the commit `before`, and of a fleet under
+    the strategy `priority`. Each has the machine for itself, in turns of a few rounds."""
     ask = len(messages.encode(Ask("0123456789ab", "bench", {EXCLUSIVE[0]: {}}, 0, 60)))  # type: ignore[arg-type]
-    address = lab.fleet.mesh.multicast_address.replace("224.0.0.224", "224.0.0.225")
-
-    bare_query = bare.BareQuery(b"x" * ask)
-
-    async def face_query() -> float:
-        key, asked = face.key(client.mesh.keys), StateAsk(arc="x" * ask)
-        return await hot(lambda: client.mesh.ask_one(key, asked, Notice, timeout=5))
-
-    async def ranking() -> float:
-        return await hot(lambda: client.mesh.ask_one(client.mesh.keys.rank, RankAsk(), HostRanking, timeout=5))
-
-    measured: dict[str, Callable[[], Awaitable[float]]] = {
-        "query, asyncio face": face_query,
-        "balancer's answer": ranking,
-    }
-    aims: dict[str, float] = {"balancer's answer": 1.2}
-
-    def add(fleet: Child, of: str) -> None:
+    fleets: dict[str, tuple[Path, StrategyName]] = {"": (ROOT, "adaptive")}
+    if before is not None:
+        fleets[f" ({before})"] = commit(before, folder / "tree"), "adaptive"
+    fleets[" under priority"] = ROOT, "priority"
+    samples = {f"{what}, {needs}{of}": Samples() for of in fleets for what, needs in MEASURED}
+    bare_samples = {of: Samples() for of in fleets}
+    with bare_query(folder, ask) as query:
+        progress(f"bare query: {query.way}, {ask} bytes out, {ANSWER} back")
+        for turn in range(TURNS):
+            for of, (tree, strategy) in fleets.items():
+                progress(f"latencies{of}: turn {turn + 1} of {TURNS}")
+                with programs(folder / f"fleet-{turn}{len(of)}", tree, strategy) as fleet:
+                    for number in range(-WARM_UP, rounds // TURNS):
+                        for what, needs in MEASURED:
+                            reference = query.hot()
+                            fleet.order([what, needs])
+                            took = await asyncio.to_thread(fleet.report)
+                            if number >= 0:
+                                samples[f"{what}, {needs}{of}"].add(took)
+                                bare_samples[of].add(reference)
+    rows = [of_latency("bare query", bare_samples[""], bare_samples[""])]
+    for of in fleets:
         for what, needs in MEASURED:
+            name, aim = f"{what}, {needs}{of}", AIMS.get((what, needs)) if not of else None
+            rows.append(of_latency(name, samples[name], bare_samples[of], aim=aim))
+    return rows
 
-            async def ordered(what: str = what, needs: str = needs) -> float:
-                fleet.order([what, needs])
-                took: float = await asyncio.to_thread(fleet.report)
-                return took
 
-            measured[f"{what}, {needs}{of}"] = ordered
-            if not of and (what, needs) in AIMS:
-                aims[f"{what}, {needs}"] = AIMS[what, needs]
+async def questions(lab: Lab, folder: Path, rounds: int, progress: Callable[[str], None]) -> list[Row]:
+    """Rows for the asyncio face of a bare query, and the balancer's answer."""
+    client = await lab.client("bench")
+    key, asked = face.key(client.mesh.keys), StateAsk(arc="x" * 100)
 
-    size = len(messages.encode(face.NOTICE))
-    with ExitStack() as stack:
-        add(stack.enter_context(programs(folder / "now")), "")
-        if before is not None:
-            tree = commit(before, folder / "tree")
-            add(stack.enter_context(programs(folder / "before", tree)), f" ({before})")
-        add(stack.enter_context(programs(folder / "paper", strategy="priority")), " under priority")
-        stack.enter_context(child("face", str(lab.fleet_file)))
-        stack.enter_context(child("bare", address, bare.KEY, "--bytes", str(size)))
-        session = stack.enter_context(zenoh.open(bare.settings(address)))
-        while await client.mesh.ask_one(face.key(client.mesh.keys), None, Notice, timeout=1) is None:
+    async def face_query() -> object:
+        return await client.mesh.ask_one(key, asked, Notice, timeout=5)
+
+    async def ranking() -> object:
+        return await client.mesh.ask_one(client.mesh.keys.rank, RankAsk(), HostRanking, timeout=5)
+
+    measured = {"query, asyncio face": (face_query, None), "balancer's answer": (ranking, 1.2)}
+    samples, bare_samples = {name: Samples() for name in measured}, Samples()
+    with bare_query(folder, len(messages.encode(asked))) as query, child("face", str(lab.fleet_file)):
+        while await client.mesh.ask_one(key, None, Notice, timeout=1) is None:
             progress("looking for the asyncio face")
-        way = bare_query.choose(session)
-        progress(f"bare query: {way}, {ask} bytes out, {size} back")
-        samples = {name: Samples() for name in measured}
-        bare_samples = Samples()
-        for number in range(-rounds // 10, rounds):
-            for name, measure in measured.items():
-                for _ in range(HOT):
-                    reference = bare_query.once()
-                took = await measure()
+        for number in range(-WARM_UP, rounds):
+            for name, (question, _) in measured.items():
+                reference = query.hot()
+                took = await hot(question)
                 if number >= 0:
                     samples[name].add(took)
                     bare_samples.add(reference)
-            if number % 100 == 0:
-                progress(f"latencies: round {max(number, 0)} of {rounds}")
-    rows = [of_latency("bare query", bare_samples, bare_samples)]
-    rows += [of_latency(name, samples[name], bare_samples, aim=aims.get(name)) for name in measured]
-    return rows
+    await client.close()
+    lab.clients.remove(client)
+    return [of_latency(name, samples[name], bare_samples, aim=aim) for name, (_, aim) in measured.items()]
+
+
+@contextmanager
+def bare_query(folder: Path, size: int) -> Iterator[bare.BareQuery]:
+    """A bare query of so many bytes, on a mesh of its own."""
+    lab = fleet_of(folder)  # while it lives, its address is nobody else's
+    address = lab.fleet.mesh.multicast_address
+    with child("bare", address, bare.KEY, "--bytes", str(ANSWER)), zenoh.open(bare.settings(address)) as session:
+        query = bare.BareQuery(b"x" * size)
+        query.choose(session)
+        yield query

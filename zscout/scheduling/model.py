@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, TypeAlias
 
+from msgspec import Struct
+
 from zscout.keyexpr import check_need, is_pattern, matcher
 from zscout.messages import Who
 from zscout.scheduling.reason import SHOWN, Party, Reason
@@ -31,8 +33,7 @@ Rank: TypeAlias = tuple[int, Ns, Place, ArcId]
 """Sorts contenders, best first: priority (negated), minimum runtime, place, id."""
 
 
-@dataclass(frozen=True, slots=True)
-class ArcRequest:
+class ArcRequest(Struct, frozen=True):
     """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0).
 
     A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`).
@@ -67,8 +68,7 @@ class ArcRequest:
         return self.label or self.arc
 
 
-@dataclass(frozen=True, slots=True)
-class Hold:
+class Hold(Struct, frozen=True):
     """A grant in force. `end` is when the minimum runtime is over; with `keep` the hold goes on past it."""
 
     grant: Grant
@@ -266,8 +266,7 @@ def union(masks: Iterable[int]) -> int:
 # Events: each carries everything the core may know about it
 
 
-@dataclass(frozen=True, slots=True)
-class Requested:
+class Requested(Struct, frozen=True):
     """A program requests an ARC. `place` is set when it had one under an earlier RCM; `since` is then when it
     was last queued, on the core's clock, if that is known."""
 
@@ -276,24 +275,21 @@ class Requested:
     since: Ns | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Cancelled:
+class Cancelled(Struct, frozen=True):
     """The ARC is not wanted any more, whether it waits or runs."""
 
     arc: ArcId
     by: str = "its client"
 
 
-@dataclass(frozen=True, slots=True)
-class Released:
+class Released(Struct, frozen=True):
     """A running ARC gives back what it holds; a waiting one leaves the queue."""
 
     arc: ArcId
     by: str = "its client"
 
 
-@dataclass(frozen=True, slots=True)
-class Vote:
+class Vote(Struct, frozen=True):
     """A sharable RC's answer to a proposal."""
 
     proposal: int
@@ -301,23 +297,20 @@ class Vote:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class VoteOverdue:
+class VoteOverdue(Struct, frozen=True):
     """No answer to a proposal in time, or it could not be delivered."""
 
     proposal: int
 
 
-@dataclass(frozen=True, slots=True)
-class RcJoined:
+class RcJoined(Struct, frozen=True):
     """An RC is there and can be granted."""
 
     rc: RcName
     sharable: bool
 
 
-@dataclass(frozen=True, slots=True)
-class RcReported:
+class RcReported(Struct, frozen=True):
     """An RC reports that holds ended there, or that the rules it votes by have changed."""
 
     rc: RcName
@@ -325,8 +318,7 @@ class RcReported:
     rules_changed: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class RcLost:
+class RcLost(Struct, frozen=True):
     """An RC is gone, or can't carry its holders any longer; `why`, if that is known, stands in the reason of whoever
     waits for it."""
 
@@ -335,24 +327,21 @@ class RcLost:
     why: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ClientLost:
+class ClientLost(Struct, frozen=True):
     """A program is gone: what it holds is free and what it asked for is forgotten."""
 
     client: ClientId
     reason: str = "its client left the mesh"
 
 
-@dataclass(frozen=True, slots=True)
-class PlaceShown:
+class PlaceShown(Struct, frozen=True):
     """A client shows the place that its ARC was given before; it has entered without."""
 
     arc: ArcId
     place: Place
 
 
-@dataclass(frozen=True, slots=True)
-class Unconfirmed:
+class Unconfirmed(Struct, frozen=True):
     """A client could not confirm a grant: these RCs know nothing of it, or do not answer."""
 
     arc: ArcId
@@ -360,15 +349,13 @@ class Unconfirmed:
     rcs: tuple[RcName, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Reachable:
+class Reachable(Struct, frozen=True):
     """One of the RCs that a client could not confirm a grant with has shown itself to it anew."""
 
     arc: ArcId
 
 
-@dataclass(frozen=True, slots=True)
-class HandedOver:
+class HandedOver(Struct, frozen=True):
     """An ARC goes on in another client (migration), by the name `renamed`: same place; if it runs, same RCs,
     same end, new grant."""
 
@@ -377,8 +364,7 @@ class HandedOver:
     renamed: ArcId
 
 
-@dataclass(frozen=True, slots=True)
-class RecoveredHold:
+class RecoveredHold(Struct, frozen=True):
     """A hold that was in force when an RCM took the lead: its grant is kept, `end` is on the core's clock."""
 
     request: ArcRequest
@@ -386,7 +372,7 @@ class RecoveredHold:
     grant: Grant
     start: Ns
     end: Ns
-    bound: Mapping[Need, RcName] = field(default_factory=dict)
+    bound: Mapping[Need, RcName] = {}
     """By each pattern of its needs: the RC that it holds."""
 
     def __post_init__(self) -> None:
@@ -399,8 +385,7 @@ class RecoveredHold:
         return [self.bound.get(need, need) for need in self.request.needs]
 
 
-@dataclass(frozen=True, slots=True)
-class LeadTaken:
+class LeadTaken(Struct, frozen=True):
     """This RCM leads from now on, in `term`, over the holds and the queue that it recovered."""
 
     term: Term
@@ -408,16 +393,14 @@ class LeadTaken:
     waiting: tuple[Requested, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Adopted:
+class Adopted(Struct, frozen=True):
     """RCs have joined with a hold of an earlier term, which goes on if all of its gang have, unless this RCM has ended
     it, or its ARC holds something newer."""
 
     held: RecoveredHold
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(Struct, frozen=True):
     """Time has passed: holds may be over, the quantum may be."""
 
 
@@ -461,8 +444,7 @@ class Outcome(StrEnum):
     """It goes on in another client, under a new grant."""
 
 
-@dataclass(frozen=True, slots=True)
-class Propose:
+class Propose(Struct, frozen=True):
     """Ask a sharable RC whether it would carry exactly these holders, by ARC, with their parameters."""
 
     proposal: int
@@ -470,8 +452,7 @@ class Propose:
     holders: Mapping[ArcId, Params]
 
 
-@dataclass(frozen=True, slots=True)
-class Granted:
+class Granted(Struct, frozen=True):
     """All of `rcs` are the ARC's until `end`; None where it may keep them past its minimum runtime."""
 
     arc: ArcId
@@ -482,8 +463,7 @@ class Granted:
     end: Ns | None
 
 
-@dataclass(frozen=True, slots=True)
-class HoldEnded:
+class HoldEnded(Struct, frozen=True):
     """A hold is over. `requeued` says whether its ARC waits again; `by` is the ARC it was taken for."""
 
     arc: ArcId
@@ -496,8 +476,7 @@ class HoldEnded:
     by: ArcId | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Queued:
+class Queued(Struct, frozen=True):
     """The ARC waits, for this reason; sent at the first wait and when the reason changes.
 
     `settled` is False while the RCM itself is still asking votes, so that the answer is near."""
@@ -508,8 +487,7 @@ class Queued:
     settled: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class Dropped:
+class Dropped(Struct, frozen=True):
     """A waiting ARC left the queue without having run."""
 
     arc: ArcId
@@ -518,8 +496,7 @@ class Dropped:
     reason: Reason
 
 
-@dataclass(frozen=True, slots=True)
-class WakeAt:
+class WakeAt(Struct, frozen=True):
     """Send a `Tick` at this time, or earlier; a later effect replaces it. None: nothing to wait for."""
 
     at: Ns | None
@@ -531,8 +508,7 @@ Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | WakeAt
 # The state after the last batch of events
 
 
-@dataclass(frozen=True, slots=True)
-class ArcStatus:
+class ArcStatus(Struct, frozen=True):
     """One ARC that is queued (`hold is None`) or runs."""
 
     request: ArcRequest
@@ -561,8 +537,7 @@ class ArcStatus:
         return self.request.name
 
 
-@dataclass(frozen=True, slots=True)
-class RcStatus:
+class RcStatus(Struct, frozen=True):
     """One RC; `holders` in the order in which they came to hold it."""
 
     name: RcName
@@ -571,8 +546,7 @@ class RcStatus:
     holders: tuple[ArcId, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
+class Status(Struct, frozen=True):
     """The whole fleet: who runs, in the order in which they started; who is queued, best rank first and
     perhaps not all of the `waiting`; the RCs by name."""
 

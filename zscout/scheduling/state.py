@@ -9,7 +9,6 @@ import heapq
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import replace
 from operator import itemgetter
 from types import MappingProxyType
 from typing import Protocol
@@ -343,7 +342,7 @@ class SchedulerState:
         who = arc.request.who
         if who is not None and who.host:
             who = structs.replace(who, host="")  # it is the new client's
-        arc.take(replace(arc.request, arc=name, client=client, who=who))
+        arc.take(structs.replace(arc.request, arc=name, client=client, who=who))
 
     def start(self, arc: Arc, hold: Hold) -> None:
         self.dequeue(arc)
