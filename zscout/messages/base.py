@@ -188,6 +188,12 @@ def schema(kind: type) -> str:
 
 def exact(value: Decimal, what: str) -> Fraction:
     """A number that is not negative, exactly. Raises ValueError for NaN, infinity, and implausible sizes."""
+    check_amount(value, what)
+    return Fraction(value)
+
+
+def check_amount(value: Decimal, what: str) -> None:
+    """Raises ValueError for what `exact` does not take."""
     shown = str(value)[:40]
     if not value.is_finite():
         raise ValueError(f"{what} must be a number, not {shown}")
@@ -198,7 +204,6 @@ def exact(value: Decimal, what: str) -> Fraction:
         raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {shown}")
     if len(value.as_tuple().digits) > MAX_DIGITS:
         raise ValueError(f"{what} has more than {MAX_DIGITS} digits")
-    return Fraction(value)
 
 
 def exact_amounts(params: Mapping[str, Decimal]) -> dict[str, Fraction]:
@@ -208,7 +213,7 @@ def exact_amounts(params: Mapping[str, Decimal]) -> dict[str, Fraction]:
 
 def duration(value: Decimal, what: str) -> Ns:
     """A positive duration in seconds as whole ns, half to even. Raises ValueError."""
-    exact(value, what)
+    check_amount(value, what)
     if value > MAX_SECONDS:
         raise ValueError(f"{what} must be at most {MAX_SECONDS} s (ten years), and is {value}")
     nanoseconds = round(value * SECOND)

@@ -422,7 +422,8 @@ class Membership:
         return {rc: self._named[rc] for rc in rcs if rc in self._named}
 
     def hosts_of(self, rcs: Iterable[RcName]) -> dict[RcName, HostName]:
-        return {rc: host for rc, (_, host) in self.named(rcs).items()}
+        named = self._named
+        return {rc: named[rc][1] for rc in rcs if rc in named}
 
     def _drop_unseen(self) -> None:
         for name, state in list(self._joined.items()):

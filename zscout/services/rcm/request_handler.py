@@ -125,25 +125,25 @@ class RequestHandler:
 
     def on_operation(self, query: Query) -> None:
         sender = self.mesh.keys.sender_of(query.key)
-        self._membership.heard(str(sender))
+        client = str(sender)
+        self._membership.heard(client)
         operation = query.message
         check_name(operation.id, "id")
         match operation:
             case Ask():
-                self._ask(query, operation, sender)
+                self._ask(query, operation, sender, client)
             case Cancel() | Release():
                 self._end(query, operation, sender)
             case HandOver():
-                self._find_new_client(query, operation, str(sender))
+                self._find_new_client(query, operation, client)
             case Foresee():
                 self._forecast(query, operation, sender)
 
-    def _ask(self, query: Query, ask: Ask, sender: Sender) -> None:
+    def _ask(self, query: Query, ask: Ask, sender: Sender, client: ClientId) -> None:
         if ask.term is not None and ask.term > self.core.term:
-            seen = str(sender) if str(sender) in self._membership.clients else None
+            seen = client if client in self._membership.clients else None
             self._membership.see(ask.term, obeyed_by=seen)
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
-        client = str(sender)
         arc = arc_id(client, ask.id)
         self._keep_order(arc)
         self._authority.check_ask(sender, ask, lambda names: self._open_of(names, arc))
@@ -165,13 +165,12 @@ class RequestHandler:
         elif self._goes_on_elsewhere(ask):
             query.answer(self._registry.handed_over(arc, ask.arc))
         else:
-            self._enter(query, ask, sender, arc)
+            self._enter(query, ask, sender, client, arc)
 
-    def _enter(self, query: Query, ask: Ask, sender: Sender, arc: ArcId) -> None:
+    def _enter(self, query: Query, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
         """Takes a new request. This is the way of every grant: nothing is done here that can be done once it is
         answered."""
-        client = str(sender)
-        self._check_room(client)
+        self._check_room(sender.host, client)
         request = admit(ask, client, arc, self.core, self.limits, self._authority.known_as(sender, ask.who))
         place, replaced, since = None, None, None
         if ask.place is not None and (place := self._own_place(ask, client)) is not None:
@@ -267,24 +266,28 @@ class RequestHandler:
 
     def _open_of(self, names: Collection[str], *but: ArcId) -> int:
         """How many ARCs these have, waiting or running; what this burst has brought counts."""
-        coming = [event.request.client for event in self._batch.values() if isinstance(event, Requested)]
-        owned = sum(client.partition("/")[0] in names for client in coming) + self.core.count_of_owners(names)
+        owned = self.core.count_of_owners(names)
+        owned += sum(client.partition("/")[0] in names for client in self._coming())
         return owned - sum(self.core.is_open(arc) and arc.partition("/")[0] in names for arc in but)
+
+    def _coming(self) -> list[ClientId]:
+        """The clients of the requests of this burst."""
+        return [event.request.client for event in self._batch.values() if isinstance(event, Requested)]
 
     def _held_by(self, names: Collection[str], *but: ArcId) -> int:
         """How many RCs these hold."""
         arcs = filter(None, map(self.core.arc, {*self.core.arcs_of_owners(names)} - {*but}))
         return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
 
-    def _check_room(self, client: ClientId) -> None:
+    def _check_room(self, host: str, client: ClientId) -> None:
         """Refuses what is too much at once; what this burst has brought already counts."""
-        coming = [event.request.client for event in self._batch.values() if isinstance(event, Requested)]
+        coming = self._coming()
         if self.core.waiting + len(coming) >= self.limits.max_queued:
             raise Refused("queue_full", f"{self.limits.max_queued} ARCs wait already; ask again later")
         most = self.limits.max_requests_per_client
         if coming.count(client) + self.core.count_of(client) >= most:
             raise Refused("too_many", f"{client} has {most} requests open already")
-        host, most = client.partition("/")[0], self.limits.max_requests_per_host
+        most = self.limits.max_requests_per_host
         if self._open_of((host,)) >= most:
             raise Refused("too_many", f"the clients of {host} have {most} requests open already")
 
