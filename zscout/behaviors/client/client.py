@@ -15,7 +15,7 @@ from typing import Any, Final, Generic, Self, TypeVar
 from msgspec.structs import replace
 
 from zscout import messages
-from zscout.behaviors.client.confirmation import CONFIRM_AGAIN, NOT_HELD, SETTLING, Confirmations
+from zscout.behaviors.client.confirmation import NOT_DONE, NOT_HELD, Confirmations
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.identity import checked_comment, this_program
@@ -396,7 +396,7 @@ class Client(MovableClient):
             return await self._command(rc, grant, do, ttl=ttl, timeout=timeout)
         except CommandRefused as refused:
             confirmation = self._confirmations.pending(grant)
-            if confirmation is None or refused.code not in CONFIRM_AGAIN | {SETTLING}:
+            if confirmation is None or refused.code not in NOT_DONE:
                 raise
             left = ttl - (self.mesh.now() - began) / SECOND
             if not await done_within(max(0.0, left), confirmation.over()) or not confirmation.all:

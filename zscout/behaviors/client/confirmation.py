@@ -11,9 +11,9 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Final
 
-from zscout.behaviors.client.direct import DirectHold
+from zscout.behaviors.client.direct import CommandSender, DirectHold
 from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, RcmLink
 from zscout.behaviors.client.request import CommandRefused, OpenArc, RequestStore
 from zscout.config.fleet import Fleet
@@ -34,7 +34,9 @@ SETTLING: Final = "settling"
 """What an RC answers while the program of its last holder may still touch its device, or that is made ready."""
 LOOK_AGAIN: Final = 0.1
 """Seconds between two questions whether it has settled."""
-CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
+NOT_DONE = frozenset({"not_yet", "stale", "busy", SETTLING})
+"""Refusals of a command that may be sent again once its RC has confirmed the grant: it was not carried out."""
+CONFIRM_AGAIN = NOT_DONE - {SETTLING} | {"unknown"}
 """Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
 NOT_HELD = frozenset({"ended", "free", "not_holder"})
 """What an RC answers to a command under a hold that is over."""
@@ -42,10 +44,6 @@ NOT_CONFIRMED = CONFIRM_AGAIN | NOT_HELD | {"wrong_client"}
 """Refusals after which an ARC is queued again; others concern whoever asked for it."""
 HELD_BACK = 30.0
 """Seconds for which an RCM does not grant again what was not confirmed, at most."""
-
-
-class CommandSender(Protocol):
-    async def __call__(self, rc: str, grant: Grant, do: dict[str, Any], *, timeout: float) -> Done: ...
 
 
 @dataclass(slots=True)
