@@ -294,16 +294,21 @@ class ResourceController:
             self._asked = NO_TERM
 
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
-        self._last_terms.shown(grants.term, self.holds.term)
-        before = self.holds.term, self.holds.seq
-        change = self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable)
+        now, before = self.mesh.now(), (self.holds.term, self.holds.seq)
+        # The timer of a lease is set anew when it goes off: most leases are renewed before.
+        change = None if self.holds.follow(grants, now) else self._apply_grants(grants, now)
         if grants.term == self.holds.term:
-            self._heard = self.mesh.now()
+            self._heard = now
         if change or before != (self.holds.term, self.holds.seq):
             self._trace("hear")
-        self._apply(change)
+        if change is not None:
+            self._apply(change)
         if self._missed:
             self._read_state()
+
+    def _apply_grants(self, grants: messages.Grants, now: Ns) -> HoldChange:
+        self._last_terms.shown(grants.term, self.holds.term)
+        return self.holds.apply_grants(grants, now, sharable=self.driver.sharable)
 
     def _on_state_query(self, query: IncomingQuery[messages.RcAsk]) -> None:
         if query.message.above is None:
