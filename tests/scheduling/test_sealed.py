@@ -19,7 +19,7 @@ SURFACE = {
     "arcs",
     "arcs_of_owners",
     "count_of",
-    "count_of_owners",
+    "count_of_owner",
     "is_open",
     "is_running",
     "place_of",

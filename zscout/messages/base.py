@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache
+from operator import attrgetter
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import msgspec
@@ -145,8 +146,11 @@ def _check_of(kind: inspect.Type) -> Callable[[Any], bool] | None:
         case inspect.Metadata(type=of):
             return _check_of(of)
         case inspect.StructType(fields=fields):
-            checks = [(one.name, check) for one in fields if (check := _check_of(one.type)) is not None]
-            return (lambda value: all(check(getattr(value, name)) for name, check in checks)) if checks else None
+            checks = [(attrgetter(one.name), check) for one in fields if (check := _check_of(one.type)) is not None]
+            if len(checks) == 1:
+                ((get, only),) = checks
+                return lambda value: only(get(value))
+            return (lambda value: all(check(get(value)) for get, check in checks)) if checks else None
         case inspect.ListType(item_type=of) | inspect.VarTupleType(item_type=of):
             return _check_of_each(of, iter)
         case inspect.DictType(value_type=of):
@@ -161,7 +165,7 @@ def _check_of_each(kind: inspect.Type, values: Callable[[Any], Iterable[Any]]) -
     if (found := _check_of(kind)) is None:
         return None
     check = found
-    return lambda value: all(map(check, values(value)))
+    return lambda value: not value or all(map(check, values(value)))
 
 
 # A check of all decimals in a message of that kind.

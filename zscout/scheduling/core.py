@@ -76,8 +76,11 @@ class Core:
         self._run_again = False
         self._expire()
         self._state.let_in()
-        for event in events:
-            self._apply(event)
+        if len(events) == 1 and isinstance(events[0], model.Requested):
+            self._ask(events[0], alone=True)
+        else:
+            for event in events:
+                self._apply(event)
         if self._state.queued:
             self.strategy.run_pass(self._state, self)
         for arc in self._state.held_back.values():
@@ -153,8 +156,9 @@ class Core:
         """How many ARCs one client has."""
         return len(self._state.arcs_of(client))
 
-    def count_of_owners(self, owners: Collection[str]) -> int:
-        return sum(len(self._state.arcs_of_owner(owner)) for owner in owners)
+    def count_of_owner(self, owner: str) -> int:
+        """How many ARCs all clients of a host or a person have."""
+        return len(self._state.arcs_of_owner(owner))
 
     def arcs_of_owners(self, owners: Collection[str]) -> list[ArcId]:
         """The ARCs of all clients of these hosts and people."""
@@ -262,10 +266,18 @@ class Core:
             case model.Tick():
                 pass
 
-    def _ask(self, asked: model.Requested) -> None:
-        if self._state.arc(asked.request.arc) is None:
-            since = self._state.now if asked.since is None else min(asked.since, self._state.now)
-            self._state.enqueue(self._new_arc(asked.request, asked.place), since)
+    def _ask(self, asked: model.Requested, *, alone: bool = False) -> None:
+        """`alone`: nothing else happens in this instant."""
+        if self._state.arc(asked.request.arc) is not None:
+            return
+        arc = self._new_arc(asked.request, asked.place)
+        if alone and self._state.is_free(arc):
+            # What any strategy would do, without a queue of one.
+            self._state.enter(arc)
+            self.start(arc)
+            return
+        since = self._state.now if asked.since is None else min(asked.since, self._state.now)
+        self._state.enqueue(arc, since)
 
     def _new_arc(self, request: model.ArcRequest, place: Place | None) -> Arc:
         if place is None:
@@ -278,7 +290,7 @@ class Core:
             # Nobody gets more: what is reckoned with it (ranks, reservations) is the shorter.
             request = replace(request, min_runtime=longest)
         patterns = tuple(filter(is_pattern, request.needs))
-        named = self._state.mask([need for need in request.needs if need not in patterns])
+        named = self._state.mask(need for need in request.needs if need not in patterns)
         arc = Arc(request, place, named, patterns, named)
         if patterns:
             self._state.bind(arc, {})

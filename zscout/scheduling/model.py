@@ -59,8 +59,9 @@ class ArcRequest(Struct, frozen=True):
             raise ValueError(f"ARC {self.arc} needs nothing; name at least one RC")
         if self.min_runtime <= 0:
             raise ValueError(f"ARC {self.arc}: the minimum runtime must be positive")
-        if any(value < 0 for params in self.needs.values() for value in params.values()):
-            raise ValueError(f"ARC {self.arc}: bandwidth parameters must not be negative")
+        for params in self.needs.values():
+            if params and any(value < 0 for value in params.values()):
+                raise ValueError(f"ARC {self.arc}: bandwidth parameters must not be negative")
         check_patterns(self.needs)
 
     @property
@@ -104,7 +105,7 @@ _CHECKED: Final = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.
 _LEAVES: Final = (ArcState.HELD_BACK, ArcState.RUNNING, ArcState.ENDED)
 _WAITS: Final = (ArcState.READY, ArcState.HELD_BACK)
 TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
-    ArcState.NEW: _WAITS,
+    ArcState.NEW: (*_WAITS, ArcState.RUNNING),
     ArcState.READY: (*_CHECKED, *_LEAVES),
     ArcState.VOTING: (*_CHECKED, *_LEAVES),
     ArcState.DEFERRED: (*_CHECKED, *_LEAVES),
@@ -128,7 +129,7 @@ def check_patterns(needs: Mapping[Need, Params]) -> None:
         kind = check_need(need).partition("/")[0]
         if asked.setdefault(kind, params) != params:
             raise ValueError(f"patterns of the kind {kind} have different parameters; give all the same")
-    if any(is_pattern(kind) for kind in asked) and any(asked.values()):
+    if asked and any(map(is_pattern, asked)) and any(asked.values()):
         raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
 
 
@@ -193,7 +194,7 @@ class Arc:
         self.request, self.id, self.priority = request, request.arc, request.priority
         self.owner = request.client.partition("/")[0]
         self.rank = (-self.priority, request.min_runtime, self.place, self.id)
-        self.party = Party(self.id, request.name, self.priority, request.who)
+        self.party = Party(self.id, request.label or self.id, self.priority, request.who)
 
     def move_to(self, state: ArcState) -> None:
         """Raises ValueError for a move that is not in `TRANSITIONS`."""

@@ -251,23 +251,7 @@ def run_pass(
 
     `off_limits`: bits of RCs that another strategy is still deciding about. `reserved`: what is reserved for
     starving ARCs; the paper's own strategy knows no such thing."""
-    if not off_limits and reserved is None and (arc := _unopposed(state)) is not None:
-        state.index.freed = state.index.touched = 0  # this concerns nobody else
-        actions.start(arc)
-        return
     Pass(state, actions, reserved).run(state.index.ready.values(), off_limits)
-
-
-def _unopposed(state: SchedulerState) -> Arc | None:
-    """The one ARC that waits, if all that it needs is there, exclusive and free: the usual case where nothing is
-    scarce."""
-    if len(state.queued) != 1:
-        return None
-    (arc,) = state.queued.values()
-    if arc.patterns or arc.mask & ~state.present or arc.mask & (state.busy | state.sharable):
-        return None
-    bound = state.policy.max_running_per_host is not None or state.policy.rc_quotas
-    return None if bound else arc
 
 
 class Pass:

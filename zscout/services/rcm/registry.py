@@ -131,25 +131,29 @@ class RequestRegistry:
             if arc_id in self._ended:
                 return self._ended[arc_id][1]
             return self._notice(arc_id, "ended", reason="no such request is open")
-        hold = arc.hold
-        # What a queued ARC is bound to is only what it was last checked with.
-        rcs = arc.needs if hold is not None else [need for need in arc.request.needs if not is_pattern(need)]
+        request, hold = arc.request, arc.hold
+        known = {
+            "priority": request.priority,
+            "who": request.who,
+            "place": arc.place,
+            "seal": self._places.seal(arc.place, arc_id),
+        }
+        if hold is not None:
+            remaining = (hold.end - self._mesh.now()) / SECOND
+            rcs, hosts, bound = sorted(arc.needs), self.hosts_of(arc.needs), dict(arc.bound)
+            return self._notice(
+                arc_id, "running", grant=hold.grant, rcs=rcs, bound=bound, remaining=remaining, hosts=hosts, **known
+            )
         return self._notice(
-            arc.id,
-            "queued" if hold is None else "running",
-            priority=arc.request.priority,
+            arc_id,
+            "queued",
             reason=str(arc.reason or ""),
             why=reason_info(arc.reason, self._mesh.now()),
-            who=arc.request.who,
-            place=arc.place,
-            seal=self._places.seal(arc.place, arc.id),
             ahead=arc.ahead,
-            grant=hold.grant if hold is not None else None,
-            rcs=sorted(rcs),
-            bound=dict(arc.bound) if hold is not None else {},
-            remaining=(hold.end - self._mesh.now()) / SECOND if hold is not None else None,
+            # What it is bound to is only what it was last checked with.
+            rcs=sorted(need for need in request.needs if not is_pattern(need)),
             starts_in=self._starts_in(arc),
-            hosts=self.hosts_of(arc.needs) if hold is not None else {},
+            **known,
         )
 
     def interrupted(self, arc: ArcId, believed: Grant) -> Notice:

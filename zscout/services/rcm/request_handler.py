@@ -266,7 +266,7 @@ class RequestHandler:
 
     def _open_of(self, names: Collection[str], *but: ArcId) -> int:
         """How many ARCs these have, waiting or running; what this burst has brought counts."""
-        owned = self.core.count_of_owners(names)
+        owned = sum(map(self.core.count_of_owner, names))
         owned += sum(client.partition("/")[0] in names for client in self._coming())
         return owned - sum(self.core.is_open(arc) and arc.partition("/")[0] in names for arc in but)
 
@@ -281,14 +281,14 @@ class RequestHandler:
 
     def _check_room(self, host: str, client: ClientId) -> None:
         """Refuses what is too much at once; what this burst has brought already counts."""
-        coming = self._coming()
+        coming = self._coming() if self._batch else []
         if self.core.waiting + len(coming) >= self.limits.max_queued:
             raise Refused("queue_full", f"{self.limits.max_queued} ARCs wait already; ask again later")
         most = self.limits.max_requests_per_client
         if coming.count(client) + self.core.count_of(client) >= most:
             raise Refused("too_many", f"{client} has {most} requests open already")
         most = self.limits.max_requests_per_host
-        if self._open_of((host,)) >= most:
+        if self.core.count_of_owner(host) + sum(one.startswith(f"{host}/") for one in coming) >= most:
             raise Refused("too_many", f"the clients of {host} have {most} requests open already")
 
     def _forecast(self, query: Query, asked: Foresee, sender: Sender) -> None:
@@ -340,8 +340,12 @@ class RequestHandler:
         batch, self._batch = self._batch, {}
         if not batch:
             return
-        asked = [event for event in batch.values() if isinstance(event, Requested)]
-        ended = [event for event in batch.values() if not isinstance(event, Requested)]
+        asked, ended = list[Requested](), list[Cancelled | Released]()
+        for event in batch.values():
+            if isinstance(event, Requested):
+                asked.append(event)
+            else:
+                ended.append(event)
         self._emit(*ended, *asked)
         self.given_up.clear()
         self.left.clear()
@@ -503,7 +507,7 @@ def admit(
                 raise ValueError(f"{name} has more than {MAX_PARAMS} parameters")
             for parameter in params:
                 check_name(parameter, f"parameter of {name}")
-        needs = {name: exact_amounts(params) for name, params in ask.needs.items()}
+        needs = {name: exact_amounts(params) if params else {} for name, params in ask.needs.items()}
         return ArcRequest(
             arc=arc,
             client=client,
