@@ -25,6 +25,8 @@ SURFACE = {
     "place_of",
     "at_place",
     "could_have_issued",
+    "reasons_changed",
+    "tell_reasons",
 }
 SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}

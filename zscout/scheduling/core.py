@@ -34,7 +34,7 @@ from zscout.scheduling.model import (
     RcStatus,
     Status,
 )
-from zscout.scheduling.priority import AdmissionCheck, Priority
+from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
@@ -87,6 +87,18 @@ class Core:
             if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
                 self.wait(arc, _claimed_by(other))
         self._set_wake()
+        return self._effects
+
+    @property
+    def reasons_changed(self) -> bool:
+        """Whether somebody may wait for another reason than was told last."""
+        return bool(self._state.index.retold)
+
+    def tell_reasons(self) -> list[model.Effect]:
+        """Why those wait whose reason has changed: for who reads it, as often as that is."""
+        self._effects = []
+        for arc, reason in reasons_of_now(self._state):
+            self.wait(arc, reason)
         return self._effects
 
     @property

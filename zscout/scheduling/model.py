@@ -213,7 +213,8 @@ class Arc:
     def blocks(self, other: Arc) -> Party:
         """How the reason names it for which `other` waits, that may not preempt it yet."""
         end = self.known_end(other)
-        return self.party._replace(until=None if math.isinf(end) else int(end))
+        one = self.party
+        return Party(one.arc, one.name, one.priority, one.who, None if math.isinf(end) else int(end))
 
     def past_min_runtime(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may preempt it then."""

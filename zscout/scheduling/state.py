@@ -46,6 +46,8 @@ class QueueIndex:
         """Bits of the RCs whose watchers may have become possible since the last pass."""
         self.touched = 0
         """Bits of the RCs at which something else has changed: it concerns all but watchers."""
+        self.retold = 0
+        """Bits of the RCs that have been taken by another, which their watchers have not been told."""
         self.ranks: list[Rank] = []
         """Of all that are queued, best first."""
         self._not_starving: list[tuple[Ns, ArcId]] = []

@@ -76,6 +76,8 @@ class RequestRegistry:
         """Whether a queued ARC's client believes in a hold that RCs may yet report: it is not told to wait before."""
         self.hosts_of: Callable[[Iterable[RcName]], dict[RcName, HostName]] = lambda _: {}
         """Where RCs are that are granted."""
+        self._telling = False
+        """Whether reasons are told before long."""
         self._changed: dict[ArcId, None] = {}
         """Queued ARCs whose reason to wait has changed and has not been published yet."""
         self._starts: Mapping[ArcId, Ns] = {}
@@ -198,6 +200,8 @@ class RequestRegistry:
                         self._put(notice)
                 case Queued(arc=arc, settled=True) if self._core.is_queued(arc):
                     self._change(arc)
+        if self._core.reasons_changed:
+            self._tell_soon()
 
     def publish(self, arcs: Iterable[ArcId]) -> None:
         """Publishes the present state of these ARCs, as far as they are open."""
@@ -207,11 +211,17 @@ class RequestRegistry:
                 self._put(self.notice(arc))
 
     def _change(self, arc: ArcId) -> None:
-        if not self._changed:
-            self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
+        self._tell_soon()
         self._changed[arc] = None
 
+    def _tell_soon(self) -> None:
+        if not self._telling:
+            self._telling = True
+            self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
+
     def _publish_reasons(self) -> None:
+        self._telling = False
+        self._changed |= {effect.arc: None for effect in self._core.tell_reasons() if isinstance(effect, Queued)}
         undecided = [arc for arc in self._changed if self.may_be_held(arc)]
         changed = [arc for arc in self._changed if arc not in undecided and self._core.is_queued(arc)]
         self._changed = dict.fromkeys(changed)
