@@ -63,7 +63,9 @@ def test_what_the_fleet_does_is_a_behaviour_of_the_model(trace: list[str]) -> No
 
 def test_a_forged_step_is_refused_in_any_piece(trace: list[str]) -> None:
     events = [msgspec.json.decode(line) for line in trace]
-    heard = [number for number, event in enumerate(events) if event["do"] == "hear" and event["holds"]]
+    # Of sharable RCs the model knows nothing.
+    exclusive = [number for number, event in enumerate(events) if event["do"] == "hear" and not event["sharable"]]
+    heard = [number for number in exclusive if events[number]["holds"]]
     forged = []
     for at in (heard[0], heard[-1]):
         mine = msgspec.json.decode(msgspec.json.encode(events))

@@ -46,7 +46,10 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
     assert started.stdout.splitlines()[-1] == "counter runs on anvil"
     fleet.state(lambda state: [hold.arc for hold in state.holds] == ["counter"])
 
+    # What it needs is measured a little later.
     (one,) = listed(fleet)
+    while one["memory"] is None:
+        (one,) = listed(fleet)
     assert (one["component"], one["state"], one["host"], one["movable"]) == ("counter", "running", "anvil", True)
     assert one["spec"]["kind"] == "counter"
     assert one["spec"]["params"] == {"period": 0.1, "rc": "robot/a"}
