@@ -330,6 +330,43 @@ def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it_ended
     run(story())
 
 
+def test_who_waited_is_told_of_its_grant_before_the_rcs_are() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"))
+        holder, waiter = fleet.client("holder"), fleet.client("waiter")
+        await holder.ask("first", "robot/a")
+        await waiter.ask("next", "robot/a")
+        fleet.log.clear()
+        await holder.do(Release("first"))
+        assert fleet.log == [
+            ("waiter", "notice", "next running"),
+            ("all", "grants", "robot/a"),
+            ("holder", "answer", "first ended"),
+        ]
+
+    run(story())
+
+
+def test_who_is_preempted_and_granted_in_one_instant_is_told_in_that_order() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"), fleet.rc("robot/b"))
+        client, operator = fleet.client("any"), fleet.client("operator")
+        first = (await client.ask("any", "robot/*")).rcs
+        await operator.ask("drive", *first, priority=10)
+        await until(lambda: len(client.notices) >= 2)
+        assert [(notice.state, notice.outcome, notice.rcs) for notice in client.notices[:2]] == [
+            ("queued", "preempted", first),
+            ("running", None, ["robot/a" if first == ["robot/b"] else "robot/b"]),
+        ]
+        assert client.notices[0].step < client.notices[1].step
+
+    run(story())
+
+
 def test_rcs_settle_unless_the_client_says_that_its_program_is_gone() -> None:
     """One that started anew under its name gives back what it knows nothing of: a program of that may run yet."""
 

@@ -3,7 +3,7 @@
     in        queries, tokens, reports of RCs, votes and time become
     events    of the core, all of one instant together; it returns
     effects,  which go
-    out       as a publication, notices, answers and proposals, in this order.
+    out       to who is granted, as a publication, notices to others, answers and proposals, in this order.
 
 Nothing is decided here. Queries for the state (`zscout status`, `why`) are answered here as well.
 """
@@ -72,6 +72,8 @@ KEPT: Final[Mapping[Outcome, Ns]] = MappingProxyType(
     {Outcome.RELEASED: 0, Outcome.CANCELLED: 0, Outcome.CLIENT_LOST: 86_400 * SECOND}
 )
 """For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
+CONTINUED: Final = (LeadTaken, Adopted, HandedOver)
+"""Events by which holds that stand go on: the RCs hear of that before anybody else."""
 MAX_REASON = 500
 """Characters of a veto's reason."""
 
@@ -229,10 +231,12 @@ class Rcm:
         over = self.registry.ended
         events = [one for one in events if not (isinstance(one, Adopted) and over(one.held.request.arc))]
         effects = self.core.handle(self.mesh.now(), *events)
-        answered = self.requests.answer_grants(effects)
+        told = self.requests.answer_grants(effects)
+        if not any(isinstance(event, CONTINUED) for event in events):
+            told |= self.registry.tell_grants(effects, told)
         self._publish(effects, named)
         self._note(events)
-        self.registry.report(effects, answered | self.requests.waiting.keys(), self.requests.given_up)
+        self.registry.report(effects, told | self.requests.waiting.keys(), self.requests.given_up)
         self.requests.answer(effects)
         for effect in effects:
             match effect:

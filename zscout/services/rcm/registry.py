@@ -183,6 +183,17 @@ class RequestRegistry:
             **details,
         )
 
+    def tell_grants(self, effects: Collection[Effect], answered: Collection[ArcId]) -> set[ArcId]:
+        """Publishes the notices of an instant's grants before the RCs hear of them, but to who is `answered` so, or had
+        another hold until now. Returns whom it told."""
+        over = {effect.arc for effect in effects if isinstance(effect, (HoldEnded, Dropped))}
+        granted = [effect.arc for effect in effects if isinstance(effect, Granted)]
+        told = {arc for arc in granted if arc not in over and arc not in answered and self._core.is_running(arc)}
+        for arc in granted:
+            if arc in told:
+                self._put(self.notice(arc))
+        return told
+
     def report(self, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]) -> None:
         """Publishes the notices of an instant's effects, but where the answer to an operation says the same: the grant
         of an `answered` ARC, the end of the hold of a `given_up` one."""
