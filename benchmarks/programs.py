@@ -69,8 +69,11 @@ class Programs:
     @staticmethod
     async def _entered(attempt: Any) -> float:
         began = entered = time.perf_counter()
-        async with attempt:
+        async with attempt as held:
             entered = time.perf_counter()
+            if hasattr(held, "confirmed"):
+                # What goes on beside one body is not to be beside the next one's request.
+                await held.confirmed()
         return entered - began
 
     async def release(self, needs: Any) -> float:
