@@ -1,4 +1,4 @@
-"""`python -m benchmarks.publication`: what a publication on `rcm/grants` costs its leader, by the sessions that hear it.
+"""`python -m benchmarks.publication`: what a publication on `rcm/grants` costs its leader, by sessions that hear it.
 
 The listeners do with it what a client does, which is to keep the latest without being woken. They are children, ten
 sessions each: `python -m benchmarks.publication listen FLEET_FILE SESSIONS`. Publications are of a grant of five RCs,
