@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks import commands, crowd, frames, hosts, latency, process, reporter
+from benchmarks import commands, crowd, frames, hosts, latency, process, programs, reporter
 from benchmarks.loop import run
 from benchmarks.stats import Row, table
 
@@ -20,25 +20,25 @@ def progress(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-async def measure(rounds: int, crowds: int, programs: int) -> list[Row]:
+async def measure(rounds: int, crowds: int, members: int, before: str | None) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="zscout-bench-") as name:
         folder = Path(name)
+        (folder / "latencies").mkdir()
+        latencies = await latency.latencies(folder / "latencies", rounds, progress, before)
         async with latency.fleet_of(folder) as lab:
-            latency.start(lab)
+            programs.start(lab)
             first = await lab.client("first")
-            await lab.ready(first, *latency.EXCLUSIVE, *latency.SHARABLE)
+            await lab.ready(first, *programs.EXCLUSIVE, *programs.SHARABLE)
             await first.close()
             lab.clients.clear()
             progress("idle nodes")
             rows = await process.idle(lab)
             progress("zscout --help")
             rows += process.help_time(rounds=15)
-            (folder / "priority").mkdir()
-            async with latency.fleet_of(folder / "priority", "priority") as paper:
-                latency.start(paper)
-                rows = await latency.latencies(lab, paper, rounds, progress) + rows
+            (folder / "questions").mkdir()
+            rows = latencies + await latency.questions(lab, folder / "questions", rounds, progress) + rows
             (folder / "empty").mkdir()
-            rows += await crowd.crowd(lab, folder / "empty", crowds, 3.0, progress, programs)
+            rows += await crowd.crowd(lab, folder / "empty", crowds, 3.0, progress, members)
             rows += process.memory_after(lab)
             rows += reporter.costs(lab.nodes["lead"].pid)
         progress("1,000 hosts")
@@ -56,12 +56,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=500, help="of each latency (default: 500)")
     parser.add_argument("--crowds", type=int, default=5, help="rounds of the crowd (default: 5)")
     parser.add_argument("--programs", type=int, default=4, help="that the 20 behaviors run in (default: 4)")
+    parser.add_argument("--before", metavar="COMMIT", help="measured in the same rounds, from a fleet of its own")
     args = parser.parse_args()
     if args.rounds < 10 or args.crowds < 1 or crowd.BEHAVIORS % args.programs:
         parser.error("at least 10 rounds and 1 crowd; programs must divide 20")
     start = time.monotonic()
     load = os.getloadavg()[0]
-    rows = run(measure(args.rounds, args.crowds, args.programs))
+    rows = run(measure(args.rounds, args.crowds, args.programs, args.before))
     machine = {
         "cores": os.cpu_count(),
         "python": platform.python_version(),

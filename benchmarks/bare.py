@@ -16,6 +16,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from benchmarks.child import ready
+from benchmarks.programs import HOT
 from benchmarks.stats import Samples
 
 KEY = "bench/bare"
@@ -39,10 +40,14 @@ class BareQuery:
 
     def __init__(self, payload: bytes) -> None:
         self._payload = payload
-        self.once = self._blocking
+        self.once, self.way = self._blocking, ""
 
-    def choose(self, session: zenoh.Session) -> str:
-        """Waits for the other end, tries both ways, and returns the name of the faster."""
+    def hot(self) -> float:
+        """The last of HOT queries in a row."""
+        return [self.once() for _ in range(HOT)][-1]
+
+    def choose(self, session: zenoh.Session) -> None:
+        """Waits for the other end, tries both ways, and goes on with the faster."""
         self._session = session
         deadline = time.monotonic() + START
         while not self._answered():
@@ -53,9 +58,8 @@ class BareQuery:
         for _ in range(WARM_UP):
             for name, way in ways.items():
                 tried[name].add(way())
-        fastest = min(ways, key=lambda name: tried[name].median)
-        self.once = ways[fastest]
-        return fastest
+        self.way = min(ways, key=lambda name: tried[name].median)
+        self.once = ways[self.way]
 
     def _answered(self) -> bool:
         return any(reply.ok is not None for reply in self._session.get(KEY, payload=self._payload, timeout=1.0))

@@ -5,32 +5,40 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import IO, Any
+from pathlib import Path
+from typing import IO, Any, Self
 
 END = 20.0
 
 
 class Child:
-    """A module of this package as a process; it has reported once before this is made."""
+    """A process that takes orders as JSON lines, and reports so."""
 
-    def __init__(self, module: str, *args: str) -> None:
-        command = [sys.executable, "-m", f"benchmarks.{module}", *args]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    def __init__(
+        self, command: Sequence[str], *, env: Mapping[str, str] | None = None, cwd: Path | None = None
+    ) -> None:
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=env, cwd=cwd)
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._orders: IO[str] = self._process.stdin
         self._reports: IO[str] = self._process.stdout
-        self._name = module
+        self._name = " ".join(command[1:3])
 
-    def order(self, what: dict[str, Any]) -> None:
+    @classmethod
+    def of(cls, module: str, *args: str) -> Self:
+        """A module of this package."""
+        return cls([sys.executable, "-m", f"benchmarks.{module}", *args])
+
+    def order(self, what: Any) -> None:
         print(json.dumps(what), file=self._orders, flush=True)
 
     def report(self) -> Any:
         """The next thing that it says, as JSON; waits for it."""
         line = self._reports.readline()
-        assert line, f"benchmarks.{self._name} ended"
+        assert line, f"{self._name} ended"
         return json.loads(line)
 
     def close(self) -> None:
@@ -42,7 +50,7 @@ class Child:
 @contextmanager
 def child(module: str, *args: str) -> Iterator[Child]:
     """Runs a module of this package until the end of the block."""
-    process = Child(module, *args)
+    process = Child.of(module, *args)
     try:
         process.report()
         yield process

@@ -18,8 +18,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from benchmarks.child import child, ready
-from benchmarks.latency import EXCLUSIVE, HOLD, running
 from benchmarks.loop import run
+from benchmarks.programs import EXCLUSIVE, HOLD, running
 from benchmarks.stats import Row
 from tests.live.lab import Lab
 from zscout import messages

@@ -3,160 +3,155 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import subprocess
+import sys
+import tarfile
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import zenoh
 
 from benchmarks import bare, face
-from benchmarks.child import child
+from benchmarks.child import Child, child
+from benchmarks.programs import EXCLUSIVE, HOT
 from benchmarks.stats import Row, Samples, of_latency
 from tests.live.lab import Lab
 from zscout import messages
-from zscout.behaviors.client.client import Client
-from zscout.behaviors.client.request import Needs, OpenArc
 from zscout.config.scheduling_policy import StrategyName
 from zscout.messages import Ask, HostRanking, Notice, RankAsk, StateAsk
 
-EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
-SHARABLE = ["radio/rf0", "video/ch1"]
-HOT = 3
-"""Times that each thing is done in a row, of which the last counts: an idle processor and cold caches cost
-more than anything that is measured here, and most where many processes take part."""
-HOLD = 60.0
+ROOT = Path(__file__).parents[1]
+TURNS = 5
+WARM_UP = 10
+ANSWER = len(messages.encode(face.NOTICE))
+"""Bytes."""
+MEASURED = [
+    ("grant", "1 RC"),
+    ("grant", "5 RCs"),
+    ("grant", "2 votes"),
+    ("body entered", "1 RC"),
+    ("body entered", "5 RCs"),
+    ("body confirmed", "5 RCs"),
+    ("body confirmed", "2 votes"),
+    ("release to next grant", "1 RC"),
+]
+AIMS = {
+    ("grant", "1 RC"): 2.0,
+    ("grant", "5 RCs"): 2.0,
+    ("grant", "2 votes"): 3.5,
+    ("body entered", "1 RC"): 2.2,
+    ("body entered", "5 RCs"): 2.2,
+    ("body confirmed", "5 RCs"): 3.5,
+    ("release to next grant", "1 RC"): 2.0,
+}
 
 
 def fleet_of(folder: Path, strategy: StrategyName = "adaptive") -> Lab:
-    """The RCM's node apart from those of the RCs, as on a mesh; not started yet."""
+    """Not started yet."""
     return Lab(folder, candidates=["lead"], strategy=strategy)
 
 
-def start(lab: Lab) -> None:
-    lab.node("lead")
-    lab.node("left", *EXCLUSIVE[0::2], f"{SHARABLE[0]}:rate=10")
-    lab.node("right", *EXCLUSIVE[1::2], f"{SHARABLE[1]}:rate=10")
+def commit(name: str, folder: Path) -> Path:
+    """The tree of a commit, in `folder`."""
+    archive = subprocess.run(["git", "-C", str(ROOT), "archive", name], capture_output=True, check=True).stdout
+    with tarfile.open(fileobj=BytesIO(archive)) as tree:
+        tree.extractall(folder, filter="data")
+    return folder
 
 
-async def running(client: Client, arc: OpenArc) -> None:
-    """Waits for the grant, without the confirmation at the RCs."""
-    while arc.state != "running":
-        assert arc.open, f"{arc.name} ended: {arc.reason}"
-        await client.changed(arc)
+async def hot(ask: Callable[[], Awaitable[object]]) -> float:
+    """Seconds of the last of HOT questions in a row."""
+    for _ in range(HOT):
+        began = time.perf_counter()
+        reply = await ask()
+        took = time.perf_counter() - began
+        assert reply is not None, "no answer"
+    return took
 
 
-class Programs:
-    """Two programs in one fleet, and what they do."""
-
-    def __init__(self, client: Client, second: Client) -> None:
-        self.client, self.second = client, second
-
-    @classmethod
-    async def of(cls, lab: Lab) -> Programs:
-        made = cls(await lab.client("bench"), await lab.client("second"))
-        await lab.ready(made.client, *EXCLUSIVE, *SHARABLE)
-        return made
-
-    def grant(self, needs: Needs, *, confirm: bool = False) -> Callable[[], Awaitable[float]]:
-        async def measured() -> float:
-            start = time.perf_counter()
-            arc = await self.client.request("bench", needs, min_runtime=HOLD)
-            await (self.client.granted(arc) if confirm else running(self.client, arc))
-            took = time.perf_counter() - start
-            await self.client.end(arc)
-            return took
-
-        return measured
-
-    def release_to_next(self, needs: Needs) -> Callable[[], Awaitable[float]]:
-        async def measured() -> float:
-            holder = await self.client.request("holder", needs, min_runtime=HOLD)
-            await running(self.client, holder)
-            waiter = await self.second.request("waiter", needs, min_runtime=HOLD)
-            assert waiter.state == "queued"
-            start = time.perf_counter()
-            released = asyncio.create_task(self.client.end(holder))
-            await running(self.second, waiter)
-            took = time.perf_counter() - start
-            await released
-            await self.second.end(waiter)
-            return took
-
-        return measured
+@contextmanager
+def programs(folder: Path, tree: Path = ROOT, strategy: StrategyName = "adaptive") -> Iterator[Child]:
+    """Two programs in a fleet of their own, all of that tree's commit."""
+    folder.mkdir()
+    command = [sys.executable, "-P", str(ROOT / "benchmarks" / "programs.py"), str(folder), strategy]
+    process = Child(command, env=os.environ | {"PYTHONPATH": str(tree)}, cwd=tree)
+    try:
+        process.report()
+        yield process
+    finally:
+        process.close()
 
 
-async def latencies(lab: Lab, paper: Lab, rounds: int, progress: Callable[[str], None]) -> list[Row]:
-    """Rows for the bare query, its asyncio face, the grants and the release; `paper` is a fleet under the
-    strategy `priority`."""
-    programs, papers = await Programs.of(lab), await Programs.of(paper)
-    client = programs.client
-    one: Needs = {EXCLUSIVE[0]: {}}
-    five: Needs = {name: {} for name in EXCLUSIVE[:5]}
-    votes: Needs = {name: {"rate": 4} for name in SHARABLE}
+async def latencies(folder: Path, rounds: int, progress: Callable[[str], None], before: str | None = None) -> list[Row]:
+    """Rows for the bare query and what programs wait for: of this tree, of the commit `before`, and of a fleet under
+    the strategy `priority`. Each has the machine for itself, in turns of a few rounds."""
     ask = len(messages.encode(Ask("0123456789ab", "bench", {EXCLUSIVE[0]: {}}, 0, 60)))  # type: ignore[arg-type]
-    address = lab.fleet.mesh.multicast_address.replace("224.0.0.224", "224.0.0.225")
+    fleets: dict[str, tuple[Path, StrategyName]] = {"": (ROOT, "adaptive")}
+    if before is not None:
+        fleets[f" ({before})"] = commit(before, folder / "tree"), "adaptive"
+    fleets[" under priority"] = ROOT, "priority"
+    samples = {f"{what}, {needs}{of}": Samples() for of in fleets for what, needs in MEASURED}
+    bare_samples = {of: Samples() for of in fleets}
+    with bare_query(folder, ask) as query:
+        progress(f"bare query: {query.way}, {ask} bytes out, {ANSWER} back")
+        for turn in range(TURNS):
+            for of, (tree, strategy) in fleets.items():
+                progress(f"latencies{of}: turn {turn + 1} of {TURNS}")
+                with programs(folder / f"fleet-{turn}{len(of)}", tree, strategy) as fleet:
+                    for number in range(-WARM_UP, rounds // TURNS):
+                        for what, needs in MEASURED:
+                            reference = query.hot()
+                            fleet.order([what, needs])
+                            took = await asyncio.to_thread(fleet.report)
+                            if number >= 0:
+                                samples[f"{what}, {needs}{of}"].add(took)
+                                bare_samples[of].add(reference)
+    rows = [of_latency("bare query", bare_samples[""], bare_samples[""])]
+    for of in fleets:
+        for what, needs in MEASURED:
+            name, aim = f"{what}, {needs}{of}", AIMS.get((what, needs)) if not of else None
+            rows.append(of_latency(name, samples[name], bare_samples[of], aim=aim))
+    return rows
 
-    bare_query = bare.BareQuery(b"x" * ask)
 
-    async def face_query() -> float:
-        start = time.perf_counter()
-        reply = await client.mesh.ask_one(face.key(client.mesh.keys), StateAsk(arc="x" * ask), Notice, timeout=5)
-        took = time.perf_counter() - start
-        assert reply is not None, "the face did not answer"
-        return took
+async def questions(lab: Lab, folder: Path, rounds: int, progress: Callable[[str], None]) -> list[Row]:
+    """Rows for the asyncio face of a bare query, and the balancer's answer."""
+    client = await lab.client("bench")
+    key, asked = face.key(client.mesh.keys), StateAsk(arc="x" * 100)
 
-    async def ranking() -> float:
-        start = time.perf_counter()
-        reply = await client.mesh.ask_one(client.mesh.keys.rank, RankAsk(), HostRanking, timeout=5)
-        took = time.perf_counter() - start
-        assert reply is not None, "the balancer did not answer"
-        return took
+    async def face_query() -> object:
+        return await client.mesh.ask_one(key, asked, Notice, timeout=5)
 
-    measured: dict[str, Callable[[], Awaitable[float]]] = {
-        "query, asyncio face": face_query,
-        "balancer's answer": ranking,
-        "grant, 1 RC": programs.grant(one),
-        "1 RC under priority": papers.grant(one),
-        "grant, 5 RCs": programs.grant(five),
-        "5 RCs under priority": papers.grant(five),
-        "grant, 2 votes": programs.grant(votes),
-        "2 votes under priority": papers.grant(votes),
-        "grant and confirmation, 1 RC": programs.grant(one, confirm=True),
-        "grant and confirmation, 5 RCs": programs.grant(five, confirm=True),
-        "grant and confirmation, 2 votes": programs.grant(votes, confirm=True),
-        "release to next grant": programs.release_to_next(one),
-        "release under priority": papers.release_to_next(one),
-    }
-    aims = {
-        "balancer's answer": 1.2,
-        "grant, 1 RC": 1.5,
-        "grant, 5 RCs": 1.5,
-        "grant, 2 votes": 2.6,
-        "release to next grant": 2.0,
-    }
-    samples = {name: Samples() for name in measured}
-    bare_samples = Samples()
-    size = len(messages.encode(face.NOTICE))
-    with (
-        child("face", str(lab.fleet_file)),
-        child("bare", address, bare.KEY, "--bytes", str(size)),
-        zenoh.open(bare.settings(address)) as session,
-    ):
-        while await client.mesh.ask_one(face.key(client.mesh.keys), None, Notice, timeout=1) is None:
+    async def ranking() -> object:
+        return await client.mesh.ask_one(client.mesh.keys.rank, RankAsk(), HostRanking, timeout=5)
+
+    measured = {"query, asyncio face": (face_query, None), "balancer's answer": (ranking, 1.2)}
+    samples, bare_samples = {name: Samples() for name in measured}, Samples()
+    with bare_query(folder, len(messages.encode(asked))) as query, child("face", str(lab.fleet_file)):
+        while await client.mesh.ask_one(key, None, Notice, timeout=1) is None:
             progress("looking for the asyncio face")
-        way = bare_query.choose(session)
-        progress(f"bare query: {way}, {ask} bytes out, {size} back")
-        for number in range(-rounds // 10, rounds):
-            for name, measure in measured.items():
-                for _ in range(HOT):
-                    reference = bare_query.once()
-                for _ in range(HOT):
-                    took = await measure()
+        for number in range(-WARM_UP, rounds):
+            for name, (question, _) in measured.items():
+                reference = query.hot()
+                took = await hot(question)
                 if number >= 0:
                     samples[name].add(took)
                     bare_samples.add(reference)
-            if number % 100 == 0:
-                progress(f"latencies: round {max(number, 0)} of {rounds}")
-    rows = [of_latency("bare query", bare_samples, bare_samples)]
-    rows += [of_latency(name, samples[name], bare_samples, aim=aims.get(name)) for name in measured]
-    return rows
+    await client.close()
+    lab.clients.remove(client)
+    return [of_latency(name, samples[name], bare_samples, aim=aim) for name, (_, aim) in measured.items()]
+
+
+@contextmanager
+def bare_query(folder: Path, size: int) -> Iterator[bare.BareQuery]:
+    """A bare query of so many bytes, on a mesh of its own."""
+    lab = fleet_of(folder)  # while it lives, its address is nobody else's
+    address = lab.fleet.mesh.multicast_address
+    with child("bare", address, bare.KEY, "--bytes", str(ANSWER)), zenoh.open(bare.settings(address)) as session:
+        query = bare.BareQuery(b"x" * size)
+        query.choose(session)
+        yield query

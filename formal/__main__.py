@@ -1,5 +1,5 @@
-"""`make model`: what TLC says of `ownership.tla` and `settling.tla`. Each guard of the protocol is taken out in turn as
-well, and must break something.
+"""`make model`: what TLC says of `ownership.tla`, `entering.tla` and `settling.tla`. Each guard of the protocol is
+taken out in turn as well, and must break something.
 
 `python -m formal traces FILE...` and `--simulated COUNT`: whether what a fleet did is a behaviour of the model."""
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from formal.tlc import GUARDS, SETTLING, Instance, NoTlc, Outcome, check, check_settling, jar
+from formal.tlc import ENTERING, GUARDS, SETTLING, Instance, NoTlc, Outcome, check, check_entering, check_settling, jar
 from formal.traces import Behaviour, accept
 from zscout import terminal
 from zscout.lab.faults.simulation import simulate
@@ -47,6 +47,11 @@ def checks() -> Iterator[Check]:
     for instance in (*WITHOUT, *INSTANCES):
         bounds = f"{instance.terms} terms of {instance.joins} steps"
         yield Check(instance.name, bounds, partial(check, instance), instance in WITHOUT)
+    for without in (*ENTERING, ""):
+        name = f"entering without {without}" if without else "entering"
+        terms, numbers = (2, 3) if without else (3, 3)
+        ask = partial(check_entering, without, terms=terms, numbers=numbers)
+        yield Check(name, f"{terms} terms of {numbers} numbers", ask, bool(without))
     for without in (*SETTLING, ""):
         name = f"settling without {without}" if without else "settling"
         yield Check(name, f"{HOLDS} holds", partial(check_settling, without, holds=HOLDS), bool(without))

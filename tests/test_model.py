@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from formal.__main__ import WITHOUT
-from formal.tlc import SETTLING, Instance, NoTlc, check, check_settling, jar
+from formal.tlc import ENTERING, SETTLING, Instance, NoTlc, check, check_entering, check_settling, jar
 from formal.traces import Behaviour, accept
 from zscout.lab.faults.simulation import simulate
 
@@ -27,6 +27,14 @@ def test_two_reigns_keep_what_is_promised() -> None:
 @pytest.mark.parametrize("instance", WITHOUT, ids=lambda instance: instance.name)
 def test_without_a_guard_some_promise_breaks(instance: Instance) -> None:
     assert check(instance).violated is not None
+
+
+@pytest.mark.parametrize("without", ["", *ENTERING])
+def test_a_grant_is_answered_first_and_confirmed_beside_its_body_unless_a_guard_is_taken_out(without: str) -> None:
+    outcome = check_entering(without, terms=2, numbers=3 if without == "by name" else 2)
+    promises = {"confirm": "progress", "waits": "Undisturbed", "by name": "Undisturbed", "newer": "Forward"}
+    assert outcome.violated == promises.get(without)
+    assert outcome.states > 1_000
 
 
 @pytest.mark.parametrize("without", ["", *SETTLING])
@@ -55,7 +63,9 @@ def test_what_the_fleet_does_is_a_behaviour_of_the_model(trace: list[str]) -> No
 
 def test_a_forged_step_is_refused_in_any_piece(trace: list[str]) -> None:
     events = [msgspec.json.decode(line) for line in trace]
-    heard = [number for number, event in enumerate(events) if event["do"] == "hear" and event["holds"]]
+    # Of sharable RCs the model knows nothing.
+    exclusive = [number for number, event in enumerate(events) if event["do"] == "hear" and not event["sharable"]]
+    heard = [number for number in exclusive if events[number]["holds"]]
     forged = []
     for at in (heard[0], heard[-1]):
         mine = msgspec.json.decode(msgspec.json.encode(events))

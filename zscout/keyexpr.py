@@ -210,6 +210,7 @@ class Keys:
     rc_state = _rc_key("state")
     frame = _rc_key("frame")
     load = _host_key("load")
+    confirm_any = _host_key("confirm/*/*")
     notice = _sender_key("client", "/notice")
     requests = _sender_key("client", "/requests")
     behavior = _sender_key("client", "/behavior")
@@ -226,6 +227,10 @@ class Keys:
 
     def command(self, rc: str, sender: Sender) -> str:
         return f"{self.base}/rc/{check_rc(rc)}/command/{_sender(sender)}"
+
+    def confirm(self, host: str, sender: Sender) -> str:
+        """Where all RCs of a host's processes are asked at once whether they know of a grant."""
+        return f"{self.base}/host/{check_name(host, 'host')}/confirm/{_sender(sender)}"
 
     def placer(self, sender: Sender) -> str:
         """Where the component placer is asked."""
@@ -277,17 +282,7 @@ class Keys:
 
     def sender_of(self, key: str) -> Sender:
         """The sender of a request or command, or the owner of the key of a client or a building."""
-        match self._chunks(key):
-            case (
-                ["rcm", "schedule", host, client]
-                | ["rc", _, _, "command", host, client]
-                | ["client", host, client, "notice" | "requests" | "behavior"]
-                | ["building", host, client, "plan" | "poses"]
-                | ["placer", "component", host, client]
-                | ["host", _, "component", host, client]
-            ):
-                return Sender(check_name(host, "host"), check_name(client, "client"))
-        raise BadName(f"{key[:200]!r} does not name its sender")
+        return _sender_of(self, key)
 
     def rc_of(self, key: str) -> str:
         match self._chunks(key):
@@ -316,6 +311,21 @@ class Keys:
         if not key.startswith(f"{self.base}/"):
             raise BadName(f"{key[:200]!r} is not a key of fleet {self.fleet}")
         return key[len(self.base) + 1 :].split("/")
+
+
+@lru_cache(REMEMBERED)
+def _sender_of(keys: Keys, key: str) -> Sender:
+    match keys._chunks(key):
+        case (
+            ["rcm", "schedule", host, client]
+            | ["rc", _, _, "command", host, client]
+            | ["client", host, client, "notice" | "requests" | "behavior"]
+            | ["building", host, client, "plan" | "poses"]
+            | ["placer", "component", host, client]
+            | ["host", _, "component" | "confirm", host, client]
+        ):
+            return Sender(check_name(host, "host"), check_name(client, "client"))
+    raise BadName(f"{key[:200]!r} does not name its sender")
 
 
 def client_of(text: str) -> Sender:
@@ -366,6 +376,7 @@ ACCESS: Final = (
     Access("rc/{rc}/frame", publish=NODES, subscribe=_ALL),
     Access("host/{at}/load", publish=NODES, subscribe=_ALL),
     Access("host/{at}/component/{by}/*", ask=_ALL, serve=NODES),
+    Access("host/{at}/confirm/{by}/*", ask=USERS, serve=NODES),
     Access("balancer/rank", ask=_ALL, serve=_MANAGERS),
     Access("placer/component/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("placer/placements", publish=_MANAGERS, subscribe=_ALL),

@@ -26,6 +26,7 @@ from zscout.config.fleet import Fleet
 from zscout.config.node import Node, default_node, load_node
 from zscout.config.state_folder import state_folder
 from zscout.config.strict import BadInput
+from zscout.drivers.confirm_server import ConfirmServer
 from zscout.drivers.last_holder import LastHolderFile, UnknownLastHolder
 from zscout.drivers.lock import only_here
 from zscout.drivers.registry import driver_for, driver_name
@@ -90,6 +91,7 @@ async def run_services(
         stack.callback(token.close)
         lease = node.fleet.timing.hold_lease / SECOND
         kept = state_folder(node.fleet.name, me.host, node.state) if node.rcs or node.candidate else None
+        confirmations = ConfirmServer(mesh) if node.rcs else None
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
             stack.enter_context(only_here(node.fleet.name, me.host, spec.name))
@@ -102,6 +104,7 @@ async def run_services(
                 settle=spec.settle / SECOND,
                 last_holder=LastHolderFile(kept, spec.name) if kept is not None else UnknownLastHolder(),
                 stall=stall,
+                confirmations=confirmations,
                 on_failure=fail,
             )
             try:

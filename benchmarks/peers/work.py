@@ -63,7 +63,7 @@ def team(key: str, address: str, folder: Path) -> Iterator[Team]:
     with ExitStack() as stack:
         made = Team(key, address, folder, [])
         for number in range(PROGRAMS):
-            program = Child(*made.arguments(f"p{number}"))
+            program = Child.of(*made.arguments(f"p{number}"))
             stack.callback(program.close)
             made.programs.append(program)
         for program in made.programs:
@@ -203,7 +203,7 @@ def killed(team: Team, progress: Progress) -> Figure:
     took: list[float] = []
     for number in range(KILLS):
         name = f"victim{number}"
-        holder = Child(*team.arguments(name))
+        holder = Child.of(*team.arguments(name))
         try:
             pid = holder.report()
             holder.order({"do": "hold_on", "rcs": rcs})

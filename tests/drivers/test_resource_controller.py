@@ -12,13 +12,13 @@ import pytest
 from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
 from tests.hang import HANG
 from tests.mesh.kit import run, until
+from zscout.drivers.confirm_server import CommandQuery
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
 from zscout.drivers.resource_controller import (
     COMMANDS_PER_HOST,
     EARLY_PER_HOST,
     SAY_AGAIN,
-    CommandQuery,
     ResourceController,
     WorkQueue,
 )
@@ -60,12 +60,13 @@ def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> None:
         # Under a grant that nobody knows: each made the RC read `rcm/state` for half a second.
         early = [asyncio.create_task(answer(client, grant(99), ttl=60)) for _ in range(20)]
         await until(lambda: rc.queue.commands == EARLY_PER_HOST)
+        await until(lambda: len(rcm.asked) == 2)  # one when it started, and one for all of these
         asked, ended = len(rcm.asked), rcm.mesh.now()
         rcm.publish()
         await until(lambda: device.calls == ["begin one", "end one", "safe"])
         assert rcm.mesh.now() - ended < 0.01 * SECOND
         assert await asyncio.gather(*early) == ["not_yet"] * EARLY_PER_HOST + ["busy"] * (20 - EARLY_PER_HOST)
-        assert len(rcm.asked) == asked == 2  # one when it started, and one for all of these
+        assert len(rcm.asked) == asked
 
     play(story)
 

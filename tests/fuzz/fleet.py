@@ -293,7 +293,7 @@ class Fleet:
         client, needs = self.clients["asker"], {"robot/a": {}, "radio/r": {"rate": 1}}
         try:
             arc = await client.request(f"good-{self._asked}", needs, priority=9, min_runtime=5, wait_for_device=True)
-            while (grant := await client.granted(arc)) is not None:
+            while (grant := await client.granted(arc, confirmed=True)) is not None:
                 done = await client.command("robot/a", grant, {"name": "echo", "value": self._asked})
                 await client.end(arc)
                 return bool(done.result == self._asked)

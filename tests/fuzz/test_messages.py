@@ -110,9 +110,10 @@ def test_every_key_of_the_key_space_has_a_row() -> None:
         "alive_rc": ("k/n",),
         "command": ("k/n", sender),
         "component": ("h", sender),
+        "confirm": ("h", sender),
         "served_placer": (),
         **dict.fromkeys(("vote", "command_any", "rc_state", "frame"), ("k/n",)),
-        **dict.fromkeys(("load", "served_component"), ("h",)),
+        **dict.fromkeys(("load", "served_component", "confirm_any"), ("h",)),
     }
     no_keys = {"fleet", "closed", "base", "everything"}
     built: dict[str, str] = {}

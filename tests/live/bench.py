@@ -86,7 +86,7 @@ class Stand:
 
 async def running(client: Client, name: str, *rcs: str, **how: Any) -> tuple[OpenArc, Grant]:
     arc = await client.request(name, {rc: {} for rc in rcs}, **({"min_runtime": 600} | how))
-    grant = await client.granted(arc)
+    grant = await client.granted(arc, confirmed=True)
     assert grant is not None
     return arc, grant
 

@@ -148,7 +148,7 @@ def test_a_hold_that_had_its_time_by_this_host_s_clock_is_completed_though_no_rc
     text = """
         with zscout.connect() as lab:
             try:
-                with lab.hold("survey", {"robot/a": {}}, min_runtime=2, keep=False) as held:
+                with lab.hold("survey", {"robot/a": {}}, min_runtime=2, keep=False, confirmed=True) as held:
                     say("entered")
                     time.sleep(LONGER)
             except zscout.Revoked as revoked:

@@ -11,6 +11,7 @@ import pytest
 from tests.live.bench import running, until
 from tests.live.crew import Crew, Stand
 from tests.live.lab import Lab, LeaderWatch
+from tests.live.unpublished import deaths
 from zscout.behaviors.client.client import Client
 from zscout.mesh import clock
 from zscout.types import SECOND, Ns
@@ -68,6 +69,12 @@ def test_a_successor_carries_everything_on(tmp_path: Path) -> None:
             await asyncio.gather(*(body.finish() for body in crew.bodies if body is not crew.bodies[1]))
 
     asyncio.run(story())
+
+
+def test_a_leader_killed_between_answer_and_publication_has_granted_nothing(tmp_path: Path) -> None:
+    found = asyncio.run(deaths(tmp_path, 3, lambda _: None))
+    assert [one.trouble for one in found] == [""] * 3
+    assert any(one.answered for one in found)
 
 
 def test_the_only_rcm_killed_and_started_again_finds_everything(tmp_path: Path) -> None:

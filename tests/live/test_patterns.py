@@ -139,7 +139,7 @@ def test_the_one_that_was_given_is_asked_whether_it_knows(tmp_path: Path) -> Non
             await lab.ready(client, BOTH[0])
             lab.signal("v", signal.SIGSTOP)
             arc = await client.request("any", {ANY: {}}, min_runtime=600)
-            entered = asyncio.create_task(client.granted(arc))
+            entered = asyncio.create_task(client.granted(arc, confirmed=True))
             state = await lab.state(client, lambda state: bool(state.queue))
             assert not state.holds
             assert state.queue[0].reason.startswith(f"{BOTH[0]} did not confirm")

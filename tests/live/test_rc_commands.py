@@ -230,6 +230,7 @@ def test_holds_end_at_rc_and_client_when_no_rcm_is_heard_for_the_hold_lease(tmp_
                 grants: list[Grant] = []
                 with pytest.raises(Revoked) as revoked:  # noqa: PT012
                     async with hold(client, "gang", {"robot/x": {}, "robot/bench": {}}, min_runtime=600) as held:
+                        assert await held.confirmed()
                         grants.append(held.grant)
                         killed = lab.signal("a", signal.SIGKILL)
                         async with asyncio.timeout(HANG):

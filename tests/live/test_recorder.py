@@ -255,7 +255,7 @@ def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path: Path
             await lab.ready(client, "robot/b")
             await recording(lab)
             survey = await client.request("survey", {"robot/b": {}}, min_runtime=60)
-            await until(lambda: survey.state == "running")
+            assert await client.granted(survey, confirmed=True)
             over = asyncio.Event()
 
             def heard(_key: str, state: RcState) -> None:

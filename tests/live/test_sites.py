@@ -122,6 +122,7 @@ def test_what_two_relays_bring_twice_is_carried_out_once(tmp_path: Path) -> None
                     while carried_out() < number:  # noqa: ASYNC110
                         await asyncio.sleep(0.05)
 
+            await reaches(2)  # the question whether it knows of the grant
             before = carried_out()
             await commands(count, anew=True)
             await reaches(before + 2 * count)  # so it arrives twice

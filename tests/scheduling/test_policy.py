@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.test_waiting import workload
@@ -275,7 +276,7 @@ def ended(effects: list[Effect]) -> list[tuple[str, Outcome, str, bool]]:
 @pytest.mark.parametrize("strategy", ALL)
 def test_the_longest_time_ends_what_is_kept_though_nobody_waits(strategy: StrategyName) -> None:
     core = limited(strategy, "robot/a")
-    core.handle(SECOND, Requested(replace(request("kept", "robot/a", priority=11), keep=True)))
+    core.handle(SECOND, Requested(structs.replace(request("kept", "robot/a", priority=11), keep=True)))
     assert not ended(core.handle(11 * SECOND, Tick()))
     wakes = [effect.at for effect in core.handle(12 * SECOND, Tick()) if isinstance(effect, WakeAt)]
     assert not wakes, "it was told already when to wake"
@@ -297,7 +298,7 @@ def test_nobody_is_given_more_than_the_longest_time(strategy: StrategyName) -> N
 def test_the_longest_time_is_counted_from_the_beginning_of_the_hold_whoever_leads_and_has_it() -> None:
     core = Core(policy=SchedulingPolicy(max_runtime=20 * SECOND))
     term, old = Term(2, "rcm/b"), Term(1, "rcm/a")
-    kept = replace(request("kept", "robot/a"), keep=True)
+    kept = structs.replace(request("kept", "robot/a"), keep=True)
     stands = RecoveredHold(kept, Place(old, 1), Grant(old, 1), 5 * SECOND, 15 * SECOND)
     core.handle(16 * SECOND, RcJoined("robot/a", sharable=False), LeadTaken(term, (stands,)))
     core.handle(17 * SECOND, HandedOver("kept", "h/other", "moved"))
@@ -342,7 +343,7 @@ def test_no_hold_is_ever_longer_than_the_longest_time(strategy: StrategyName, se
 
 
 def _shorter(one: ArcRequest, longest: Ns) -> ArcRequest:
-    return replace(one, min_runtime=min(one.min_runtime, longest))
+    return structs.replace(one, min_runtime=min(one.min_runtime, longest))
 
 
 def play(core: Core, work: Workload, watch: Callable[[Ns, Core, list[Effect]], None]) -> None:

@@ -225,7 +225,12 @@ def test_what_a_release_looks_at_does_not_grow_with_the_queue(monkeypatch: pytes
     looked_at.clear()
     granted = [effect for effect in core.handle(1, Released("a7")) if isinstance(effect, Granted)]
     assert [grant.arc for grant in granted] == ["a57"], "the next in line for robot/7"
-    assert looked_at == [f"a{57 + 50 * step}" for step in range(1 + priority.MAX_REPORTED)]
+    assert looked_at == ["a57"]
+    # What others wait for now is looked at when somebody reads it.
+    following = [f"a{107 + 50 * step}" for step in range(priority.MAX_REPORTED)]
+    assert [effect.arc for effect in core.tell_reasons() if isinstance(effect, Queued)] == following
+    assert looked_at == ["a57", *following]
+    assert not core.reasons_changed
 
 
 def test_the_words_for_who_asks_are_those_of_now() -> None:

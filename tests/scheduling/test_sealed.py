@@ -18,9 +18,15 @@ SURFACE = {
     "arcs_of",
     "arcs",
     "arcs_of_owners",
+    "count_of",
+    "count_of_owner",
+    "is_open",
+    "is_running",
     "place_of",
     "at_place",
     "could_have_issued",
+    "reasons_changed",
+    "tell_reasons",
 }
 SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}

@@ -7,6 +7,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 import pytest
+from msgspec import structs
 
 from tests.scheduling.invariants import Ledger
 from tests.thorough import times
@@ -45,7 +46,7 @@ def workload(seed: int, kept: float = 0.0) -> Workload:
     rcs = (*map(WorkloadRc, robots), *((RADIO,) if radio else ()))
     keeps = random.Random(f"kept {seed}")  # noqa: S311
     return Workload(
-        rcs, tuple(replace(one, request=replace(one.request, keep=keeps.random() < kept)) for one in arrivals)
+        rcs, tuple(replace(one, request=structs.replace(one.request, keep=keeps.random() < kept)) for one in arrivals)
     )
 
 

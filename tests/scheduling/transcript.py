@@ -75,7 +75,9 @@ class CorePlayer:
                 events.append(event)
         if not events:
             return []
-        effects = self.core.handle(self.now, *events)
+        decided = self.core.handle(self.now, *events)
+        wakes = [one for one in decided if isinstance(one, WakeAt)]
+        effects = [*(one for one in decided if one not in wakes), *self.core.tell_reasons(), *wakes]
         validate(self.core)
         return [_print(effect) for effect in effects] or ["nothing"]
 

@@ -24,6 +24,8 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final, Literal, TypeAlias
 
+from msgspec import structs
+
 from tests.surface.commands import scripts
 from tests.surface.record import text as as_text
 from tests.surface.tree import find
@@ -80,7 +82,7 @@ def kept(text: str, seed: int, strategy: StrategyName) -> str:
     arrivals = tuple(
         dataclasses.replace(
             arrival,
-            request=dataclasses.replace(
+            request=structs.replace(
                 arrival.request, keep=random.random() < 0.3, client=f"host{random.randrange(3)}/client"
             ),
         )

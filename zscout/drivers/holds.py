@@ -127,6 +127,14 @@ class HoldTable:
 
     # Publications and snapshots
 
+    def follow(self, grants: Grants, now: Ns) -> bool:
+        """Takes the next publication of the RCM that is obeyed, if it is about other RCs, as most are. False: it has to
+        be applied."""
+        if grants.term != self.term or not grants.prev <= self.seq <= grants.seq or self.rc in grants.rcs:
+            return False
+        self.seq, self.last_contact = grants.seq, now
+        return True
+
     def apply_grants(self, grants: Grants, now: Ns, *, sharable: bool = True) -> HoldChange:
         """Takes a publication. Of several holders of an exclusive RC only the newest grant is obeyed."""
         missed = grants.term != self.term or grants.prev > self.seq

@@ -11,12 +11,13 @@ import math
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 from msgspec import structs
 
 from zscout import messages, trace
 from zscout.config import devices
+from zscout.drivers.confirm_server import CommandQuery, ConfirmServer
 from zscout.drivers.driver import Driver, RcDirectory
 from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.instances import Instances, InstanceState
@@ -49,6 +50,8 @@ NEVER_HELD_BACK: Final = ("stop", "halt")
 COMMAND_QUEUE = 64
 COMMANDS_PER_HOST = 48
 """Of those that wait, at most."""
+EARLY: Final = 0.25
+"""Seconds for which a command under a grant that is not known yet waits for its publication."""
 EARLY_PER_HOST = 16
 """Commands of one host that may be set aside."""
 LOOK_PERIOD = 0.5
@@ -57,8 +60,6 @@ FIGURES_PERIOD = 1.0
 """Seconds between two publications of changed figures."""
 SAY_AGAIN = 10.0
 """Seconds after which an RC publishes its state though nothing has changed: who missed a change hears of it then."""
-
-CommandQuery: TypeAlias = IncomingQuery[messages.Command]
 
 
 class WorkQueue:
@@ -79,6 +80,11 @@ class WorkQueue:
     def commands(self) -> int:
         """Commands that wait, those that are set aside included."""
         return len(self._commands) + len(self._early)
+
+    @property
+    def early(self) -> int:
+        """Those that are set aside."""
+        return len(self._early)
 
     def put_change(self, change: HoldChange) -> None:
         self._changes.append(change)
@@ -124,7 +130,8 @@ class WorkQueue:
 
 class ResourceController:
     """One RC: its keys, its holds and its driver. Where it fails, not its driver, it leaves the mesh, makes
-    its device safe and calls `on_failure`. `hold_lease` and `settle` are in seconds; `last_holder` outlives it."""
+    its device safe and calls `on_failure`. `hold_lease` and `settle` are in seconds; `last_holder` outlives it;
+    `confirmations` is that of all RCs of its process, its own if there is none."""
 
     def __init__(
         self,
@@ -136,6 +143,7 @@ class ResourceController:
         stall: StallWatch,
         settle: float = SETTLE,
         last_holder: LastHolder | None = None,
+        confirmations: ConfirmServer | None = None,
         on_failure: Callable[[Exception], object] = lambda _error: None,
     ) -> None:
         self.mesh, self.name, self.driver = mesh, name, driver
@@ -143,6 +151,7 @@ class ResourceController:
         lease, self._settle = round(hold_lease * SECOND), round(settle * SECOND)
         self.holds = HoldTable(name, hold_lease=lease, settle=self._settle, instance=self.instance)
         self._last_holder, self._noting = last_holder or LastHolder(), asyncio.Lock()
+        self._confirmations = confirmations or ConfirmServer(mesh)
         self.rules = 0
         self.health = "ok"
         self.queue, self._memory = WorkQueue(), CommandMemory()
@@ -219,6 +228,7 @@ class ResourceController:
                 self._served.append(mesh.serve(keys.vote(self.name), messages.Proposal, self._on_proposal))
             command = keys.command_any(self.name)
             self._served.append(mesh.serve(command, messages.Command, self._on_command, depth=2 * COMMAND_QUEUE))
+            self._served.append(self._confirmations.serve(self.name, self._on_command))
 
     def _on_instance_state(self) -> None:
         if self._is_open:
@@ -284,16 +294,21 @@ class ResourceController:
             self._asked = NO_TERM
 
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
-        self._last_terms.shown(grants.term, self.holds.term)
-        before = self.holds.term, self.holds.seq
-        change = self.holds.apply_grants(grants, self.mesh.now(), sharable=self.driver.sharable)
+        now, before = self.mesh.now(), (self.holds.term, self.holds.seq)
+        # The timer of a lease is set anew when it goes off: most leases are renewed before.
+        change = None if self.holds.follow(grants, now) else self._apply_grants(grants, now)
         if grants.term == self.holds.term:
-            self._heard = self.mesh.now()
+            self._heard = now
         if change or before != (self.holds.term, self.holds.seq):
             self._trace("hear")
-        self._apply(change)
+        if change is not None:
+            self._apply(change)
         if self._missed:
             self._read_state()
+
+    def _apply_grants(self, grants: messages.Grants, now: Ns) -> HoldChange:
+        self._last_terms.shown(grants.term, self.holds.term)
+        return self.holds.apply_grants(grants, now, sharable=self.driver.sharable)
 
     def _on_state_query(self, query: IncomingQuery[messages.RcAsk]) -> None:
         if query.message.above is None:
@@ -383,9 +398,15 @@ class ResourceController:
             elif not self._is_early(work):
                 await self._answer(work, self._carry_out(work))
             elif self.queue.set_aside(work, self.mesh.keys.sender_of(work.key).host):
-                self._read_state()  # nothing else waits for that
+                # Who is granted hears of it before its RCs do: most are published by then.
+                left = work.message.ttl - self._waited(work) / SECOND
+                self.supervisor.call_later(max(0.0, min(EARLY, left)), self._read_for_early)
             else:
                 work.refuse(Refused("busy", f"too many commands to {self.name} are early; ask again").problem)
+
+    def _read_for_early(self) -> None:
+        if self.queue.early:
+            self._read_state()
 
     async def _carry_out(self, query: CommandQuery) -> Any:
         """What is answered, or a Future of it."""

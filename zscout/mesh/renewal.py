@@ -51,6 +51,11 @@ class Suspicions:
         self._acted: dict[str, Ns] = {}
         """What this process has joined anew for, and when; until it is right."""
 
+    @property
+    def any(self) -> bool:
+        """Whether anything is suspected, or was until it is said to be right."""
+        return bool(self._since or self._acted)
+
     def suspect(self, what: str, *, so: bool = True, patience: float = PATIENCE) -> None:
         """What is seen contradicts itself, or no longer does (`so`); to be said again while it lasts. `patience` is in
         seconds."""

@@ -282,24 +282,24 @@ class Mesh:
         shares = HostShares(depth // 2)
 
         def on_query(query: TransportQuery) -> None:
-            host = query.key.rsplit("/", 2)[-2] if names_sender else ""
+            asked = query.key
+            host = asked.rsplit("/", 2)[-2] if names_sender else ""
             if state.closed:
                 query.drop()
             elif host and not shares.enter(host):
                 _refuse(query, "busy", f"too many requests of {host[:MAX_NAME]} are waiting here; ask again")
-            elif not self._inbox.offer(state, handle, query, self.now(), host):
+            elif not self._inbox.offer(state, handle, query, asked, self.now(), host):
                 if host:
                     shares.leave(host)
                 _refuse(query, "busy", "too many requests are waiting here; ask again")
 
-        def handle(query: TransportQuery, arrived: Ns, host: str) -> None:
+        def handle(query: TransportQuery, asked: str, arrived: Ns, host: str) -> None:
             if host:
                 shares.leave(host)
             if state.closed:
                 # Unless it is dropped here and now, its sender waits for the whole of its timeout.
                 query.drop()
                 return
-            asked = query.key
             if wild and "*" in asked:
                 _refuse(query, "bad_key", f"name yourself in the key {key}: no wildcards")
                 return

@@ -47,6 +47,9 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
     Quality.DATA: {"congestion_control": DROP, "priority": zenoh.Priority.DATA_LOW, "express": False},
     Quality.FRAME: {"congestion_control": DROP, "priority": zenoh.Priority.DATA, "express": True},
 }
+QUERY: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE, **CONTROL}
+MAX_QUERIERS = 256
+"""Of one session: what is declared for a key is never given back."""
 MAX_MESSAGE = 17_000_000
 """Bytes: a little more than any message of zscout's has."""
 LOOK_AT_CERTIFICATES = 2.0
@@ -267,6 +270,9 @@ class ZenohTransport(Transport):
 
     def __init__(self, session: zenoh.Session, relinking: Relinking | None = None) -> None:
         self._session, self._relinking = session, relinking
+        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
+        """By key and timeout."""
+        self._asked_once: dict[tuple[str, float], None] = {}
 
     def id(self) -> str:
         return str(self._session.info.zid())
@@ -297,19 +303,28 @@ class ZenohTransport(Transport):
             log.warning("the mesh session did not close within %g s", CLOSE_TIMEOUT)
 
     def get(self, key: str, payload: bytes | None, kind: type | None, timeout: float, to: Collector) -> None:
+        encoding = None if kind is None else _encoding(kind)
         try:
-            self._session.get(
-                key,
-                _collecting(to),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=timeout,
-                payload=payload,
-                encoding=None if kind is None else _encoding(kind),
-                **CONTROL,
-            )
+            if (querier := self._querier(key, timeout)) is not None:
+                querier.get(_collecting(to), payload=payload, encoding=encoding)
+            else:
+                self._session.get(key, _collecting(to), timeout=timeout, payload=payload, encoding=encoding, **QUERY)
         except zenoh.ZError as error:
             raise MeshError(f"{key} can't be asked: {error}") from None
+
+    def _querier(self, key: str, timeout: float) -> zenoh.Querier | None:
+        """Declared for what is asked a second time, which is quicker from then on; None for others."""
+        asked = key, timeout
+        if (known := self._queriers.get(asked)) is not None or "*" in key or len(self._queriers) >= MAX_QUERIERS:
+            return known
+        if asked not in self._asked_once:
+            self._asked_once[asked] = None
+            if len(self._asked_once) > MAX_QUERIERS:
+                del self._asked_once[next(iter(self._asked_once))]
+            return None
+        del self._asked_once[asked]
+        querier = self._queriers[asked] = self._session.declare_querier(key, timeout=timeout, **QUERY)
+        return querier
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
         return _undeclare(self._session.declare_queryable(key, _direct(lambda query: on_query(ZenohQuery(query)))))

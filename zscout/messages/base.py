@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache
+from operator import attrgetter
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import msgspec
@@ -118,7 +119,8 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
         raise Malformed(f"{len(payload)} bytes are too many; at most {limit} are taken")
     try:
         message: T = _decoder(kind).decode(payload)
-        if kind in NAMES_ONCE:
+        # What is as this encodes it has no name twice.
+        if kind in NAMES_ONCE and _ENCODER.encode(message) != payload:
             _ONCE.decode(payload.decode())
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         name = getattr(kind, "__name__", "operation")
@@ -144,8 +146,11 @@ def _check_of(kind: inspect.Type) -> Callable[[Any], bool] | None:
         case inspect.Metadata(type=of):
             return _check_of(of)
         case inspect.StructType(fields=fields):
-            checks = [(one.name, check) for one in fields if (check := _check_of(one.type)) is not None]
-            return (lambda value: all(check(getattr(value, name)) for name, check in checks)) if checks else None
+            checks = [(attrgetter(one.name), check) for one in fields if (check := _check_of(one.type)) is not None]
+            if len(checks) == 1:
+                ((get, only),) = checks
+                return lambda value: only(get(value))
+            return (lambda value: all(check(get(value)) for get, check in checks)) if checks else None
         case inspect.ListType(item_type=of) | inspect.VarTupleType(item_type=of):
             return _check_of_each(of, iter)
         case inspect.DictType(value_type=of):
@@ -160,7 +165,7 @@ def _check_of_each(kind: inspect.Type, values: Callable[[Any], Iterable[Any]]) -
     if (found := _check_of(kind)) is None:
         return None
     check = found
-    return lambda value: all(map(check, values(value)))
+    return lambda value: not value or all(map(check, values(value)))
 
 
 # A check of all decimals in a message of that kind.
@@ -187,6 +192,12 @@ def schema(kind: type) -> str:
 
 def exact(value: Decimal, what: str) -> Fraction:
     """A number that is not negative, exactly. Raises ValueError for NaN, infinity, and implausible sizes."""
+    check_amount(value, what)
+    return Fraction(value)
+
+
+def check_amount(value: Decimal, what: str) -> None:
+    """Raises ValueError for what `exact` does not take."""
     shown = str(value)[:40]
     if not value.is_finite():
         raise ValueError(f"{what} must be a number, not {shown}")
@@ -197,7 +208,6 @@ def exact(value: Decimal, what: str) -> Fraction:
         raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {shown}")
     if len(value.as_tuple().digits) > MAX_DIGITS:
         raise ValueError(f"{what} has more than {MAX_DIGITS} digits")
-    return Fraction(value)
 
 
 def exact_amounts(params: Mapping[str, Decimal]) -> dict[str, Fraction]:
@@ -207,7 +217,7 @@ def exact_amounts(params: Mapping[str, Decimal]) -> dict[str, Fraction]:
 
 def duration(value: Decimal, what: str) -> Ns:
     """A positive duration in seconds as whole ns, half to even. Raises ValueError."""
-    exact(value, what)
+    check_amount(value, what)
     if value > MAX_SECONDS:
         raise ValueError(f"{what} must be at most {MAX_SECONDS} s (ten years), and is {value}")
     nanoseconds = round(value * SECOND)

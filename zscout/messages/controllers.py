@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeAlias
 
 from msgspec import Meta
 
-from zscout.messages.base import Amounts, Elapsed, Message, Seconds, VersionText
+from zscout.messages.base import MAX_NEEDS, Amounts, Elapsed, Message, Problem, Seconds, VersionText
 from zscout.messages.scheduling import Holder, Parameters
 from zscout.types import NO_TERM, Grant, Term
 
@@ -59,6 +59,22 @@ class Done(Message, frozen=True):
     warming: Seconds = 0.0
     settle: Elapsed | None = None
     """To a `confirm`: the seconds that the RC settles at most once its client has said `leaving`."""
+
+
+class Confirm(Message, frozen=True):
+    """Asks all RCs of a process at once what each would answer to the command `confirm` under `grant`, waiting for no
+    longer than `ttl` seconds."""
+
+    grant: Grant
+    rcs: Annotated[list[str], Meta(max_length=MAX_NEEDS)]
+    ttl: float = 1.0
+
+
+class Confirmed(Message, frozen=True):
+    """How the RCs answer that are asked about and are here; of others nothing is said."""
+
+    done: dict[str, Done] = {}
+    refused: dict[str, Problem] = {}
 
 
 class RcAsk(Message, frozen=True):

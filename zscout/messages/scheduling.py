@@ -211,6 +211,8 @@ class Notice(_ArcParty, frozen=True):
     """Whose it is, while it is open."""
     seal: str | None = None
     """Proof that the place is this ARC's, for every RCM; absent where RCMs share no key."""
+    hosts: dict[str, str] = {}
+    """While it runs: where its RCs are, by RC, as far as that is known."""
 
 
 class Holder(_ArcParty, frozen=True):

@@ -15,7 +15,8 @@ comes back with what follows from them: votes, and a `Tick` at the latest when `
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.keyexpr import is_pattern
@@ -33,7 +34,7 @@ from zscout.scheduling.model import (
     RcStatus,
     Status,
 )
-from zscout.scheduling.priority import AdmissionCheck, Priority
+from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
@@ -75,14 +76,29 @@ class Core:
         self._run_again = False
         self._expire()
         self._state.let_in()
-        for event in events:
-            self._apply(event)
+        if len(events) == 1 and isinstance(events[0], model.Requested):
+            self._ask(events[0], alone=True)
+        else:
+            for event in events:
+                self._apply(event)
         if self._state.queued:
             self.strategy.run_pass(self._state, self)
         for arc in self._state.held_back.values():
             if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
                 self.wait(arc, _claimed_by(other))
         self._set_wake()
+        return self._effects
+
+    @property
+    def reasons_changed(self) -> bool:
+        """Whether somebody may wait for another reason than was told last."""
+        return bool(self._state.index.retold)
+
+    def tell_reasons(self) -> list[model.Effect]:
+        """Why those wait whose reason has changed: for who reads it, as often as that is."""
+        self._effects = []
+        for arc, reason in reasons_of_now(self._state):
+            self.wait(arc, reason)
         return self._effects
 
     @property
@@ -140,6 +156,21 @@ class Core:
     def arcs(self) -> list[ArcId]:
         """All ARCs, those that wait first."""
         return [arc.id for arc in self._state.all_arcs()]
+
+    def is_open(self, arc_id: ArcId) -> bool:
+        """Whether it waits or runs."""
+        return self._state.arc(arc_id) is not None
+
+    def is_running(self, arc_id: ArcId) -> bool:
+        return arc_id in self._state.running
+
+    def count_of(self, client: ClientId) -> int:
+        """How many ARCs one client has."""
+        return len(self._state.arcs_of(client))
+
+    def count_of_owner(self, owner: str) -> int:
+        """How many ARCs all clients of a host or a person have."""
+        return len(self._state.arcs_of_owner(owner))
 
     def arcs_of_owners(self, owners: Collection[str]) -> list[ArcId]:
         """The ARCs of all clients of these hosts and people."""
@@ -247,10 +278,18 @@ class Core:
             case model.Tick():
                 pass
 
-    def _ask(self, asked: model.Requested) -> None:
-        if self._state.arc(asked.request.arc) is None:
-            since = self._state.now if asked.since is None else min(asked.since, self._state.now)
-            self._state.enqueue(self._new_arc(asked.request, asked.place), since)
+    def _ask(self, asked: model.Requested, *, alone: bool = False) -> None:
+        """`alone`: nothing else happens in this instant."""
+        if self._state.arc(asked.request.arc) is not None:
+            return
+        arc = self._new_arc(asked.request, asked.place)
+        if alone and self._state.is_free(arc):
+            # What any strategy would do, without a queue of one.
+            self._state.enter(arc)
+            self.start(arc)
+            return
+        since = self._state.now if asked.since is None else min(asked.since, self._state.now)
+        self._state.enqueue(arc, since)
 
     def _new_arc(self, request: model.ArcRequest, place: Place | None) -> Arc:
         if place is None:
@@ -263,7 +302,7 @@ class Core:
             # Nobody gets more: what is reckoned with it (ranks, reservations) is the shorter.
             request = replace(request, min_runtime=longest)
         patterns = tuple(filter(is_pattern, request.needs))
-        named = self._state.mask([need for need in request.needs if need not in patterns])
+        named = self._state.mask(need for need in request.needs if need not in patterns)
         arc = Arc(request, place, named, patterns, named)
         if patterns:
             self._state.bind(arc, {})

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, TypeAlias
 
+from msgspec import Struct
+
 from zscout.keyexpr import check_need, is_pattern, matcher
 from zscout.messages import Who
 from zscout.scheduling.reason import SHOWN, Party, Reason
@@ -31,8 +33,7 @@ Rank: TypeAlias = tuple[int, Ns, Place, ArcId]
 """Sorts contenders, best first: priority (negated), minimum runtime, place, id."""
 
 
-@dataclass(frozen=True, slots=True)
-class ArcRequest:
+class ArcRequest(Struct, frozen=True):
     """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0).
 
     A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`).
@@ -58,8 +59,9 @@ class ArcRequest:
             raise ValueError(f"ARC {self.arc} needs nothing; name at least one RC")
         if self.min_runtime <= 0:
             raise ValueError(f"ARC {self.arc}: the minimum runtime must be positive")
-        if any(value < 0 for params in self.needs.values() for value in params.values()):
-            raise ValueError(f"ARC {self.arc}: bandwidth parameters must not be negative")
+        for params in self.needs.values():
+            if params and any(value < 0 for value in params.values()):
+                raise ValueError(f"ARC {self.arc}: bandwidth parameters must not be negative")
         check_patterns(self.needs)
 
     @property
@@ -67,8 +69,7 @@ class ArcRequest:
         return self.label or self.arc
 
 
-@dataclass(frozen=True, slots=True)
-class Hold:
+class Hold(Struct, frozen=True):
     """A grant in force. `end` is when the minimum runtime is over; with `keep` the hold goes on past it."""
 
     grant: Grant
@@ -104,7 +105,7 @@ _CHECKED: Final = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.
 _LEAVES: Final = (ArcState.HELD_BACK, ArcState.RUNNING, ArcState.ENDED)
 _WAITS: Final = (ArcState.READY, ArcState.HELD_BACK)
 TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
-    ArcState.NEW: _WAITS,
+    ArcState.NEW: (*_WAITS, ArcState.RUNNING),
     ArcState.READY: (*_CHECKED, *_LEAVES),
     ArcState.VOTING: (*_CHECKED, *_LEAVES),
     ArcState.DEFERRED: (*_CHECKED, *_LEAVES),
@@ -128,7 +129,7 @@ def check_patterns(needs: Mapping[Need, Params]) -> None:
         kind = check_need(need).partition("/")[0]
         if asked.setdefault(kind, params) != params:
             raise ValueError(f"patterns of the kind {kind} have different parameters; give all the same")
-    if any(is_pattern(kind) for kind in asked) and any(asked.values()):
+    if asked and any(map(is_pattern, asked)) and any(asked.values()):
         raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
 
 
@@ -193,7 +194,7 @@ class Arc:
         self.request, self.id, self.priority = request, request.arc, request.priority
         self.owner = request.client.partition("/")[0]
         self.rank = (-self.priority, request.min_runtime, self.place, self.id)
-        self.party = Party(self.id, request.name, self.priority, request.who)
+        self.party = Party(self.id, request.label or self.id, self.priority, request.who)
 
     def move_to(self, state: ArcState) -> None:
         """Raises ValueError for a move that is not in `TRANSITIONS`."""
@@ -212,7 +213,8 @@ class Arc:
     def blocks(self, other: Arc) -> Party:
         """How the reason names it for which `other` waits, that may not preempt it yet."""
         end = self.known_end(other)
-        return self.party._replace(until=None if math.isinf(end) else int(end))
+        one = self.party
+        return Party(one.arc, one.name, one.priority, one.who, None if math.isinf(end) else int(end))
 
     def past_min_runtime(self, now: Ns) -> bool:
         """True when a kept hold has had its minimum runtime: equal priority may preempt it then."""
@@ -266,8 +268,7 @@ def union(masks: Iterable[int]) -> int:
 # Events: each carries everything the core may know about it
 
 
-@dataclass(frozen=True, slots=True)
-class Requested:
+class Requested(Struct, frozen=True):
     """A program requests an ARC. `place` is set when it had one under an earlier RCM; `since` is then when it
     was last queued, on the core's clock, if that is known."""
 
@@ -276,24 +277,21 @@ class Requested:
     since: Ns | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Cancelled:
+class Cancelled(Struct, frozen=True):
     """The ARC is not wanted any more, whether it waits or runs."""
 
     arc: ArcId
     by: str = "its client"
 
 
-@dataclass(frozen=True, slots=True)
-class Released:
+class Released(Struct, frozen=True):
     """A running ARC gives back what it holds; a waiting one leaves the queue."""
 
     arc: ArcId
     by: str = "its client"
 
 
-@dataclass(frozen=True, slots=True)
-class Vote:
+class Vote(Struct, frozen=True):
     """A sharable RC's answer to a proposal."""
 
     proposal: int
@@ -301,23 +299,20 @@ class Vote:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class VoteOverdue:
+class VoteOverdue(Struct, frozen=True):
     """No answer to a proposal in time, or it could not be delivered."""
 
     proposal: int
 
 
-@dataclass(frozen=True, slots=True)
-class RcJoined:
+class RcJoined(Struct, frozen=True):
     """An RC is there and can be granted."""
 
     rc: RcName
     sharable: bool
 
 
-@dataclass(frozen=True, slots=True)
-class RcReported:
+class RcReported(Struct, frozen=True):
     """An RC reports that holds ended there, or that the rules it votes by have changed."""
 
     rc: RcName
@@ -325,8 +320,7 @@ class RcReported:
     rules_changed: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class RcLost:
+class RcLost(Struct, frozen=True):
     """An RC is gone, or can't carry its holders any longer; `why`, if that is known, stands in the reason of whoever
     waits for it."""
 
@@ -335,24 +329,21 @@ class RcLost:
     why: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ClientLost:
+class ClientLost(Struct, frozen=True):
     """A program is gone: what it holds is free and what it asked for is forgotten."""
 
     client: ClientId
     reason: str = "its client left the mesh"
 
 
-@dataclass(frozen=True, slots=True)
-class PlaceShown:
+class PlaceShown(Struct, frozen=True):
     """A client shows the place that its ARC was given before; it has entered without."""
 
     arc: ArcId
     place: Place
 
 
-@dataclass(frozen=True, slots=True)
-class Unconfirmed:
+class Unconfirmed(Struct, frozen=True):
     """A client could not confirm a grant: these RCs know nothing of it, or do not answer."""
 
     arc: ArcId
@@ -360,15 +351,13 @@ class Unconfirmed:
     rcs: tuple[RcName, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Reachable:
+class Reachable(Struct, frozen=True):
     """One of the RCs that a client could not confirm a grant with has shown itself to it anew."""
 
     arc: ArcId
 
 
-@dataclass(frozen=True, slots=True)
-class HandedOver:
+class HandedOver(Struct, frozen=True):
     """An ARC goes on in another client (migration), by the name `renamed`: same place; if it runs, same RCs,
     same end, new grant."""
 
@@ -377,8 +366,7 @@ class HandedOver:
     renamed: ArcId
 
 
-@dataclass(frozen=True, slots=True)
-class RecoveredHold:
+class RecoveredHold(Struct, frozen=True):
     """A hold that was in force when an RCM took the lead: its grant is kept, `end` is on the core's clock."""
 
     request: ArcRequest
@@ -386,7 +374,7 @@ class RecoveredHold:
     grant: Grant
     start: Ns
     end: Ns
-    bound: Mapping[Need, RcName] = field(default_factory=dict)
+    bound: Mapping[Need, RcName] = {}
     """By each pattern of its needs: the RC that it holds."""
 
     def __post_init__(self) -> None:
@@ -399,8 +387,7 @@ class RecoveredHold:
         return [self.bound.get(need, need) for need in self.request.needs]
 
 
-@dataclass(frozen=True, slots=True)
-class LeadTaken:
+class LeadTaken(Struct, frozen=True):
     """This RCM leads from now on, in `term`, over the holds and the queue that it recovered."""
 
     term: Term
@@ -408,16 +395,14 @@ class LeadTaken:
     waiting: tuple[Requested, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Adopted:
+class Adopted(Struct, frozen=True):
     """RCs have joined with a hold of an earlier term, which goes on if all of its gang have, unless this RCM has ended
     it, or its ARC holds something newer."""
 
     held: RecoveredHold
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(Struct, frozen=True):
     """Time has passed: holds may be over, the quantum may be."""
 
 
@@ -461,8 +446,7 @@ class Outcome(StrEnum):
     """It goes on in another client, under a new grant."""
 
 
-@dataclass(frozen=True, slots=True)
-class Propose:
+class Propose(Struct, frozen=True):
     """Ask a sharable RC whether it would carry exactly these holders, by ARC, with their parameters."""
 
     proposal: int
@@ -470,8 +454,7 @@ class Propose:
     holders: Mapping[ArcId, Params]
 
 
-@dataclass(frozen=True, slots=True)
-class Granted:
+class Granted(Struct, frozen=True):
     """All of `rcs` are the ARC's until `end`; None where it may keep them past its minimum runtime."""
 
     arc: ArcId
@@ -482,8 +465,7 @@ class Granted:
     end: Ns | None
 
 
-@dataclass(frozen=True, slots=True)
-class HoldEnded:
+class HoldEnded(Struct, frozen=True):
     """A hold is over. `requeued` says whether its ARC waits again; `by` is the ARC it was taken for."""
 
     arc: ArcId
@@ -496,8 +478,7 @@ class HoldEnded:
     by: ArcId | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Queued:
+class Queued(Struct, frozen=True):
     """The ARC waits, for this reason; sent at the first wait and when the reason changes.
 
     `settled` is False while the RCM itself is still asking votes, so that the answer is near."""
@@ -508,8 +489,7 @@ class Queued:
     settled: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class Dropped:
+class Dropped(Struct, frozen=True):
     """A waiting ARC left the queue without having run."""
 
     arc: ArcId
@@ -518,8 +498,7 @@ class Dropped:
     reason: Reason
 
 
-@dataclass(frozen=True, slots=True)
-class WakeAt:
+class WakeAt(Struct, frozen=True):
     """Send a `Tick` at this time, or earlier; a later effect replaces it. None: nothing to wait for."""
 
     at: Ns | None
@@ -531,8 +510,7 @@ Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | WakeAt
 # The state after the last batch of events
 
 
-@dataclass(frozen=True, slots=True)
-class ArcStatus:
+class ArcStatus(Struct, frozen=True):
     """One ARC that is queued (`hold is None`) or runs."""
 
     request: ArcRequest
@@ -561,8 +539,7 @@ class ArcStatus:
         return self.request.name
 
 
-@dataclass(frozen=True, slots=True)
-class RcStatus:
+class RcStatus(Struct, frozen=True):
     """One RC; `holders` in the order in which they came to hold it."""
 
     name: RcName
@@ -571,8 +548,7 @@ class RcStatus:
     holders: tuple[ArcId, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
+class Status(Struct, frozen=True):
     """The whole fleet: who runs, in the order in which they started; who is queued, best rank first and
     perhaps not all of the `waiting`; the RCs by name."""
 

@@ -41,7 +41,7 @@ An ARC with patterns is always checked, unless an RC that it names keeps it out.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Final, Literal, TypeAlias
@@ -229,8 +229,8 @@ VOTING: Final = Reason(ReasonCode.VOTING)
 MAX_BINDINGS: Final = 16
 """Bindings that one check tries."""
 MAX_REPORTED: Final = 4
-"""To how many of an RC's watchers a new holder is reported at once; for the others `Core.arc` has it. In a
-long queue every grant would else be reported to every ARC."""
+"""To how many of an RC's watchers a new holder is reported; for the others `Core.arc` has it. In a long queue every
+grant would else be reported to every ARC."""
 
 _Verdict: TypeAlias = Inadmissible | VotesNeeded | Admissible | RcQuota | Literal["off limits", "over quota"]
 
@@ -254,6 +254,17 @@ def run_pass(
     Pass(state, actions, reserved).run(state.index.ready.values(), off_limits)
 
 
+def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
+    """Why those wait who watch an RC that has been taken by another since this was asked last: the best MAX_REPORTED of
+    each such RC. No pass computes that, as most is out of date before anybody reads it."""
+    retold, state.index.retold = state.index.retold & state.index.watched, 0
+    for rc in state.rcs_in(retold):
+        for rank in rc.watchers[:MAX_REPORTED]:
+            arc = state.queued[rank[-1]]
+            if (obstacle := AdmissionCheck(state, arc).obstacle(0)) is not None:
+                yield arc, obstacle.reason
+
+
 class Pass:
     """Checks in rank order the ready ARCs, and the watchers of RCs that have been freed."""
 
@@ -265,8 +276,8 @@ class Pass:
         """Bits of the RCs at which something is new since the last pass began."""
         self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
         """The next ARCs to check, beside the ready ones; the watchers of an RC one after the other."""
-        self._reports_left: dict[int, int] = {}
-        """By bit of each RC whose watchers come: to how many more of them a new holder is reported."""
+        self._walked: set[int] = set()
+        """Bits of the RCs whose watchers come."""
         self._changed_here = 0
         """Bits of the RCs at which this pass itself has changed something."""
 
@@ -451,9 +462,8 @@ class Pass:
     def _call_concerned(self, watched: int, touched: int, rank: Rank | None) -> None:
         index = self.index
         for rc in self.state.rcs_in(watched & index.watched):
-            known = rc.bit in self._reports_left
-            self._reports_left[rc.bit] = MAX_REPORTED
-            if not known:
+            if rc.bit not in self._walked:
+                self._walked.add(rc.bit)
                 self._call_next_watcher(rc, rank)
         for arc in [arc for arc in index.parked.values() if (arc.footprint or 0) & touched]:
             if rank is None or arc.rank > rank:
@@ -464,17 +474,15 @@ class Pass:
         """The next watcher of `rc` below `rank` comes."""
         following = self.state.next_watcher(rc, rank)
         if following is None:
-            del self._reports_left[rc.bit]
+            self._walked.discard(rc.bit)
         else:
             heapq.heappush(self._heap, following)
 
     def _needs_check(self, rc: Rc, arc: Arc) -> bool:
-        """False ends the walk along the watchers of `rc`: it is held again, nobody from `arc` downwards may preempt its
-        holder, and MAX_REPORTED of them have been told."""
+        """False ends the walk along the watchers of `rc`: it is held again, and nobody from `arc` downwards may preempt
+        its holder. What they wait for now is told later, to who reads it (`reasons_of_now`)."""
         if rc.sharable or rc.bit & self.off_limits or not rc.non_preemptible_holders(arc, self.state.now):
             return True
-        if not self._reports_left[rc.bit]:
-            del self._reports_left[rc.bit]
-            return False
-        self._reports_left[rc.bit] -= 1
-        return True
+        self._walked.discard(rc.bit)
+        self.index.retold |= rc.bit
+        return False

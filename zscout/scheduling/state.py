@@ -9,7 +9,6 @@ import heapq
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import replace
 from operator import itemgetter
 from types import MappingProxyType
 from typing import Protocol
@@ -47,6 +46,8 @@ class QueueIndex:
         """Bits of the RCs whose watchers may have become possible since the last pass."""
         self.touched = 0
         """Bits of the RCs at which something else has changed: it concerns all but watchers."""
+        self.retold = 0
+        """Bits of the RCs that have been taken by another, which their watchers have not been told."""
         self.ranks: list[Rank] = []
         """Of all that are queued, best first."""
         self._not_starving: list[tuple[Ns, ArcId]] = []
@@ -238,6 +239,20 @@ class SchedulerState:
         self.index.freed |= rc.bit
         self.version += 1
 
+    def is_free(self, arc: Arc) -> bool:
+        """Whether a new ARC finds all that it needs there, exclusive and free, and nobody waits: the usual case where
+        nothing is scarce. Who is bound by a quota or a pattern is not looked at so closely."""
+        if self.queued or self.held_back or arc.patterns or arc.place in self._at_place:
+            return False
+        bound = self.policy.max_running_per_host is not None or self.policy.rc_quotas
+        return not bound and not arc.mask & ~self.present and not arc.mask & (self.busy | self.sharable)
+
+    def enter(self, arc: Arc) -> None:
+        """A new ARC is started without having been queued."""
+        arc.rcs = tuple(self.rcs_in(arc.mask))
+        self._know(arc)
+        self._at_place[arc.place] = arc
+
     def enqueue(self, arc: Arc, since: Ns) -> None:
         arc.since, arc.entry = since, self._next_entry()
         arc.rcs = arc.rcs or tuple(self.rcs_in(arc.mask))
@@ -343,10 +358,11 @@ class SchedulerState:
         who = arc.request.who
         if who is not None and who.host:
             who = structs.replace(who, host="")  # it is the new client's
-        arc.take(replace(arc.request, arc=name, client=client, who=who))
+        arc.take(structs.replace(arc.request, arc=name, client=client, who=who))
 
     def start(self, arc: Arc, hold: Hold) -> None:
-        self.dequeue(arc)
+        if arc.state is not ArcState.NEW:
+            self.dequeue(arc)
         arc.move_to(ArcState.RUNNING)
         arc.hold, arc.reason, arc.since, arc.entry = hold, None, self.now, self._next_entry()
         self._add_running(arc)
@@ -433,8 +449,8 @@ class SchedulerState:
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
         self.version += 1
-        self.running_by_owner[arc.owner] += 1
-        self.held_by_owner[arc.owner] += len(arc.rcs)
+        self.running_by_owner[arc.owner] = self.running_by_owner.get(arc.owner, 0) + 1
+        self.held_by_owner[arc.owner] = self.held_by_owner.get(arc.owner, 0) + len(arc.rcs)
         for rc in arc.rcs:
             rc.holders[arc.id] = arc
 

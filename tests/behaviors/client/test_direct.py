@@ -36,7 +36,7 @@ async def entered_after(client: Client, name: str, **how: Any) -> float:
     """Seconds from asking for RC to entering."""
     asked = client.mesh.now()
     arc = await client.request(name, {RC: {}}, **{"min_runtime": 600, **how})
-    assert await client.granted(arc) is not None
+    assert await client.granted(arc, confirmed=True) is not None
     return (client.mesh.now() - asked) / SECOND
 
 
@@ -164,7 +164,7 @@ def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_runtime
             arc = await two.request("second", {RC: {}}, priority=1, min_runtime=2, keep=keep)
             first_grant, place = arc.grant, arc.place
             asked = two.mesh.now()
-            entering = asyncio.create_task(two.granted(arc))
+            entering = asyncio.create_task(two.granted(arc, confirmed=True))
             if keep:
                 # Past its minimum runtime another of its priority takes it, which could not enter either.
                 await asyncio.sleep(2.5)

@@ -11,11 +11,15 @@ from tests.behaviors.client.small_fleet import FLEET, RC, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.arc import Revoked, hold, holds
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.client.direct import DEFAULT_SETTLE
+from zscout.behaviors.client.direct import DEFAULT_SETTLE, DirectHold
 from zscout.types import SECOND
 
 PARKS = 3.0
 """Seconds that a body clears up."""
+
+
+def direct_of(client: Client) -> list[DirectHold]:
+    return list(client._confirmations._direct.values())
 
 
 async def park(client: Client, said: list[str]) -> None:
@@ -39,7 +43,7 @@ def test_the_next_holder_waits_until_a_preempted_body_has_cleared_up() -> None:
             body = asyncio.create_task(park(low, said))
             await until(lambda: said)
             asked = high.mesh.now()
-            async with hold(high, "high", {RC: {}}, priority=5, min_runtime=60):
+            async with hold(high, "high", {RC: {}}, priority=5, min_runtime=60, confirmed=True):
                 said.append("high in")
             with pytest.raises(Revoked):
                 await body
@@ -72,7 +76,7 @@ def test_a_body_that_clears_up_for_too_long_is_interrupted_before_the_next_holde
             await until(lambda: body.done())
             assert 0.8 * DEFAULT_SETTLE < low.mesh.now() - asked < DEFAULT_SETTLE
             assert isinstance(body.exception(), Revoked)
-            assert await high.granted(taker) is not None
+            assert await high.granted(taker, confirmed=True) is not None
             assert said == ["low in", "low out"]
 
     run(test())
@@ -94,7 +98,7 @@ def test_a_body_that_has_had_its_time_clears_up_before_the_next_one_begins() -> 
 
             body = asyncio.create_task(first())
             await until(lambda: said)
-            async with hold(high, "high", {RC: {}}, min_runtime=60):
+            async with hold(high, "high", {RC: {}}, min_runtime=60, confirmed=True):
                 said.append("high in")
             await body
             assert said == ["low in", "low parked", "high in"]
@@ -119,7 +123,7 @@ def test_a_body_that_is_entered_again_has_left_before() -> None:
 
             body = asyncio.create_task(work())
             await until(lambda: said)
-            async with hold(high, "high", {RC: {}}, priority=5, min_runtime=60):
+            async with hold(high, "high", {RC: {}}, priority=5, min_runtime=60, confirmed=True):
                 assert said == ["in", "out"]
             await body
             assert said == ["in", "out", "in", "out"]
@@ -134,12 +138,12 @@ def test_a_body_that_is_cancelled_from_outside_while_it_clears_up_ends_so() -> N
             body = asyncio.create_task(park(low, said))
             await until(lambda: said)
             taker = await high.request("high", {RC: {}}, priority=5, min_runtime=60)
-            await until(lambda: low._direct and all(one.over for one in low._direct.values()))
+            await until(lambda: direct_of(low) and all(one.over for one in direct_of(low)))
             await asyncio.sleep(PARKS / 4)
             body.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await body
-            assert await high.granted(taker) is not None
+            assert await high.granted(taker, confirmed=True) is not None
 
     run(test())
 

@@ -9,7 +9,8 @@ import pytest
 
 from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, small_fleet
 from tests.mesh.kit import run, until
-from zscout.behaviors.client.client import CONFIRM_TIMEOUT, CommandRefused
+from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
+from zscout.behaviors.client.request import CommandRefused
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh, MemoryTransport
 from zscout.scheduling.model import HOLD_BACK
@@ -42,7 +43,7 @@ def test_a_client_that_sees_its_rc_anew_is_granted_at_once(cut: float) -> None:
             for source, target in ((client, rc), (rc, client)):
                 network.cut(source, target)
             arc = await one.request("first", {RC: {}}, min_runtime=600)
-            granting = asyncio.create_task(one.granted(arc))
+            granting = asyncio.create_task(one.granted(arc, confirmed=True))
             await asyncio.sleep(cut)
             assert not granting.done()
             network.heal()

@@ -22,7 +22,7 @@ from zscout.config.fleet import default_fleet
 from zscout.keyexpr import BadName, Keys, Sender
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.renewal import Suspicions
-from zscout.messages import Amounts, Notice, OpenRequest, Problem, ReasonInfo
+from zscout.messages import Amounts, Done, Notice, OpenRequest, Problem, ReasonInfo
 from zscout.types import SECOND, Grant, Ns, Place, Term
 
 OLD, TERM = Term(1, "zz"), Term(2, "aa")
@@ -259,13 +259,15 @@ def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(answers: l
     async def story() -> None:
         client = Client(mesh(lambda: NOW), default_fleet())
         known = arc("robot/a")
+        client._store.add(known)
         known.take(runs({}), NOW)
         ended: list[OpenArc] = []
         asked: list[Any] = []
 
-        async def command(rc: str, *_: Any, **__: Any) -> None:
+        async def command(rc: str, *_: Any, **__: Any) -> Done:
             if (code := answers.pop(0)) is not None:
                 raise CommandRefused(rc, Problem(code, code))
+            return Done()
 
         async def end(given_up: OpenArc) -> None:
             ended.append(given_up)
@@ -275,15 +277,17 @@ def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(answers: l
             ask = again.ask(NOW)
             asked.append((ask.grant, ask.unconfirmed))
             again.take(runs({}, 3, SECOND_GRANT), NOW)
+            client._store.notify(again)
             assert again.ask(NOW).unconfirmed == []
 
-        client.command, client.end, client._rcm.submit = command, end, submit  # type: ignore[assignment,method-assign]
+        client._confirmations._command = command
+        client.end, client._rcm.submit = end, submit  # type: ignore[assignment,method-assign]
         if told == "failed":
             with pytest.raises(CommandRefused, match="failed"):
-                await client.granted(known)
+                await client.granted(known, confirmed=True)
             assert (ended, asked) == ([known], [])
         else:
-            assert await client.granted(known) == (FIRST if told is None else SECOND_GRANT)
+            assert await client.granted(known, confirmed=True) == (FIRST if told is None else SECOND_GRANT)
             assert (ended, asked) == ([], [] if told is None else [told])
         assert answers == []
 
@@ -297,12 +301,13 @@ def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> N
         known.take(runs({}), client.mesh.now())
         linked = loop.time() + 0.99
 
-        async def command(rc: str, *_: Any, **__: Any) -> None:
+        async def command(rc: str, *_: Any, **__: Any) -> Done:
             if loop.time() < linked:
                 raise CommandRefused(rc, Problem("unknown", "no answer, at once"))
+            return Done()
 
-        client.command = command  # type: ignore[assignment,method-assign]
-        assert await client.granted(known) == FIRST
+        client._confirmations._command = command
+        assert await client.granted(known, confirmed=True) == FIRST
 
     kit.run(story())
 
@@ -313,17 +318,18 @@ def test_a_client_that_stood_still_itself_gives_its_rcs_a_second_all_the_same() 
         client, known = Client(mesh(lambda: round((loop.time() + still) * SECOND)), default_fleet()), arc()
         known.take(runs({}), client.mesh.now())
 
-        async def command(rc: str, *_: Any, **__: Any) -> None:
+        async def command(rc: str, *_: Any, **__: Any) -> Done:
             nonlocal still
             if not still:
                 still = 2.0
                 raise CommandRefused(rc, Problem("unknown", "no answer"))
             if loop.time() < wakes:
                 raise CommandRefused(rc, Problem("stale", "it stood still as well"))
+            return Done()
 
         wakes = loop.time() + 0.3
-        client.command = command  # type: ignore[assignment,method-assign]
-        assert await client.granted(known) == FIRST
+        client._confirmations._command = command
+        assert await client.granted(known, confirmed=True) == FIRST
 
     kit.run(story())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -46,7 +47,10 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
     assert started.stdout.splitlines()[-1] == "counter runs on anvil"
     fleet.state(lambda state: [hold.arc for hold in state.holds] == ["counter"])
 
-    (one,) = listed(fleet)
+    # What it needs is measured a little later.
+    until = time.monotonic() + HANG
+    while (one := listed(fleet)[0])["memory"] is None and time.monotonic() < until:
+        pass
     assert (one["component"], one["state"], one["host"], one["movable"]) == ("counter", "running", "anvil", True)
     assert one["spec"]["kind"] == "counter"
     assert one["spec"]["params"] == {"period": 0.1, "rc": "robot/a"}

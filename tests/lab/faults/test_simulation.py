@@ -23,7 +23,6 @@ MISSED = {
     "safe first": 1,
     "snapshots": 14,
     "step down": 1,
-    "away": 404,
     "reopen": 3,
     "places": 2,
     "withdrawn": 222,

@@ -21,6 +21,7 @@ from zscout.mesh.supervision import StallWatch
 from zscout.messages import LAST_TERMS, Grants, Notice, OpenRequest, RcAsk, RcState, Release
 from zscout.services.rcm import candidate as candidate_module
 from zscout.services.rcm.candidate import BACKOFF, MAX_BACKOFF, Candidate
+from zscout.services.rcm.election import SETTLE
 from zscout.types import NO_TERM, SECOND, Term
 
 
@@ -295,7 +296,7 @@ def test_of_two_that_stand_at_once_one_leads_and_the_other_leaves_it_alone(monke
         names = itertools.chain(["1", "2", "x"], map(str, itertools.count(3)))
         monkeypatch.setattr(candidate_module, "new_instance", names.__next__)
         first = fleet.candidate("h2")
-        await asyncio.sleep(0.48)
+        await asyncio.sleep(SETTLE / SECOND + 0.03)
         second = fleet.candidate("h1")
         await until(lambda: any(one.promise for one in late.asked))
         # The first waits for this promise; the second waits for nobody.

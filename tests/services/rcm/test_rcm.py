@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 
 import msgspec
 import pytest
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, grant_of
+from zscout.config.access import AccessPolicy, Quota, Roles
 from zscout.messages import Cancel, EndedHold, HandOver, Release
 from zscout.scheduling.model import Adopted, ArcRequest, RcJoined, RecoveredHold
 from zscout.types import SECOND, Grant, Place, Term
 
 
-def test_a_grant_is_published_then_the_loser_is_told_then_the_asker_is_answered() -> None:
+def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_the_way() -> None:
     async def story() -> None:
         fleet = FakeFleet()
         fleet.rcm()
@@ -328,6 +330,43 @@ def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it_ended
     run(story())
 
 
+def test_who_waited_is_told_of_its_grant_before_the_rcs_are() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"))
+        holder, waiter = fleet.client("holder"), fleet.client("waiter")
+        await holder.ask("first", "robot/a")
+        await waiter.ask("next", "robot/a")
+        fleet.log.clear()
+        await holder.do(Release("first"))
+        assert fleet.log == [
+            ("waiter", "notice", "next running"),
+            ("all", "grants", "robot/a"),
+            ("holder", "answer", "first ended"),
+        ]
+
+    run(story())
+
+
+def test_who_is_preempted_and_granted_in_one_instant_is_told_in_that_order() -> None:
+    async def story() -> None:
+        fleet = FakeFleet()
+        fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"), fleet.rc("robot/b"))
+        client, operator = fleet.client("any"), fleet.client("operator")
+        first = (await client.ask("any", "robot/*")).rcs
+        await operator.ask("drive", *first, priority=10)
+        await until(lambda: len(client.notices) >= 2)
+        assert [(notice.state, notice.outcome, notice.rcs) for notice in client.notices[:2]] == [
+            ("queued", "preempted", first),
+            ("running", None, ["robot/a" if first == ["robot/b"] else "robot/b"]),
+        ]
+        assert client.notices[0].step < client.notices[1].step
+
+    run(story())
+
+
 def test_rcs_settle_unless_the_client_says_that_its_program_is_gone() -> None:
     """One that started anew under its name gives back what it knows nothing of: a program of that may run yet."""
 
@@ -366,5 +405,25 @@ def test_a_hand_over_needs_room_at_the_new_client_and_on_its_host() -> None:
         # Among the programs of one host nothing is added to what it has.
         await old.ask("f", "robot/a")
         await old.do(HandOver("b", fleet.client("next").name))
+
+    run(story())
+
+
+def test_an_arc_that_is_open_at_its_new_client_already_counts_once_against_a_quota() -> None:
+    """A hand-over is repeated so where the RCM changed, and the new client asked before the old one did."""
+
+    async def story() -> None:
+        fleet = FakeFleet()
+        access = AccessPolicy(roles=Roles(client=("desk", "h2")), quotas={"h2": Quota(arcs=1, rcs=1)})
+        fleet.fleet = msgspec.structs.replace(fleet.fleet, security=Path("keys"), access=access)
+        fleet.rcm()
+        await fleet.joined(fleet.rc("robot/a"), fleet.rc("robot/b"))
+        old, new = fleet.client("old"), fleet.client("new", "h2")
+        await old.ask("a", "robot/a")
+        assert (await new.ask("a", "robot/a")).state == "queued"
+        assert (await old.do(HandOver("a", new.name))).client == new.name
+        await old.ask("b", "robot/b")
+        with pytest.raises(Refusal, match="not_allowed: h2 may have 1 ARCs open, and would have more"):
+            await old.do(HandOver("b", new.name))
 
     run(story())

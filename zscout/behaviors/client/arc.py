@@ -16,8 +16,13 @@ out, and `held.completed` is true). `holds` asks again, and goes again when it i
 A need may be a pattern, which any one RC meets: with `{"framegrabber/*": {}}` as needs,
 `held.rc("framegrabber/*")` is the one that was given, and `held.command("framegrabber/*", ...)` goes to it.
 
-A body that touches devices past their RCs says `direct=True`. When its hold ends it is cancelled, and its `finally` and
-`except CancelledError` run to their end, in at most nine tenths of what its RCs settle; the next holder waits for that.
+The body begins at the grant. Whether its RCs know of it is seen to beside: one that does not confirm it within a second
+ends the body, and what is commanded meanwhile waits at the RC for as long as its `ttl`. A body that needs its devices
+ready from the first line on says `confirmed=True`, or awaits `held.confirmed()`.
+
+A body that touches devices past their RCs says `direct=True`. It begins when all have confirmed. When its hold ends it
+is cancelled, and its `finally` and `except CancelledError` run to their end, in at most nine tenths of what its RCs
+settle; the next holder waits for that.
 """
 
 from __future__ import annotations
@@ -89,8 +94,17 @@ class Held:
     def completed(self) -> bool:
         """Whether the hold is over because it had its time: its minimum runtime, and with `keep` somebody waited."""
         if self.active:
-            return not self.arc.keep and self.remaining <= 0
+            return not self.arc.keep and self.remaining <= 0 and not self.settling
         return self.arc.outcome == "completed"
+
+    @property
+    def settling(self) -> bool:
+        """Whether some of its RCs still settle. If that lasts until its time is over, it is asked for once more."""
+        return self.arc.settling == self.grant
+
+    async def confirmed(self) -> bool:
+        """Waits until all RCs have confirmed this hold, which they do once they have settled. False: it is over."""
+        return self.active and await self._client.confirmed(self.arc) and self.active
 
     async def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
         """Has one of the held RCs do something: the one of this name, or that meets this pattern.
@@ -108,7 +122,7 @@ class Held:
         # A timer may go off a little before its time by this host's clock.
         while self.active and not self.completed:
             with suppress(TimeoutError):
-                async with asyncio.timeout(None if self.arc.keep else self.remaining):
+                async with asyncio.timeout(None if self.arc.keep or self.settling else self.remaining):
                     await self._client.changed(self.arc)
 
 
@@ -117,12 +131,19 @@ class Attempt:
     once more, and one that was kept and had its time be asked for anew. `timeout` in seconds, for each wait."""
 
     def __init__(
-        self, client: Client, ask: dict[str, Any], *, again: bool = False, timeout: float | None = None
+        self,
+        client: Client,
+        ask: dict[str, Any],
+        *,
+        again: bool = False,
+        timeout: float | None = None,
+        confirmed: bool = False,
     ) -> None:
         for what, value in (("timeout", timeout), ("min_runtime", ask["min_runtime"])):
             if value is not None:
                 check_seconds(what, value)
         self._client, self._ask, self._again, self._timeout = client, ask, again, timeout
+        self._confirmed = confirmed
         self.arc: OpenArc | None = None
         self._anew = False
         """Whether what was kept is to be asked for anew."""
@@ -144,7 +165,7 @@ class Attempt:
             async with asyncio.timeout(self._timeout):
                 if self.arc is None:
                     self.arc = await self._client.request(**self._ask)
-                grant = await self._client.granted(self.arc)
+                grant = await self._client.granted(self.arc, confirmed=self._confirmed)
         except (asyncio.CancelledError, TimeoutError) as error:
             why = self.arc.reason if self.arc is not None else "no RCM has answered"
             if self.arc is not None:
@@ -228,16 +249,18 @@ def hold(
     min_runtime: float | Decimal | None = None,
     keep: bool = True,
     direct: bool = False,
+    confirmed: bool = False,
     timeout: float | None = None,
     comment: str = "",
     wait_for_device: bool | None = None,
 ) -> Attempt:
-    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's; the
-    `comment` is shown to others; `wait_for_device` as `Client.request` has it.
+    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's;
+    `confirmed`: it is entered when all RCs have confirmed the grant; the `comment` is shown to others;
+    `wait_for_device` as `Client.request` has it.
 
     Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
     ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device)
-    return Attempt(client, ask, timeout=timeout)
+    return Attempt(client, ask, timeout=timeout, confirmed=confirmed)
 
 
 async def holds(
@@ -249,13 +272,14 @@ async def holds(
     min_runtime: float | Decimal | None = None,
     keep: bool = True,
     direct: bool = False,
+    confirmed: bool = False,
     comment: str = "",
     wait_for_device: bool | None = None,
 ) -> AsyncIterator[Attempt]:
     """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
     without `keep` has had its time."""
     ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device)
-    attempt = Attempt(client, ask, again=True)
+    attempt = Attempt(client, ask, again=True, confirmed=confirmed)
     yield attempt
     while attempt.goes_on:
         yield attempt

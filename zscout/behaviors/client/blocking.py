@@ -56,7 +56,7 @@ class BlockingHeld:
     @property
     def active(self) -> bool:
         """Whether the hold is still in force, as far as this client knows."""
-        return self._held.active and (self._held.arc.keep or self._held.remaining > 0)
+        return self._held.active and not self._held.completed
 
     @property
     def completed(self) -> bool:
@@ -248,6 +248,7 @@ class Lab:
         min_runtime: float | None = None,
         keep: bool = True,
         direct: bool = False,
+        confirmed: bool = False,
         timeout: float | None = None,
         interrupt: bool = True,
         comment: str = "",
@@ -261,6 +262,9 @@ class Lab:
         taken away before, `Revoked` is raised in a body in the main thread, unless `interrupt` is false: its `outcome`
         is `completed` where it had its time.
 
+        With `confirmed` it is entered when all RCs have confirmed the grant: until then one may be made ready yet, and
+        a command to it waits for as long as its `ttl`.
+
         A body that touches devices past their RCs says `direct`: they settle until it has been left, in at most nine
         tenths of their `settle`; the next holder waits for that, and Revoked is raised once more in who takes longer.
 
@@ -269,8 +273,7 @@ class Lab:
         Entering raises TimeoutError, RequestRefused, Revoked where others ended the request, and NoRcm where none is
         seen within 3 s. Leaving raises Revoked where the hold was taken away and the body has not been told."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
-        how |= {"comment": comment, "direct": direct}
-        how["wait_for_device"] = wait_for_device
+        how |= {"comment": comment, "direct": direct, "confirmed": confirmed, "wait_for_device": wait_for_device}
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
     def _stop(self) -> None:

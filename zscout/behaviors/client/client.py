@@ -15,10 +15,11 @@ from typing import Any, Final, Generic, Self, TypeVar
 from msgspec.structs import replace
 
 from zscout import messages
+from zscout.behaviors.client.confirmation import NOT_DONE, NOT_HELD, Confirmations
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.identity import checked_comment, this_program
-from zscout.behaviors.client.rcm_link import BACKOFF, QUERY_TIMEOUT, TRY_AGAIN
+from zscout.behaviors.client.rcm_link import QUERY_TIMEOUT, TRY_AGAIN
 from zscout.behaviors.client.request import (
     CommandRefused,
     Needs,
@@ -33,7 +34,6 @@ from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Declaration, Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
-from zscout.mesh.renewal import PATIENCE
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import Done, Foresight, Notice, Problem, RcmState, Who
 from zscout.types import SECOND, Grant, Ns, Term
@@ -47,24 +47,8 @@ LOOK_FOR_RCM: Final = 3.0
 LOOK_FOR_TAKEOVER: Final = 5.0
 """The same where a candidate is seen."""
 MAX_NAMED: Final = 5
-UNREACHED = 10.0
-"""Seconds for which an RC may be granted that this client neither sees nor reaches."""
-CONFIRM_TIMEOUT = 1.0
-"""Seconds within which all RCs of a grant must have confirmed it."""
-SETTLING: Final = "settling"
-"""What an RC answers while the program of its last holder may still touch its device, or that is made ready."""
 LAST_WORD: Final = 0.5
 """Seconds at most for which a client that closes tells RCs that its programs are gone."""
-LOOK_AGAIN: Final = 0.1
-"""Seconds between two questions whether it has settled."""
-CONFIRM_AGAIN = frozenset({"not_yet", "stale", "busy", "unknown"})
-"""Refusals that do not end a hold: an RC may hear of a grant later than its holder, or just after a stall."""
-NOT_HELD = frozenset({"ended", "free", "not_holder"})
-"""What an RC answers to a command under a hold that is over."""
-NOT_CONFIRMED = CONFIRM_AGAIN | NOT_HELD | {"wrong_client"}
-"""Refusals after which an ARC is queued again; others concern whoever asked for it."""
-HELD_BACK = 30.0
-"""Seconds for which an RCM does not grant again what was not confirmed, at most."""
 TOLD_WITHIN = 1.0
 """Seconds within which a notice says so too; else the RC is believed."""
 RENEW_TOKEN: Final[Ns] = SECOND // 2
@@ -89,9 +73,15 @@ class Client(MovableClient):
         """When the present token was declared."""
         self._denied: set[Grant] = set()
         """Grants that an RC says are over, and no notice yet."""
-        self._direct: dict[Grant, DirectHold] = {}
-        """Holds of direct requests, until their programs are gone."""
-        self._store.watchers.append(self._look_at_direct)
+        self._confirmations = Confirmations(
+            mesh,
+            fleet,
+            self._store,
+            self._rcm,
+            self._supervisor,
+            self._command,
+            lambda arc: self._supervisor.spawn(self._ask_again(arc)),
+        )
         self.waits_for_devices = False
         """Whether its requests wait for what nobody knows, instead of being refused, if they do not say."""
 
@@ -157,7 +147,7 @@ class Client(MovableClient):
                 self._may_end.set()
                 await self._supervisor.close()
                 await asyncio.gather(*(self.end(arc) for arc in self._store.open))
-                if telling := [task for direct in self._direct.values() for task in direct.telling]:
+                if telling := self._confirmations.telling:
                     await asyncio.wait(telling, timeout=LAST_WORD)
         finally:
             await self.leave()
@@ -174,7 +164,7 @@ class Client(MovableClient):
         try:
             await self._supervisor.close()
         finally:
-            for telling in [task for direct in self._direct.values() for task in direct.telling]:
+            for telling in self._confirmations.telling:
                 telling.cancel()
             for declared in (*filter(None, [self._token]), *reversed(self._declared)):
                 declared.close()
@@ -288,172 +278,44 @@ class Client(MovableClient):
         """Waits until there is news of `arc`."""
         await self._store.changed(arc)
 
-    async def granted(self, arc: OpenArc) -> Grant | None:
-        """Waits until `arc` is granted and all its RCs have confirmed it, which they do once they have settled; None if
-        it ended instead.
+    async def granted(self, arc: OpenArc, *, confirmed: bool = False) -> Grant | None:
+        """Waits until `arc` is granted; None if it ended instead. Its RCs are asked beside whether they know of it, and
+        if not, it is taken away again: `arc` has no grant then, and waits for another one.
+
+        With `confirmed`, and for a direct request, it waits until all RCs have confirmed it, which they do once they
+        have settled; raises CommandRefused where one refuses it for a reason that waiting does not mend.
 
         Nothing is entered while the client is paused, nor is what it hands over reported as ended."""
         while True:
             await self._store.resumed.wait()
             if not arc.open:
                 return None
-            if arc.state == "running" and arc.grant is not None:
-                grant = arc.grant
-                if grant == arc.left:
-                    # Its RCs have been told that its program leaves, whatever a new RCM has found.
-                    over = Problem("ended", "its program was told to leave")
-                    refusals = [CommandRefused(rc, over) for rc in arc.rcs]
-                else:
-                    refusals = await self._confirm(arc, grant)
-                if arc.grant == grant and not refusals:
-                    arc.settling = None
-                    if grant in self._direct:
-                        self._direct[grant].keep_confirming(self._on_unsure)
-                    return grant
-                self._leave_unentered(grant)
-                if arc.grant == grant:
-                    await self._give_back(arc, grant, refusals)
-            else:
+            if arc.state != "running" or arc.grant is None:
                 await self.changed(arc)
+                continue
+            grant = arc.grant
+            confirmation = self._confirmations.begin(arc, grant)
+            if not (confirmed or arc.direct):
+                return grant
+            await confirmation.over()
+            if arc.grant == grant and confirmation.all:
+                return grant
+            if arc.grant == grant and confirmation.refused is not None:
+                await self.end(arc)
+                raise confirmation.refused
+
+    async def confirmed(self, arc: OpenArc) -> bool:
+        """Waits until all RCs of the present grant have confirmed it. False: they do not, or it is over."""
+        if (grant := arc.grant) is None:
+            return False
+        confirmation = self._confirmations.begin(arc, grant)
+        await confirmation.over()
+        return arc.grant == grant and confirmation.all
 
     def direct_hold(self, grant: Grant) -> DirectHold | None:
         """For who runs the program of a direct request: how long its hold may be relied on, and what is to be told when
         the program is gone. None where the request was not direct, or that has been told."""
-        return self._direct.get(grant)
-
-    async def _give_back(self, arc: OpenArc, grant: Grant, refusals: list[CommandRefused]) -> None:
-        """It is not entered. Raises CommandRefused where that is not for the RCM to mend."""
-        if other := [refused for refused in refusals if refused.code not in NOT_CONFIRMED | {SETTLING}]:
-            log.warning("the grant of %s is given back: %s", arc.name, other[0])
-            await self.end(arc)
-            raise other[0]
-        rcs = [refused.rc for refused in refusals if refused.code != SETTLING]
-        if rcs:
-            log.warning("the grant of %s is given back: %s", arc.name, refusals[0])
-            arc.not_confirmed(rcs, str(refusals[0]), self.mesh.now())
-            self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
-        else:
-            arc.not_served(grant, self.mesh.now())
-        self._store.notify(arc)
-        await self._rcm.submit(arc)
-
-    async def _confirm(self, arc: OpenArc, grant: Grant) -> list[CommandRefused]:
-        """Asks all RCs of a grant, side by side, whether they know of it. Returns those that do not say so within a
-        second in which this client did not stand still itself, or that settle until its time is over."""
-        direct = self._open_direct(arc, grant) if arc.direct else None
-        asked = arc.rcs
-        while True:
-            refusals = await asyncio.gather(*(self._confirm_one(arc, grant, rc, direct) for rc in asked))
-            for rc, refused in zip(asked, refusals, strict=True):
-                await self._look_at_silence(rc, silent=refused is not None and refused.code == "unknown")
-            # What one has confirmed is old by now if another had to settle.
-            asked = [] if direct is None else direct.unanswered(self.mesh.now() - self.fleet.timing.hold_lease // 2)
-            refused_by = [refused for refused in refusals if refused is not None]
-            if refused_by or arc.grant != grant or not asked:
-                return refused_by
-
-    async def _confirm_one(
-        self, arc: OpenArc, grant: Grant, rc: str, direct: DirectHold | None
-    ) -> CommandRefused | None:
-        second = round(CONFIRM_TIMEOUT * SECOND)
-        deadline = self.mesh.now() + second
-        pause = BACKOFF[0]
-        while True:
-            sent = self.mesh.now()
-            left = (deadline - sent) / SECOND
-            try:
-                done = await self.command(rc, grant, {"name": "confirm"}, timeout=max(left, BACKOFF[0]))
-            except CommandRefused as refused:
-                if arc.grant != grant or refused.code not in CONFIRM_AGAIN | {SETTLING}:
-                    return refused
-                if refused.code == SETTLING:
-                    # Neither a refusal nor silence.
-                    if arc.settling != grant:
-                        arc.settling, arc.reason = grant, refused.message
-                        self._store.notify(arc)
-                    if not arc.keep and self.mesh.now() >= arc.end:
-                        return refused
-                    deadline, pause = self.mesh.now() + second, BACKOFF[0]
-                    await asyncio.sleep(min(LOOK_AGAIN, refused.left if refused.left is not None else LOOK_AGAIN))
-                    continue
-                if self._rcm.stood_still:
-                    deadline = self.mesh.now() + second
-                elif left <= 0:
-                    return refused
-            else:
-                if direct is not None:
-                    direct.confirmed(rc, sent, done)
-                return None
-            # The last time when all is over: a link to the RC may take that long.
-            await asyncio.sleep(max(0.0, min(pause, (deadline - self.mesh.now()) / SECOND)))
-            pause *= 2
-
-    # Direct holds
-
-    def _open_direct(self, arc: OpenArc, grant: Grant) -> DirectHold:
-        if grant not in self._direct:
-            lease, spawn = self.fleet.timing.hold_lease, self._supervisor.spawn
-            self._direct[grant] = DirectHold(arc, grant, self.command, self.mesh.now, spawn, hold_lease=lease)
-        return self._direct[grant]
-
-    def _look_at_direct(self, arc: OpenArc) -> None:
-        """There is news of `arc`: its holds before the present one are over."""
-        for direct in self._direct_of(arc):
-            if direct.grant != arc.grant:
-                direct.end()
-
-    def _direct_of(self, arc: OpenArc) -> list[DirectHold]:
-        self._direct = {grant: one for grant, one in self._direct.items() if not one.gone or one.telling}
-        return [direct for direct in self._direct.values() if direct.arc is arc]
-
-    def _program_is_gone(self, arc: OpenArc) -> None:
-        for direct in self._direct_of(arc):
-            direct.end(released=True)
-
-    def _leave_unentered(self, grant: Grant) -> None:
-        """Some RCs may have confirmed what was not entered."""
-        if (direct := self._direct.get(grant)) is not None:
-            direct.end(released=True)
-
-    def _on_unsure(self, direct: DirectHold) -> None:
-        """An RC has not confirmed it for a hold lease: it is over, whatever RCMs say."""
-        arc, rcs = direct.arc, direct.unanswered(self.mesh.now() - self.fleet.timing.hold_lease)
-        direct.end()
-        if arc.grant == direct.grant:
-            arc.not_confirmed(rcs, f"{', '.join(rcs)} did not confirm it for the hold lease", self.mesh.now())
-            self._store.notify(arc)
-            self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
-            self._supervisor.spawn(self._ask_again(arc))
-
-    async def _ask_when_reachable(self, arc: OpenArc, rcs: list[str]) -> None:
-        """Where tokens of RCs that did not confirm go, or have gone, and come back, links are back: `arc` is held back
-        for nothing."""
-        keys, back = self.mesh.keys, asyncio.Event()
-        gone = {rc for rc in rcs if not await self.mesh.living(keys.alive_rc(rc), timeout=QUERY_TIMEOUT)}
-
-        def on_token(token: Token, alive: bool) -> None:
-            if not alive:
-                gone.add(token.name)
-            elif token.name in gone:
-                gone.remove(token.name)
-                if not gone:
-                    back.set()
-
-        with ExitStack() as watched:
-            for rc in rcs:
-                watched.enter_context(closing(self.mesh.watch(keys.alive_rc(rc), on_token)))
-            if await done_within(HELD_BACK, back.wait()):
-                while arc.state == "asking" and arc.id in self._store.arcs:
-                    await self._store.changed(arc)
-                if arc.state == "queued" and not self.paused:
-                    await self._rcm.ask(arc, reachable=True)
-
-    async def _look_at_silence(self, rc: str, *, silent: bool) -> None:
-        """An RC that the RCM sees, and so should this client."""
-        seen = silent and await self.mesh.living(self.mesh.keys.alive_rc(rc), timeout=CONFIRM_TIMEOUT)
-        # There may be no link to one that is not seen: but for so long?
-        patience = PATIENCE if seen else UNREACHED
-        self.mesh.suspicions.suspect(f"{rc} was granted and does not answer", so=silent, patience=patience)
+        return self._confirmations.direct(grant)
 
     async def end(self, arc: OpenArc) -> None:
         """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed
@@ -465,12 +327,12 @@ class Client(MovableClient):
         if arc.state == "moved":
             self._store.forget(arc)
             return
-        self._program_is_gone(arc)
+        self._confirmations.program_is_gone(arc)
         await self._rcm.end(arc)
 
     def complete(self, arc: OpenArc) -> None:
         """An ARC has had its time by this host's clock, and its body has returned; RCs and RCM end it by theirs."""
-        self._program_is_gone(arc)
+        self._confirmations.program_is_gone(arc)
         self.expire(arc)
 
     def expire(self, arc: OpenArc) -> None:
@@ -527,7 +389,23 @@ class Client(MovableClient):
     async def command(
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
     ) -> Done:
-        """Has an RC do something under `grant`. Raises CommandRefused."""
+        """Has an RC do something under `grant`. An RC that may not know of it yet, or settles, has `ttl` seconds to
+        confirm it. Raises CommandRefused."""
+        began = self.mesh.now()
+        try:
+            return await self._command(rc, grant, do, ttl=ttl, timeout=timeout)
+        except CommandRefused as refused:
+            confirmation = self._confirmations.pending(grant)
+            if confirmation is None or refused.code not in NOT_DONE:
+                raise
+            left = ttl - (self.mesh.now() - began) / SECOND
+            if not await done_within(max(0.0, left), confirmation.over()) or not confirmation.all:
+                raise
+        return await self._command(rc, grant, do, ttl=ttl, timeout=timeout)
+
+    async def _command(
+        self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
+    ) -> Done:
         key = self.mesh.keys.command(rc, self.mesh.me)
         id_ = f"{self._instance}-{next(self._commanded)}"
         command = messages.Command(grant=grant, do=dict(do), ttl=ttl, id=id_)

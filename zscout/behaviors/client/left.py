@@ -15,7 +15,7 @@ from contextlib import suppress
 import msgspec
 from msgspec.structs import replace
 
-from zscout.behaviors.client.client import CONFIRM_AGAIN
+from zscout.behaviors.client.confirmation import CONFIRM_AGAIN
 from zscout.behaviors.client.direct import DEFAULT_SETTLE, TELL_TIMEOUT, TRY_AGAIN_AFTER
 from zscout.config.fleet import beside, fleet_from_env
 from zscout.config.strict import BadInput

@@ -103,6 +103,10 @@ class RcmLink:
         return self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease
 
     @property
+    def _heard_lately(self) -> bool:
+        return self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease // 2
+
+    @property
     def who(self) -> str:
         """Whom this asks, for people."""
         return "the RCM" if self.leader is None else f"the RCM at {self.leader}"
@@ -165,8 +169,10 @@ class RcmLink:
         """An RCM's answer to an operation, of several that which counts; None: none came, and it was carried out or
         not."""
         replies = await self.mesh.ask(self.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=self._counts)
-        await self._look_for_contradictions(silent=not replies)
-        return naming_versions(max(replies, key=self._counts, default=None), self.who)
+        if not replies or not self._heard_lately or self.mesh.suspicions.any:
+            await self._look_for_contradictions(silent=not replies)
+        reply = max(replies, key=self._counts, default=None)
+        return reply if reply is None or reply.problem is None else naming_versions(reply, self.who)
 
     def _counts(self, reply: Reply[Notice]) -> bool:
         """Whether it is not the word of an RCM that has been replaced."""
@@ -177,7 +183,7 @@ class RcmLink:
     async def _look_for_contradictions(self, *, silent: bool) -> None:
         """An RCM that is seen or heard answers, and one that answers is heard; where candidates are seen one leads
         before long."""
-        heard = self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease // 2
+        heard = self._heard_lately
         there, suspect = self.leader is not None or heard, self.mesh.suspicions.suspect
         suspect("an RCM is seen that does not answer", so=silent and there)
         suspect("an RCM answers that does not publish", so=not silent and not heard)

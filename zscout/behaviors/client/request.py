@@ -36,7 +36,8 @@ class CommandRefused(Exception):
 
     def __init__(self, rc: str, problem: Problem) -> None:
         super().__init__(f"{rc}: {problem.message}")
-        self.rc, self.code, self.message = rc, problem.code, problem.message
+        self.rc, self.problem = rc, problem
+        self.code, self.message = problem.code, problem.message
         self.left = problem.left
         """With `settling`: the seconds for which the RC may go on to settle."""
 
@@ -93,6 +94,8 @@ class OpenArc:
     """What it holds, or held last."""
     bound: dict[str, str] = field(default_factory=dict)
     """By each of its patterns: the RC among them that meets it."""
+    hosts: dict[str, str] = field(default_factory=dict)
+    """Where they are, by RC, as far as the RCM says it."""
     end: Ns = 0
     """When the minimum runtime of the present hold is over, on this host's clock."""
     since: Ns = 0
@@ -102,7 +105,7 @@ class OpenArc:
     unconfirmed: tuple[Grant, list[str]] | None = None
     """The grant that some of its RCs did not confirm, and which, until the RCM has answered that."""
     settling: Grant | None = None
-    """The grant whose RCs have not all stopped settling: it is not entered yet."""
+    """The grant whose RCs have not all stopped settling."""
     left: Grant | None = None
     """The last grant whose program was told to leave: it is not entered again."""
     unserved: Grant | None = None
@@ -162,6 +165,7 @@ class OpenArc:
         if notice.state == "running":
             self.grant = notice.grant
             self.bound, self.rcs = bound, sorted(bound.get(need, need) for need in self.needs)
+            self.hosts = notice.hosts
             self.end = now + round((notice.remaining or 0.0) * SECOND)
         return True
 

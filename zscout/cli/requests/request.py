@@ -137,7 +137,7 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
                     estimate=True,
                     direct=bool(wanted.command),
                 )
-            grant = await client.granted(arc)
+            grant = await client.granted(arc, confirmed=True)
     except (TimeoutError, asyncio.CancelledError) as error:
         why = arc.reason if arc is not None else ""
         if arc is not None:

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from msgspec.structs import replace
 
 from zscout.behaviors.client import rcm_link
+from zscout.behaviors.client.confirmation import Confirmations
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.rcm_link import RcmLink
@@ -204,6 +205,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "who believes in a hold is not told to wait before its RCs could say so",
             {(RequestHandler, "_may_be_held"): _no},
         ),
+        "beside": Guard("what its RCs do not confirm ends the body", {(Confirmations, "_give_back"): _nothing}),
         "settling": Guard("an RC settles before the next holder begins", {(HoldTable, "settles"): _nothing}),
         "confirmed": Guard("an RC settles from the last confirmation on", {(HoldTable, "confirmed"): _confirmed_once}),
         "deadline": Guard("a program is gone by its deadline", {(DirectHold, "gone_by"): _no_deadline}),

@@ -40,7 +40,7 @@ LONGER = 1.0
 HEALED = 45.0
 RELINK = 1.0
 """Seconds after which links that were lost stand again, at most."""
-MESSAGES = ("grants", "rc/state", "rcm/state", "schedule", "notice", "requests", "command", "vote", "alive")
+MESSAGES = ("grants", "rc/state", "rcm/state", "schedule", "notice", "requests", "command", "confirm", "vote", "alive")
 """Kinds of messages that may be disturbed."""
 OPERATIONS = ("hand_over", "move", "restore", "activate")
 """Steps of a component's move: the first node that asks for one of them, or answers, may be killed as it does, and

@@ -26,6 +26,7 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
 from zscout.config.fleet import default_fleet
 from zscout.config.node import ComponentsConfig
+from zscout.drivers.confirm_server import ConfirmServer
 from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
@@ -379,11 +380,14 @@ class Simulation:
     def _device(self, rc: str) -> Device:
         return Device(rc, DEVICES[rc], self.broken, self.log)
 
-    async def _offer(self, name: str, device: Device, mesh: MemoryMesh, stall: StallWatch) -> ResourceController:
+    async def _offer(
+        self, name: str, device: Device, mesh: MemoryMesh, stall: StallWatch, confirmations: ConfirmServer | None = None
+    ) -> ResourceController:
         driver = WatchedExclusive(device) if device.capacity is None else WatchedCapacity(device)
         lease = self.fleet.timing.hold_lease / SECOND
         last = self.last_holders[name] if device is self.devices[name] else LastHolder()
         how: dict[str, Any] = {"settle": SETTLE, "last_holder": last, "on_failure": self._on_failure}
+        how["confirmations"] = confirmations
         rc = ResourceController(mesh, name, driver, hold_lease=lease, stall=stall, **how)
         await rc.start()
         self.rcs[f"{mesh.me} {name}"] = rc
@@ -391,8 +395,9 @@ class Simulation:
 
     async def _offer_all(self, mesh: MemoryMesh, stall: StallWatch) -> None:
         """The RCs of this process."""
+        confirmations = ConfirmServer(mesh)
         for rc in [rc for rc, at in self.where.items() if at == str(mesh.me)]:
-            await self._offer(rc, self.devices[rc], mesh, stall)
+            await self._offer(rc, self.devices[rc], mesh, stall, confirmations)
 
     async def _spare(self, name: str, mesh: MemoryMesh, leaves: asyncio.Event) -> None:
         """Another device of this name on another host, until it `leaves`."""

@@ -140,7 +140,8 @@ class Candidate:
     # What is seen
 
     def _on_grants(self, _key: str, grants: Grants) -> None:
-        if self._see(grants.term):
+        known = grants.term == self.known and (self.rcm is None or self.rcm.term == self.known)
+        if known or self._see(grants.term):
             self.election.published(grants.term, self.mesh.now())
 
     def _on_leader(self, token: Token, alive: bool) -> None:

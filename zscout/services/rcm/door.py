@@ -19,16 +19,22 @@ MAX_NAMED = 8
 
 def check_door(
     needs: Mapping[Need, Amounts],
-    known: Collection[RcName],
+    expected: Collection[RcName],
+    is_there: Callable[[RcName], bool],
     parameters_of: Callable[[RcName], Parameters | None],
     *,
     waits: bool,
 ) -> None:
-    """Raises Refused. `known` are all RCs that are there or expected; with `waits`, others are waited for."""
+    """Raises Refused for what is neither among those that are expected nor there; with `waits`, it is waited for."""
     for need, params in needs.items():
-        matching = sorted(filter(matcher(need), known)) if is_pattern(need) else [need] if need in known else []
+        if not params and (is_there(need) or need in expected):
+            continue
+        if is_pattern(need):
+            matching = sorted(filter(matcher(need), expected))
+        else:
+            matching = [need] if need in expected or is_there(need) else []
         if not matching and not waits:
-            raise _unknown(need, known)
+            raise _unknown(need, expected)
         refusals = [_objection(rc, params, parameters_of(rc)) for rc in matching]
         # One that takes it is enough.
         if refusals and all(refusals):

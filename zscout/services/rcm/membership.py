@@ -421,6 +421,10 @@ class Membership:
         """The instance that is meant of each of these RCs, and its host."""
         return {rc: self._named[rc] for rc in rcs if rc in self._named}
 
+    def hosts_of(self, rcs: Iterable[RcName]) -> dict[RcName, HostName]:
+        named = self._named
+        return {rc: named[rc][1] for rc in rcs if rc in named}
+
     def _drop_unseen(self) -> None:
         for name, state in list(self._joined.items()):
             if state.instance not in self._rc_tokens.get(name, {}):

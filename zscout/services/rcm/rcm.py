@@ -3,7 +3,7 @@
     in        queries, tokens, reports of RCs, votes and time become
     events    of the core, all of one instant together; it returns
     effects,  which go
-    out       as a publication, notices, answers and proposals, in this order.
+    out       to who is granted, as a publication, notices to others, answers and proposals, in this order.
 
 Nothing is decided here. Queries for the state (`zscout status`, `why`) are answered here as well.
 """
@@ -72,6 +72,8 @@ KEPT: Final[Mapping[Outcome, Ns]] = MappingProxyType(
     {Outcome.RELEASED: 0, Outcome.CANCELLED: 0, Outcome.CLIENT_LOST: 86_400 * SECOND}
 )
 """For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
+CONTINUED: Final = (LeadTaken, Adopted, HandedOver)
+"""Events by which holds that stand go on: the RCs hear of that before anybody else."""
 MAX_REASON = 500
 """Characters of a veto's reason."""
 
@@ -104,6 +106,7 @@ class Rcm:
         devices = self.inventory.devices
         self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer, devices)
         self.membership.on_requests = self._on_requests
+        self.registry.hosts_of = self.membership.hosts_of
         self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(
             mesh,
@@ -228,13 +231,39 @@ class Rcm:
         over = self.registry.ended
         events = [one for one in events if not (isinstance(one, Adopted) and over(one.held.request.arc))]
         effects = self.core.handle(self.mesh.now(), *events)
+        told = self.requests.answer_grants(effects)
+        if not any(isinstance(event, CONTINUED) for event in events):
+            told |= self.registry.tell_grants(effects, told)
+        self._publish(effects, named)
+        self._note(events)
+        self.registry.report(effects, told | self.requests.waiting.keys(), self.requests.given_up)
+        self.requests.answer(effects)
+        for effect in effects:
+            match effect:
+                case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self.core.is_open(
+                    arc
+                ):
+                    self.places.end(arc, self.mesh.now(), KEPT.get(outcome, REMEMBER))
+                case Propose():
+                    self._propose(effect)
+                case WakeAt(at):
+                    self._set_wake(at)
+        if line := self.core.strategy.log_line():
+            log.info("%s", line)
+
+    def _note(self, events: Iterable[Event]) -> None:
+        """What is remembered of an instant."""
         seen = self.membership.clients
         for event in events:
             match event:
                 case Requested(ArcRequest(client=client)) | HandedOver(to=client) if client not in seen:
                     self.membership.expect(client)
             match event:
-                case PlaceShown(arc) | HandedOver(renamed=arc) | Requested(ArcRequest(arc=arc)):
+                case Requested(request):
+                    self._bind(request.arc)
+                    asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
+                    self.registry.record(request.arc, asked)
+                case PlaceShown(arc) | HandedOver(renamed=arc):
                     self._bind(arc)
                 case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
                     self._bind(request.arc)
@@ -244,22 +273,6 @@ class Rcm:
                         self.membership.heard(client)
                         self.membership.expect(client)
                     self._recover(request)
-        self._publish(effects, named)
-        self.registry.report(effects, self.requests.waiting, self.requests.given_up)
-        self.requests.answer(effects)
-        for effect in effects:
-            match effect:
-                case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self._is_open(arc):
-                    self.places.end(arc, self.mesh.now(), KEPT.get(outcome, REMEMBER))
-                case Propose():
-                    self._propose(effect)
-                case WakeAt(at):
-                    self._set_wake(at)
-        if line := self.core.strategy.log_line():
-            log.info("%s", line)
-
-    def _is_open(self, arc: ArcId) -> bool:
-        return self.core.place_of(arc) is not None
 
     def _bind(self, arc: ArcId) -> None:
         if (place := self.core.place_of(arc)) is not None:

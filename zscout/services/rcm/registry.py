@@ -22,7 +22,7 @@ from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.reason import Party, Reason, ended, waits
 from zscout.services.rcm.places import Places, client_id, request_id
-from zscout.types import SECOND, ArcId, Grant, Ns, Term
+from zscout.types import SECOND, ArcId, Grant, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +74,10 @@ class RequestRegistry:
         """ARCs whose notices say when they will start."""
         self.may_be_held: Callable[[ArcId], bool] = lambda _: False
         """Whether a queued ARC's client believes in a hold that RCs may yet report: it is not told to wait before."""
+        self.hosts_of: Callable[[Iterable[RcName]], dict[RcName, HostName]] = lambda _: {}
+        """Where RCs are that are granted."""
+        self._telling = False
+        """Whether reasons are told before long."""
         self._changed: dict[ArcId, None] = {}
         """Queued ARCs whose reason to wait has changed and has not been published yet."""
         self._starts: Mapping[ArcId, Ns] = {}
@@ -129,24 +133,29 @@ class RequestRegistry:
             if arc_id in self._ended:
                 return self._ended[arc_id][1]
             return self._notice(arc_id, "ended", reason="no such request is open")
-        hold = arc.hold
-        # What a queued ARC is bound to is only what it was last checked with.
-        rcs = arc.needs if hold is not None else [need for need in arc.request.needs if not is_pattern(need)]
+        request, hold = arc.request, arc.hold
+        known = {
+            "priority": request.priority,
+            "who": request.who,
+            "place": arc.place,
+            "seal": self._places.seal(arc.place, arc_id),
+        }
+        if hold is not None:
+            remaining = (hold.end - self._mesh.now()) / SECOND
+            rcs, hosts, bound = sorted(arc.needs), self.hosts_of(arc.needs), dict(arc.bound)
+            return self._notice(
+                arc_id, "running", grant=hold.grant, rcs=rcs, bound=bound, remaining=remaining, hosts=hosts, **known
+            )
         return self._notice(
-            arc.id,
-            "queued" if hold is None else "running",
-            priority=arc.request.priority,
+            arc_id,
+            "queued",
             reason=str(arc.reason or ""),
             why=reason_info(arc.reason, self._mesh.now()),
-            who=arc.request.who,
-            place=arc.place,
-            seal=self._places.seal(arc.place, arc.id),
             ahead=arc.ahead,
-            grant=hold.grant if hold is not None else None,
-            rcs=sorted(rcs),
-            bound=dict(arc.bound) if hold is not None else {},
-            remaining=(hold.end - self._mesh.now()) / SECOND if hold is not None else None,
+            # What it is bound to is only what it was last checked with.
+            rcs=sorted(need for need in request.needs if not is_pattern(need)),
             starts_in=self._starts_in(arc),
+            **known,
         )
 
     def interrupted(self, arc: ArcId, believed: Grant) -> Notice:
@@ -174,6 +183,17 @@ class RequestRegistry:
             **details,
         )
 
+    def tell_grants(self, effects: Collection[Effect], answered: Collection[ArcId]) -> set[ArcId]:
+        """Publishes the notices of an instant's grants before the RCs hear of them, but to who is `answered` so, or had
+        another hold until now. Returns whom it told."""
+        over = {effect.arc for effect in effects if isinstance(effect, (HoldEnded, Dropped))}
+        granted = [effect.arc for effect in effects if isinstance(effect, Granted)]
+        told = {arc for arc in granted if arc not in over and arc not in answered and self._core.is_running(arc)}
+        for arc in granted:
+            if arc in told:
+                self._put(self.notice(arc))
+        return told
+
     def report(self, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]) -> None:
         """Publishes the notices of an instant's effects, but where the answer to an operation says the same: the grant
         of an `answered` ARC, the end of the hold of a `given_up` one."""
@@ -191,6 +211,8 @@ class RequestRegistry:
                         self._put(notice)
                 case Queued(arc=arc, settled=True) if self._core.is_queued(arc):
                     self._change(arc)
+        if self._core.reasons_changed:
+            self._tell_soon()
 
     def publish(self, arcs: Iterable[ArcId]) -> None:
         """Publishes the present state of these ARCs, as far as they are open."""
@@ -200,11 +222,17 @@ class RequestRegistry:
                 self._put(self.notice(arc))
 
     def _change(self, arc: ArcId) -> None:
-        if not self._changed:
-            self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
+        self._tell_soon()
         self._changed[arc] = None
 
+    def _tell_soon(self) -> None:
+        if not self._telling:
+            self._telling = True
+            self._supervisor.call_later(REASONS_EVERY, self._publish_reasons)
+
     def _publish_reasons(self) -> None:
+        self._telling = False
+        self._changed |= {effect.arc: None for effect in self._core.tell_reasons() if isinstance(effect, Queued)}
         undecided = [arc for arc in self._changed if self.may_be_held(arc)]
         changed = [arc for arc in self._changed if arc not in undecided and self._core.is_queued(arc)]
         self._changed = dict.fromkeys(changed)

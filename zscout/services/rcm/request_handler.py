@@ -10,8 +10,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import TypeAlias
 
-from msgspec import structs
-
 from zscout.config.fleet import Fleet, RcmLimits
 from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
@@ -28,6 +26,7 @@ from zscout.messages import (
     Operation,
     Parameters,
     Release,
+    Who,
     absurd,
     duration,
     exact_amounts,
@@ -54,7 +53,7 @@ from zscout.services.authority import Authority
 from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.door import check_door
 from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.places import Places, arc_id, client_id, request_id
+from zscout.services.rcm.places import Places, arc_id, request_id
 from zscout.services.rcm.registry import RequestRegistry, party_info, reason_info
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
@@ -126,34 +125,35 @@ class RequestHandler:
 
     def on_operation(self, query: Query) -> None:
         sender = self.mesh.keys.sender_of(query.key)
-        self._membership.heard(str(sender))
+        client = str(sender)
+        self._membership.heard(client)
         operation = query.message
         check_name(operation.id, "id")
         match operation:
             case Ask():
-                self._ask(query, operation, sender)
+                self._ask(query, operation, sender, client)
             case Cancel() | Release():
                 self._end(query, operation, sender)
             case HandOver():
-                self._find_new_client(query, operation, str(sender))
+                self._find_new_client(query, operation, client)
             case Foresee():
                 self._forecast(query, operation, sender)
 
-    def _ask(self, query: Query, ask: Ask, sender: Sender) -> None:
+    def _ask(self, query: Query, ask: Ask, sender: Sender, client: ClientId) -> None:
         if ask.term is not None and ask.term > self.core.term:
-            client = str(sender)
-            self._membership.see(ask.term, obeyed_by=client if client in self._membership.clients else None)
+            seen = client if client in self._membership.clients else None
+            self._membership.see(ask.term, obeyed_by=seen)
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
-        arc = arc_id(str(sender), ask.id)
+        arc = arc_id(client, ask.id)
         self._keep_order(arc)
         self._authority.check_ask(sender, ask, lambda names: self._open_of(names, arc))
         if self._may_hold(arc, ask) and self._membership.awaits(arc, ask.rcs) and len(self._deferred) < MAX_BATCH:
             self._defer(query)
         elif arc in self.waiting:
             self.waiting[arc].append(query)
-        elif self.core.arc(arc) is not None:
+        elif self.core.is_open(arc):
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-            if (place := self._own_place(ask, str(sender))) is not None:
+            if (place := self._own_place(ask, client)) is not None:
                 self._emit(PlaceShown(arc, place))
             if ask.grant is not None and ask.unconfirmed:
                 self._emit(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
@@ -165,25 +165,30 @@ class RequestHandler:
         elif self._goes_on_elsewhere(ask):
             query.answer(self._registry.handed_over(arc, ask.arc))
         else:
-            self._check_room(str(sender))
-            ask = structs.replace(ask, who=self._authority.known_as(sender, ask.who))
-            request = admit(ask, sender, arc, self.core, self.limits)
-            place = self._own_place(ask, str(sender))
-            if ask.check and ask.place is None and ask.grant is None:
-                self._check_door(ask)
-            self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-            self._registry.record(arc, f"asked for {', '.join(sorted(ask.needs))} at priority {ask.priority}")
-            since = None if place is None else self.mesh.now() - round(ask.waited * SECOND)
-            asked = Requested(request, place, since)
-            if self._may_hold(arc, ask):
-                # It ends what it began under that grant before anybody is asked for a vote.
-                self._emit(asked)
-                query.answer(self._standing(arc, ask))
-                return
-            before = arc_id(str(sender), ask.was or ask.id)
+            self._enter(query, ask, sender, client, arc)
+
+    def _enter(self, query: Query, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
+        """Takes a new request. This is the way of every grant: nothing is done here that can be done once it is
+        answered."""
+        self._check_room(sender.host, client)
+        request = admit(ask, client, arc, self.core, self.limits, self._authority.known_as(sender, ask.who))
+        place, replaced, since = None, None, None
+        if ask.place is not None and (place := self._own_place(ask, client)) is not None:
+            since = self.mesh.now() - round(ask.waited * SECOND)
+        elif ask.check and ask.place is None and ask.grant is None:
+            self._check_door(ask)
+        self._registry.enter(arc, ask.arc, estimate=ask.estimate)
+        asked = Requested(request, place, since)
+        if self._may_hold(arc, ask):
+            # It ends what it began under that grant before anybody is asked for a vote.
+            self._emit(asked)
+            query.answer(self._standing(arc, ask))
+            return
+        if ask.was is not None and ask.was != ask.id:
+            before = arc_id(client, ask.was)
             self._keep_order(before)
-            is_replaced = place is not None and before != arc and self.core.place_of(before) is not None
-            self._gather(query, arc, asked, before if is_replaced else None)
+            replaced = before if place is not None and self.core.is_open(before) else None
+        self._gather(query, arc, asked, replaced)
 
     def _own_place(self, ask: Ask, client: ClientId) -> Place | None:
         """The place that a request shows, if it is its client's. Raises Refused for one that can't be."""
@@ -201,9 +206,8 @@ class RequestHandler:
 
     def _check_door(self, ask: Ask | Foresee) -> None:
         """Raises Refused for what can never start."""
-        known = {*self._devices.names, *filter(self._membership.is_known, ask.needs)}
         waits = ask.wait_for_device or self.mesh.now() < self._knows_all
-        check_door(ask.needs, known, self._parameters, waits=waits)
+        check_door(ask.needs, self._devices.names, self._membership.is_known, self._parameters, waits=waits)
 
     def _parameters(self, rc: RcName) -> Parameters | None:
         state = self._membership.reported(rc)
@@ -211,9 +215,10 @@ class RequestHandler:
 
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
         """Whether its client believes in a grant of an earlier RCM of which this one does not know."""
+        if ask.grant is None or ask.grant.term >= self.core.term or ask.unconfirmed or ask.unserved:
+            return False
         known = self.core.arc(arc)
-        unknown = ask.grant is not None and ask.grant.term < self.core.term and not ask.unconfirmed and not ask.unserved
-        return unknown and (known is None or known.hold is None) and not self._registry.ended(arc)
+        return (known is None or known.hold is None) and not self._registry.ended(arc)
 
     def _may_be_held(self, arc: ArcId) -> bool:
         known = self.core.arc(arc)
@@ -248,7 +253,7 @@ class RequestHandler:
             self.given_up.add(arc)
             if operation.left:
                 self.left.add(arc)
-            if self.core.arc(arc) is None:
+            if not self.core.is_open(arc):
                 self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
         event = Cancelled if isinstance(operation, Cancel) else Released
         who = self._authority.known_as(sender, operation.who)
@@ -257,30 +262,33 @@ class RequestHandler:
 
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
-        same_place = self.core.at_place(ask.place) if ask.place is not None else ()
-        return any(request_id(arc) == ask.id for arc in same_place)
+        return ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place))
 
-    def _open_of(self, names: Collection[str], but: ArcId = "") -> int:
+    def _open_of(self, names: Collection[str], *but: ArcId) -> int:
         """How many ARCs these have, waiting or running; what this burst has brought counts."""
-        coming = {event.request.arc for event in self._batch.values() if isinstance(event, Requested)}
-        owned = {arc for arc in coming if client_id(arc).partition("/")[0] in names}
-        return len({*owned, *self.core.arcs_of_owners(names)} - {but})
+        owned = sum(map(self.core.count_of_owner, names))
+        owned += sum(client.partition("/")[0] in names for client in self._coming())
+        return owned - sum(self.core.is_open(arc) and arc.partition("/")[0] in names for arc in but)
 
-    def _held_by(self, names: Collection[str]) -> int:
+    def _coming(self) -> list[ClientId]:
+        """The clients of the requests of this burst."""
+        return [event.request.client for event in self._batch.values() if isinstance(event, Requested)]
+
+    def _held_by(self, names: Collection[str], *but: ArcId) -> int:
         """How many RCs these hold."""
-        arcs = filter(None, map(self.core.arc, self.core.arcs_of_owners(names)))
+        arcs = filter(None, map(self.core.arc, {*self.core.arcs_of_owners(names)} - {*but}))
         return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
 
-    def _check_room(self, client: ClientId) -> None:
+    def _check_room(self, host: str, client: ClientId) -> None:
         """Refuses what is too much at once; what this burst has brought already counts."""
-        coming = [event for event in self._batch.values() if isinstance(event, Requested)]
+        coming = self._coming() if self._batch else []
         if self.core.waiting + len(coming) >= self.limits.max_queued:
             raise Refused("queue_full", f"{self.limits.max_queued} ARCs wait already; ask again later")
         most = self.limits.max_requests_per_client
-        if sum(event.request.client == client for event in coming) + len(self.core.arcs_of(client)) >= most:
+        if coming.count(client) + self.core.count_of(client) >= most:
             raise Refused("too_many", f"{client} has {most} requests open already")
-        host, most = client.partition("/")[0], self.limits.max_requests_per_host
-        if self._open_of((host,)) >= most:
+        most = self.limits.max_requests_per_host
+        if self.core.count_of_owner(host) + sum(one.startswith(f"{host}/") for one in coming) >= most:
             raise Refused("too_many", f"the clients of {host} have {most} requests open already")
 
     def _forecast(self, query: Query, asked: Foresee, sender: Sender) -> None:
@@ -290,7 +298,7 @@ class RequestHandler:
             raise Refused("bad_request", f"{asked.id} is a request already; ask how it stands")
         now = self.mesh.now()
         self._authority.check_ask(sender, asked, lambda names: self._open_of(names, arc))
-        request = admit(asked, sender, arc, self.core, self.limits)
+        request = admit(asked, str(sender), arc, self.core, self.limits)
         if asked.check:
             self._check_door(asked)
         expected = forecast(self.core, now, request)
@@ -332,8 +340,12 @@ class RequestHandler:
         batch, self._batch = self._batch, {}
         if not batch:
             return
-        asked = [event for event in batch.values() if isinstance(event, Requested)]
-        ended = [event for event in batch.values() if not isinstance(event, Requested)]
+        asked, ended = list[Requested](), list[Cancelled | Released]()
+        for event in batch.values():
+            if isinstance(event, Requested):
+                asked.append(event)
+            else:
+                ended.append(event)
         self._emit(*ended, *asked)
         self.given_up.clear()
         self.left.clear()
@@ -343,8 +355,17 @@ class RequestHandler:
             # Votes are out: they decide the first answer, if they come.
             self._supervisor.call_later(self._first_answer_timeout, self._answer, undecided)
 
+    def answer_grants(self, effects: Iterable[Effect]) -> set[ArcId]:
+        """Answers those whose ARCs an instant has granted, before anybody else is told. Returns those ARCs."""
+        answered = set[ArcId]()
+        for effect in effects:
+            if isinstance(effect, Granted) and effect.arc in self.waiting and self.core.is_running(effect.arc):
+                self._answer([effect.arc])
+                answered.add(effect.arc)
+        return answered
+
     def answer(self, effects: Iterable[Effect]) -> None:
-        """Answers the operations that an instant's effects have decided."""
+        """Answers the other operations that an instant's effects have decided."""
         for effect in effects:
             match effect:
                 case Granted(arc=arc) | Dropped(arc=arc):
@@ -401,7 +422,15 @@ class RequestHandler:
             return
         self._check_room_for(moves, sender, to)
         arcs = [arc for move in moves if (arc := self.core.arc(move.arc)) is not None]
-        self._authority.check_hand_over(client_of(sender), client_of(to), arcs, self._open_of, self._held_by)
+        # An ARC that is open at its new client already is replaced by the one that comes.
+        replaced = [move.renamed for move in moves]
+        self._authority.check_hand_over(
+            client_of(sender),
+            client_of(to),
+            arcs,
+            lambda names: self._open_of(names, *replaced),
+            lambda names: self._held_by(names, *replaced),
+        )
         for move in moves:
             self._registry.enter(move.renamed, self._registry.name(move.arc))
         places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
@@ -415,7 +444,7 @@ class RequestHandler:
     def _check_room_for(self, moves: Collection[HandedOver], sender: ClientId, to: ClientId) -> None:
         added = sum(self.core.arc(move.renamed) is None for move in moves)
         host = to.partition("/")[0]
-        rooms = [(f"{to} has", self.limits.max_requests_per_client - len(self.core.arcs_of(to)))]
+        rooms = [(f"{to} has", self.limits.max_requests_per_client - self.core.count_of(to))]
         if host != sender.partition("/")[0]:
             rooms.append((f"the clients of {host} have", self.limits.max_requests_per_host - self._open_of((host,))))
         for who, room in rooms:
@@ -458,7 +487,9 @@ def check_place(place: Place, core: Core) -> None:
         raise Refused("bad_request", "place was never given; leave it out")
 
 
-def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: RcmLimits) -> ArcRequest:
+def admit(
+    ask: Ask | Foresee, client: ClientId, arc: ArcId, core: Core, limits: RcmLimits, who: Who | None = None
+) -> ArcRequest:
     """The request, if it may be made. Raises Refused with what is wrong and how to mend it."""
     if not ask.needs:
         raise Refused("bad_request", "needs is empty; name at least one RC")
@@ -476,17 +507,17 @@ def admit(ask: Ask | Foresee, sender: Sender, arc: ArcId, core: Core, limits: Rc
                 raise ValueError(f"{name} has more than {MAX_PARAMS} parameters")
             for parameter in params:
                 check_name(parameter, f"parameter of {name}")
-        needs = {name: exact_amounts(params) for name, params in ask.needs.items()}
+        needs = {name: exact_amounts(params) if params else {} for name, params in ask.needs.items()}
         return ArcRequest(
             arc=arc,
-            client=str(sender),
+            client=client,
             needs=needs,
             priority=ask.priority,
             min_runtime=duration(ask.min_runtime, "min_runtime"),
             keep=ask.keep,
             label=ask.arc,
             direct=isinstance(ask, Ask) and ask.direct,
-            who=ask.who if isinstance(ask, Ask) else None,
+            who=who,
         )
     except (BadName, ValueError) as error:
         raise Refused("bad_request", str(error)) from None

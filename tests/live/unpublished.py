@@ -1,0 +1,172 @@
+"""Leaders that are killed between the answer to a grant and its publication, again and again.
+
+    python -m tests.live.unpublished --times 200
+
+A client asks for two RCs. The leader answers that they are granted, and is gone before any RC hears of it; the body has
+been entered by then. The successor must find that nobody holds them: the client is told so, and has both from the
+successor, at its place, before a rival who asked later. No RC carries out a command under a grant that never was.
+
+`python -m tests.live.unpublished node FILE` is the node: one that is killed so once `<host>.dies` lies beside FILE."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import shutil
+import signal
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.hang import HANG
+from tests.live.bench import answer
+from tests.live.lab import Lab
+from zscout.behaviors.client.request import CommandRefused, OpenArc
+from zscout.config.node import load_node
+from zscout.node import run_node
+from zscout.scheduling.model import Effect
+from zscout.services.rcm.request_handler import RequestHandler
+from zscout.types import Grant
+
+RCS = ("robot/a", "robot/b")
+HOSTS = ("h1", "h2")
+OUT = 0.02
+"""Seconds for which the answer may take to leave the process: nothing else leaves it meanwhile."""
+ECHO = {"name": "echo", "value": 1}
+BOTH: dict[str, dict[str, int]] = {rc: {} for rc in RCS}
+
+
+async def node(file: Path) -> None:
+    """Runs a node that kills itself so."""
+    settings = load_node(file)
+    flag = file.with_suffix(".dies")
+    answer_grants = RequestHandler.answer_grants
+
+    def then_dies(self: RequestHandler, effects: Iterable[Effect]) -> set[str]:
+        answered = answer_grants(self, effects)
+        if answered and flag.exists():
+            flag.unlink()
+            time.sleep(OUT)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return answered
+
+    RequestHandler.answer_grants = then_dies  # type: ignore[method-assign]
+    await run_node(settings, asyncio.Event())
+
+
+@dataclass(frozen=True, slots=True)
+class Death:
+    """Of one leader."""
+
+    answered: bool
+    """Whether the client had the answer."""
+    took: float
+    """Seconds from the request until the client holds both by the word of their RCs."""
+    trouble: str = ""
+
+
+class Deaths:
+    """A fleet whose leader is killed so, and started again."""
+
+    def __init__(self, lab: Lab) -> None:
+        self._lab = lab
+
+    async def assemble(self) -> None:
+        self._lab.node("devices", *RCS, extra="candidate = false")
+        for host in HOSTS:
+            self._start(host)
+        self.client, self.rival = await self._lab.client("first"), await self._lab.client("rival")
+        await self._lab.ready(self.client, *RCS)
+
+    def _start(self, host: str) -> None:
+        file = self._lab.folder / f"{host}.toml"
+        file.write_text(f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n')
+        command = [sys.executable, "-m", "tests.live.unpublished", "node", str(file)]
+        self._lab.nodes[host] = self._lab.spawn(command, log=f"{host}.log")
+
+    async def death(self) -> Death:
+        """One more."""
+        await self._lab.candidates(self.client, *HOSTS)
+        leader = (await self._lab.state(self.client, lambda state: bool(state.host))).host
+        (self._lab.folder / f"{leader}.dies").touch()
+        began = time.monotonic()
+        arc = await self.client.request("pair", BOTH, min_runtime=600)
+        first = arc.grant
+        rivals = await self.rival.request("pair", BOTH, min_runtime=600)
+        trouble = "" if first is None else await self._obeyed(first)
+        async with asyncio.timeout(HANG):
+            grant = await self.client.granted(arc, confirmed=True)
+        took = time.monotonic() - began
+        self._lab.nodes[leader].wait(HANG)
+        trouble = trouble or await self._found(arc, first, grant, rivals)
+        for client, one in ((self.client, arc), (self.rival, rivals)):
+            await client.end(one)
+        self._start(leader)
+        return Death(first is not None, took, trouble)
+
+    async def _obeyed(self, first: Grant) -> str:
+        """Whether an RC carried out a command of the body under the grant of which it never heard."""
+        for rc in RCS:
+            try:
+                await self.client.command(rc, first, ECHO, ttl=0.2, timeout=1)
+            except CommandRefused:
+                continue
+            return f"{rc} obeyed {first}, which was never published"
+        return ""
+
+    async def _found(self, arc: OpenArc, first: Grant | None, grant: Grant | None, rivals: OpenArc) -> str:
+        """What is wrong once the successor has granted, if anything."""
+        if grant is None or (first is not None and grant <= first):
+            return f"{first} is followed by {grant}"
+        if rivals.state != "queued":
+            return f"who asked later is {rivals.state}"
+        for rc in RCS:
+            said = await answer(self.client.command(rc, grant, ECHO, ttl=5, timeout=HANG))
+            if said != "done":
+                return f"{rc} says {said} to {grant}, which it confirmed"
+        state = await self._lab.state(self.client, lambda state: bool(state.holds))
+        holds = [(hold.client, hold.grant) for hold in state.holds]
+        return "" if holds == [(str(self.client.mesh.me), grant)] else f"the RCM lists {holds}"
+
+
+async def deaths(folder: Path, times: int, tell: Callable[[Death], object]) -> list[Death]:
+    async with Lab(folder, lease=1.0, candidates=HOSTS) as lab:
+        fleet = Deaths(lab)
+        await fleet.assemble()
+        found = []
+        for _ in range(times):
+            found.append(await fleet.death())
+            tell(found[-1])
+        return found
+
+
+def main() -> int:
+    if sys.argv[1:2] == ["node"]:
+        asyncio.run(node(Path(sys.argv[2])))
+        return 0
+    options = argparse.ArgumentParser(prog="python -m tests.live.unpublished", description=__doc__)
+    options.add_argument("--times", type=int, default=200, help="so many leaders are killed (200)")
+    asked = options.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="zscout-unpublished-"))
+    found = asyncio.run(deaths(folder, asked.times, lambda one: print(one.trouble or ".", end="", flush=True)))
+    took = [one.took for one in found]
+    wrong = sum(bool(one.trouble) for one in found)
+    print(
+        f"\n{len(found)} leaders killed between answer and publication, {sum(one.answered for one in found)} of them "
+        f"after the answer had arrived; both RCs held after {statistics.median(took):.2f} s, at most "
+        f"{max(took):.2f} s; {wrong} went wrong"
+    )
+    if wrong:
+        print(f"logs are in {folder}", file=sys.stderr)
+        return 1
+    shutil.rmtree(folder, ignore_errors=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
