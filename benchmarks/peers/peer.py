@@ -72,12 +72,12 @@ class Peer(ABC):
         """A program's session; `name` is the only one of its kind."""
 
 
-NAMES = ("zscout", "confirmed", "dask", "redis", "etcd", "labgrid", "ray")
+NAMES = ("zscout", "confirmed", "dask", "redis", "redis_fenced", "etcd", "etcd_fenced", "labgrid", "ray")
 
 
 def load(name: str) -> Peer:
     """The contender of this name. Raises Missing where its packages are not installed."""
-    module = "with_zscout" if name in ("zscout", "confirmed") else f"with_{name}"
+    module = "with_zscout" if name == "confirmed" else f"with_{name.partition('_')[0]}"
     try:
         peers: dict[str, Peer] = importlib.import_module(f"benchmarks.peers.{module}").PEERS
     except ModuleNotFoundError as error:

@@ -1,4 +1,5 @@
-"""Redis: one Lua script takes all keys or none; what is released is published, and waiters try again."""
+"""Redis: one Lua script takes all keys or none; what is released is published, and waiters try again. With fencing, the
+script counts a token as well, and each device is shown it before the hold counts."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from typing import Any
 
 import redis.asyncio
 
+from benchmarks.peers.device import Devices, devices
 from benchmarks.peers.peer import (
     HOST,
     LEASE,
@@ -29,11 +31,12 @@ FREED = "freed"
 TAKE = """
 local longest = -2
 for _, key in ipairs(KEYS) do longest = math.max(longest, redis.call('PTTL', key)) end
-if longest ~= -2 then return longest end
+if longest ~= -2 then return {longest, 0} end
 for _, key in ipairs(KEYS) do redis.call('SET', key, ARGV[1], 'PX', ARGV[2]) end
-return -2
+return {-2, redis.call('INCR', 'fence')}
 """
-"""-2 where all were taken, or after how many ms the last of those that are in the way ends unless renewed."""
+"""-2 where all were taken, or after how many ms the last of those that are in the way ends unless renewed; and the
+token of this hold, above those of all before it."""
 RENEW = """
 for _, key in ipairs(KEYS) do
   if redis.call('GET', key) == ARGV[1] then redis.call('PEXPIRE', key, ARGV[2]) end
@@ -54,8 +57,8 @@ class Held:
 
 
 class RedisSession(Session):
-    def __init__(self, client: Any, listener: Any) -> None:
-        self._client, self._listener = client, listener
+    def __init__(self, client: Any, listener: Any, devices: Devices | None) -> None:
+        self._client, self._listener, self._devices = client, listener, devices
         self._take, self._renew, self._give = (client.register_script(text) for text in (TAKE, RENEW, GIVE))
         self._waiters = Waiters()
         self._held: dict[str, Held] = {}
@@ -65,15 +68,17 @@ class RedisSession(Session):
     async def acquire(self, rcs: Sequence[str], waiting: Waiting | None) -> Held:
         held = Held(uuid.uuid4().hex, list(rcs))
         with self._waiters.waiter(rcs) as freed:
-            while (left := await self._take(keys=held.keys, args=[held.token, LEASE * 1000])) != -2:
+            while (answer := await self._take(keys=held.keys, args=[held.token, LEASE * 1000]))[0] != -2:
                 if waiting is not None:
                     waiting()
                     waiting = None
                 # A key that ends by its own time is not published.
                 with suppress(TimeoutError):
-                    async with asyncio.timeout((left + 1) / 1000):
+                    async with asyncio.timeout((answer[0] + 1) / 1000):
                         await self._waiters.wait(freed)
         self._held[held.token] = held
+        if self._devices is not None:
+            await self._devices.confirm(rcs, answer[1])
         return held
 
     async def release(self, hold: Held) -> None:
@@ -84,6 +89,8 @@ class RedisSession(Session):
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._devices is not None:
+            await self._devices.close()
         await self._listener.aclose()
         await self._client.aclose()
 
@@ -106,6 +113,12 @@ class Redis(Peer):
         "counts until its keys end; nothing is written to disk, and no device checks a hold"
     )
 
+    def __init__(self, *, fenced: bool = False) -> None:
+        self._fenced = fenced
+        if fenced:
+            self.name += ", fenced"
+            self.lacks = self.lacks.replace(", and no device checks a hold", "")
+
     def version(self) -> str:
         mend = "apt-get install redis-server"
         said = program_version("redis-server", "--version", mend=mend).split("v=")[1].split()[0]
@@ -115,14 +128,15 @@ class Redis(Peer):
     async def serve(self, folder: Path) -> AsyncIterator[str]:
         port = free_port()
         command = ["redis-server", "--bind", HOST, "--port", str(port), "--save", "", "--appendonly", "no"]
-        async with server(command, folder, port=port):
-            yield f"redis://{HOST}:{port}"
+        async with server(command, folder, port=port), devices() as ports:
+            yield f"redis://{HOST}:{port} {ports}"
 
     async def connect(self, address: str, name: str) -> Session:
-        client = redis.asyncio.Redis.from_url(address, socket_timeout=None)
+        url, ports = address.split()
+        client = redis.asyncio.Redis.from_url(url, socket_timeout=None)
         listener = client.pubsub()
         await listener.subscribe(FREED)
-        return RedisSession(client, listener)
+        return RedisSession(client, listener, await Devices.link(ports) if self._fenced else None)
 
 
-PEERS: dict[str, Peer] = {"redis": Redis()}
+PEERS: dict[str, Peer] = {"redis": Redis(), "redis_fenced": Redis(fenced=True)}

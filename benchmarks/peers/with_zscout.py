@@ -27,7 +27,7 @@ class ZscoutSession(Session):
             assert arc.open, f"the ARC ended: {arc.reason}"
             await self._client.changed(arc)
         if self._confirmed:
-            await self._client.granted(arc)
+            await self._client.granted(arc, confirmed=True)
         return arc
 
     async def release(self, hold: OpenArc) -> None:
