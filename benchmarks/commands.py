@@ -41,6 +41,17 @@ with zenoh.open(config) as session:
 """
 
 
+MODULES = """
+import contextlib, io, sys
+before = set(sys.modules)
+from zscout.cli.main import main
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    main(["status"], standalone_mode=False)
+print(*(name for name in sys.modules if name not in before and all(map(str.isidentifier, name.split(".")))))
+"""
+"""Prints the modules that `zscout status` imports, in their order."""
+
+
 def text_of(message: object) -> str:
     return messages.encode(message).decode()  # type: ignore[arg-type]
 
@@ -56,6 +67,7 @@ async def measure(rounds: int) -> list[Row]:
             env = {key: value for key, value in lab.env.items() if key != "PYTHONDONTWRITEBYTECODE"}
             env |= {"PYTHONPYCACHEPREFIX": f"{name}/bytecode", "PYTHONPATH": os.pathsep.join(sys.path)}
             rows = await asyncio.to_thread(in_turn, commands_of(lab), env, rounds)
+            rows += await asyncio.to_thread(parts_of_status, env, rounds)
             await client.end(held)
             return rows
 
@@ -95,6 +107,28 @@ def in_turn(commands: dict[str, tuple[list[str], list[str]]], env: dict[str, str
         aim = STATUS_AIM if name == "status" else None
         rows.append(Row(f"zscout {name} ({ratio})", whole.median, "s", whole.p99, aim=aim, rounds=rounds))
     return rows
+
+
+def parts_of_status(env: dict[str, str], rounds: int) -> list[Row]:
+    """Where the time of `zscout status` goes: Python itself, imports, and the rest, which is to join the mesh, to ask,
+    to print and to leave. The first round only warms up."""
+    status = [sys.executable, "-m", "zscout.cli.main", "status"]
+    used = subprocess.run([sys.executable, "-c", MODULES], env=env, capture_output=True, text=True, check=True).stdout
+    commands = {
+        "Python": [sys.executable, "-c", "pass"],
+        "imports": [sys.executable, "-c", f"import {', '.join(used.split())}"],
+        "status": status,
+    }
+    samples = {name: Samples() for name in commands}
+    for number in range(-1, rounds):
+        for name, command in commands.items():
+            start = time.perf_counter()
+            subprocess.run(command, env=env, capture_output=True, check=True)
+            if number >= 0:
+                samples[name].add(time.perf_counter() - start)
+    python, imports, whole = (samples[name].median for name in commands)
+    parts = {"Python": python, "imports": imports - python, "joins, asks, prints, leaves": whole - imports}
+    return [Row(f"zscout status: {name}", seconds, "s", rounds=rounds) for name, seconds in parts.items()]
 
 
 def main() -> None:
