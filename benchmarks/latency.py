@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import subprocess
 import sys
-import tarfile
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from io import BytesIO
 from pathlib import Path
 
 import zenoh
@@ -57,9 +56,9 @@ def fleet_of(folder: Path, strategy: StrategyName = "adaptive") -> Lab:
 
 def commit(name: str, folder: Path) -> Path:
     """The tree of a commit, in `folder`."""
-    archive = subprocess.run(["git", "-C", str(ROOT), "archive", name], capture_output=True, check=True).stdout
-    with tarfile.open(fileobj=BytesIO(archive)) as tree:
-        tree.extractall(folder, filter="data")
+    archive = folder.with_suffix(".tar")
+    subprocess.run(["git", "-C", str(ROOT), "archive", f"--output={archive}", name], check=True)
+    shutil.unpack_archive(archive, folder)
     return folder
 
 

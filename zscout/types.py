@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import Final, Literal, NamedTuple, TypeAlias
 
-VERSION: Final = "0.2.0"
+VERSION: Final = "0.3.0"
 """This zscout's own; pyproject.toml has it as well."""
 ArcId: TypeAlias = str
 """Identifies one request for as long as it lives; unique in the fleet. On the mesh `<host>/<client>/<id>`, of

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
+import shutil
 import subprocess
-import tarfile
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -21,15 +20,15 @@ ROOT: Final = Path(__file__).parents[2]
 
 def unpack(folder: Path) -> Path:
     """Its tree in `folder`, as if it were installed there. Skips where the repository does not reach back to it."""
-    git = ("git", "-C", str(ROOT), "archive", FORMER, "zscout", "tests", "pyproject.toml")
+    archive = folder.with_name(f"{folder.name}.tar")
+    git = ("git", "-C", str(ROOT), "archive", f"--output={archive}", FORMER, "zscout", "tests", "pyproject.toml")
     try:
-        archive = subprocess.run(git, capture_output=True, check=True).stdout
+        subprocess.run(git, capture_output=True, check=True)
     except FileNotFoundError:
         pytest.skip("git is not installed: commit 0df377c (v0.1.0) can't be had")
     except subprocess.CalledProcessError as error:
         pytest.skip(f"no commit 0df377c (v0.1.0) here, as in a shallow clone: {error.stderr.decode().strip()}")
-    with tarfile.open(fileobj=io.BytesIO(archive)) as tree:
-        tree.extractall(folder, filter="data")
+    shutil.unpack_archive(archive, folder)
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     info = folder / f"zscout-{project['version']}.dist-info"
     info.mkdir()

@@ -206,7 +206,7 @@ def test_a_component_is_started_by_either_versions_program(tmp_path: Path, forme
 
 def of_the_next_version(monkeypatch: pytest.MonkeyPatch) -> None:
     """This process, from now on."""
-    monkeypatch.setattr(exchange, "VERSION", "0.3.0")
+    monkeypatch.setattr(exchange, "VERSION", "0.4.0")
 
 
 def refusal(reply: Reply[Any] | None) -> messages.Problem:
@@ -237,7 +237,7 @@ def test_what_the_other_side_does_not_know_is_refused_naming_both_versions(
 
             of_the_next_version(monkeypatch)
             theirs = "older than 0.2.0" if leads == "old" else f"version {VERSION}"
-            says = f"at a is {theirs}, this is 0.3.0: upgrade the older one"
+            says = f"at a is {theirs}, this is 0.4.0: upgrade the older one"
             ask = Ask("x", "x", {"robot/{a,b}": {}}, 0, Decimal(1))
             for sent, code in ((operation, "malformed"), (ask, "bad_request")):
                 problem = refusal(await link.query(sent))
@@ -289,7 +289,7 @@ def test_a_command_is_told_that_nobody_waits_for_it(tmp_path: Path, former: Path
             told = map(json.loads, lab.log("request").splitlines())
             assert [one["who"] for one in told if one["event"] == "not_settling"] == [who]
 
-    who = ["the RCM at a (older than 0.2.0, this is 0.2.0)"] * (leads == "old") + ["robot/old"]
+    who = [f"the RCM at a (older than 0.2.0, this is {VERSION})"] * (leads == "old") + ["robot/old"]
     asyncio.run(story())
 
 
