@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
 
@@ -23,7 +23,8 @@ from zscout import __version__
 from zscout.config.certificates import PLACES_KEY, read_places_key
 from zscout.config.devices import RobotRc
 from zscout.config.fleet import Fleet
-from zscout.config.node import Node, default_node, load_node
+from zscout.config.node import MetricsConfig, Node, default_node, load_node
+from zscout.config.notify import NotifyConfig
 from zscout.config.state_folder import state_folder
 from zscout.config.strict import BadInput
 from zscout.drivers.confirm_server import ConfirmServer
@@ -34,12 +35,16 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.mesh.supervision import StallWatch
+from zscout.messages import LoadReport
 from zscout.services.authority import Authority
+from zscout.services.metrics.node_figures import NodeFigures
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.node.load_reporter import LoadReporter
 from zscout.services.node.reload import Reload
 from zscout.services.node.service_manager import ServiceManager
+from zscout.services.notify.notifier import Notifier
 from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.digest import HoldListener
 from zscout.services.recorder.process import RecorderProcess
 from zscout.types import SECOND
 
@@ -92,6 +97,7 @@ async def run_services(
         lease = node.fleet.timing.hold_lease / SECOND
         kept = state_folder(node.fleet.name, me.host, node.state) if node.rcs or node.candidate else None
         confirmations = ConfirmServer(mesh) if node.rcs else None
+        rcs: list[ResourceController] = []
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
             stack.enter_context(only_here(node.fleet.name, me.host, spec.name))
@@ -115,6 +121,7 @@ async def run_services(
                 log.exception("%s can't be opened", spec.name)
                 raise NodeFailed(f"{spec.name} can't be opened: {error!r}; see the log") from error
             stack.push_async_callback(rc.stop)
+            rcs.append(rc)
             log.info("runs %s (%s)", spec.name, driver_name(spec))
         authority = Authority(node.fleet)
         components = ComponentHost(mesh, node.fleet, node.components, fail, authority=authority)
@@ -127,10 +134,19 @@ async def run_services(
             await recorder.start()
             stack.push_async_callback(recorder.stop)
         candidate = None
+        figures = NodeFigures(node, mesh, rcs)
+        listeners: list[HoldListener] = [figures.holds] if node.metrics is not None else []
         if node.candidate:
-            candidate = Candidate(mesh, node.fleet, kept, authority, _places_key(node.fleet))
+            candidate = Candidate(mesh, node.fleet, kept, authority, _places_key(node.fleet), listeners)
+            if node.notify is not None:
+                notifier = _notifier(node.notify, node.fleet.name, candidate)
+                listeners.append(notifier.holds)
+                stack.callback(notifier.stop)
             candidate.start()
             stack.push_async_callback(candidate.stop)
+        if node.metrics is not None:
+            figures.candidate = candidate
+            stack.push_async_callback(await _serve_figures(node.metrics, figures))
         await components.start()
         # Before all else: they give back their ARCs while there is an RCM and while there are RCs.
         stack.push_async_callback(components.stop)
@@ -141,6 +157,7 @@ async def run_services(
 
             def take_rights(new: Node) -> None:
                 authority.reload(new.fleet)
+                figures.holds.take(new.fleet.access)
                 if candidate is not None:
                     candidate.on_reload()
                 mesh.admit(new.fleet.access.members())
@@ -157,6 +174,29 @@ async def run_services(
         manager.stopping("ends in order")
     if failures:
         raise NodeFailed(f"a service failed: {failures[0]!r}; see the log") from failures[0]
+
+
+async def _serve_figures(metrics: MetricsConfig, figures: NodeFigures) -> Callable[[], Awaitable[None]]:
+    """Returns what ends it. Raises NodeFailed."""
+    from zscout.services.metrics.server import MetricsServer
+
+    server = MetricsServer(figures.samples, metrics.bind, metrics.port)
+    try:
+        await server.start()
+    except OSError as error:
+        raise NodeFailed(f"[metrics] can't be served at {metrics.bind}:{metrics.port}: {error.strerror}") from error
+    log.info("serves its figures at http://%s:%d/metrics", metrics.bind, server.port)
+    return server.stop
+
+
+def _notifier(config: NotifyConfig, fleet: str, candidate: Candidate) -> Notifier:
+    def reports() -> list[LoadReport]:
+        balancer = candidate.balancer
+        return [] if balancer is None else [report for _, report in balancer.core.reports.values()]
+
+    notifier = Notifier(fleet, config, reports)
+    notifier.start()
+    return notifier
 
 
 def _places_key(fleet: Fleet) -> bytes | None:

@@ -24,6 +24,8 @@ from zscout.config.fleet import (
     keys_folder,
     load_fleet,
 )
+from zscout.config.notify import NotifyConfig, NotifyTable, read_notify
+from zscout.config.packages import check_installed
 from zscout.config.strict import Where, check_name, check_names, check_unique, key, quoted, read_toml
 from zscout.keyexpr import MACHINES, valid_name
 from zscout.messages import MAX_LABELS
@@ -58,6 +60,14 @@ class RecorderConfig(Struct, frozen=True):
     """Megabytes (10^6 bytes) of this fleet's recordings that are kept."""
 
 
+class MetricsConfig(Struct, frozen=True):
+    """Where the node's figures are served."""
+
+    bind: str
+    """IP address; loopback unless the file allowed others."""
+    port: int
+
+
 class ComponentsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [components]: what a node starts for others."""
 
@@ -82,6 +92,10 @@ class Node(Struct, frozen=True):
     """None: this node does not record."""
     labels: tuple[str, ...] = ()
     components: ComponentsConfig = ComponentsConfig()
+    metrics: MetricsConfig | None = None
+    """None: it serves no figures."""
+    notify: NotifyConfig | None = None
+    """None: it tells nobody."""
     state: Path | None = None
     """The folder of what must outlive the node (`state_folder.py`); None: where such folders usually are."""
 
@@ -117,6 +131,14 @@ class RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
     ] = RECORDED
 
 
+class MetricsTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [metrics]. With it the node serves its figures to Prometheus, over plain HTTP."""
+
+    bind: Annotated[str, key("IP address.")] = "127.0.0.1"
+    port: Annotated[int, key("TCP port.", 1, 65_535)] = 9464
+    allow_remote: Annotated[bool, key("Whether `bind` may let other hosts in.")] = False
+
+
 class NodeMeshTable(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [mesh] of a node file: what this host has instead of the fleet file's."""
 
@@ -139,6 +161,8 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
     recorder: RecorderTable | None = None
     security: SecurityTable | None = None
     components: ComponentsConfig = ComponentsConfig()
+    metrics: MetricsTable | None = None
+    notify: NotifyTable | None = None
 
 
 def load_node(path: Path) -> Node:
@@ -177,6 +201,10 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     if security is not None:
         _check_roles(host, (rc.name for rc in rcs), fleet.access, top)
         leads = leads and "manager" in fleet.access.ranks_of(host)
+    if file.notify is not None and not leads:
+        raise (top / "notify").bad(
+            "this host never leads, and only who leads tells anybody", "move it to one that does"
+        )
     return Node(
         host=host,
         fleet=fleet,
@@ -186,6 +214,8 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         recorder=None if file.recorder is None else _recorder(file.recorder, folder, top / "recorder"),
         labels=file.node.labels,
         components=file.components,
+        metrics=None if file.metrics is None else _metrics(file.metrics, top / "metrics"),
+        notify=None if file.notify is None else read_notify(file.notify, folder, top / "notify"),
         state=None if file.node.state is None else _folder(file.node.state, folder, top / "node" / "state", STATE),
     )
 
@@ -210,12 +240,23 @@ def _folder(text: str, folder: Path, at: Where, example: str) -> Path:
 
 def _recorder(table: RecorderTable, folder: Path, at: Where) -> RecorderConfig:
     path = _folder(table.path, folder, at / "path", 'path = "runs"')
-    address = ip_of("127.0.0.1" if table.bind == "localhost" else table.bind)
+    address = _served_at(table.bind, "the recording", at, allow_remote=table.allow_remote)
+    return RecorderConfig(path, address, table.port, table.frames, table.limit)
+
+
+def _metrics(table: MetricsTable, at: Where) -> MetricsConfig:
+    check_installed("prometheus_client", at)
+    return MetricsConfig(_served_at(table.bind, "the figures", at, allow_remote=table.allow_remote), table.port)
+
+
+def _served_at(bind: str, what: str, at: Where, *, allow_remote: bool) -> str:
+    """The IP address. Raises BadInput."""
+    address = ip_of("127.0.0.1" if bind == "localhost" else bind)
     if address is None:
-        raise (at / "bind").bad(f"{quoted(table.bind)} is not an IP address", 'write one, as in "127.0.0.1"')
-    if not address.is_loopback and not table.allow_remote:
+        raise (at / "bind").bad(f"{quoted(bind)} is not an IP address", 'write one, as in "127.0.0.1"')
+    if not address.is_loopback and not allow_remote:
         raise (at / "bind").bad(
-            f"{quoted(table.bind)} shows the recording to other hosts",
+            f"{quoted(bind)} shows {what} to other hosts",
             'write "127.0.0.1", or add allow_remote = true if that is meant',
         )
-    return RecorderConfig(path, str(address), table.port, table.frames, table.limit)
+    return str(address)

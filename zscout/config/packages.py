@@ -6,11 +6,14 @@ import re
 import shlex
 import sys
 from importlib import metadata
+from importlib.util import find_spec
 from typing import Final
+
+from zscout.config.strict import Where
 
 MODULES: Final = {"cv2": "opencv-python-headless", "numpy": "numpy", "rerun": "rerun-sdk"}
 """What a light installation leaves out: the package that each module comes with."""
-EXTRAS: Final = {"cryptography": "cryptography"}
+EXTRAS: Final = {"apprise": "apprise", "cryptography": "cryptography", "prometheus_client": "prometheus-client"}
 """The same of what only an extra brings."""
 
 
@@ -27,3 +30,10 @@ def how_to_get(error: ImportError) -> str:
     wanted = next((one.partition(";")[0] for one in required if re.split(r"[^\w.-]", one)[0] == package), package)
     command = shlex.join([sys.executable, "-m", "pip", "install", wanted])
     return f"needs {package}, which is not installed here; {command} brings it"
+
+
+def check_installed(module: str, at: Where) -> None:
+    """Refuses what stands `at` a place in a file where the module that it needs is not installed. Raises BadInput."""
+    if find_spec(module) is None:
+        what, _, remedy = how_to_get(ModuleNotFoundError(name=module)).partition("; ")
+        raise at.bad(what, remedy)

@@ -225,6 +225,11 @@ def key(
     return Meta(**bounds, description=description, examples=examples, extra=extra or None)
 
 
+def secret(wanted: str) -> Meta:
+    """Marks what no error may show. `wanted` is what it says instead: what is to be written."""
+    return Meta(extra={"secret": wanted})
+
+
 def parse_duration(text: str) -> Decimal | None:
     """Seconds from `5`, `1.5`, `90s`, `300ms`, `5m`, `2h` or `1d12h`; None for what is no duration."""
     found = _DURATION.fullmatch(text)
@@ -271,6 +276,13 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
             value = _seconds(value, where)
             _check_leaf(inspect.DecimalType(), value, where)
             return seconds_to_ns(Decimal(str(value)), where, low=low, high=high)
+        case inspect.Metadata(type=of, extra={"secret": wanted}):
+            try:
+                return _checked(of, value, where)
+            except BadInput:
+                raise where.bad(
+                    "is of the wrong form, and not shown, as it may hold a secret", f"write {wanted}"
+                ) from None
         case inspect.Metadata(type=inspect.FloatType() as of, extra={"unit": "s"}):
             return _checked(of, _seconds(value, where), where)
         case inspect.Metadata(type=of):

@@ -24,7 +24,7 @@ from zscout.drivers.instances import Instances, InstanceState
 from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.repeated import CommandMemory
 from zscout.keyexpr import Role, Token, new_instance
-from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor
+from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor, Tally
 from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.terms import LastTerms
@@ -155,6 +155,8 @@ class ResourceController:
         self.rules = 0
         self.health = "ok"
         self.queue, self._memory = WorkQueue(), CommandMemory()
+        self.tally = Tally()
+        """How its commands ended."""
         self.directory = RcDirectory(mesh) if driver.relays else None
         self.stall, self._on_failure = stall, on_failure
         self.supervisor = Supervisor(name, self._failed)
@@ -227,7 +229,8 @@ class ResourceController:
             if self.driver.sharable:
                 self._served.append(mesh.serve(keys.vote(self.name), messages.Proposal, self._on_proposal))
             command = keys.command_any(self.name)
-            self._served.append(mesh.serve(command, messages.Command, self._on_command, depth=2 * COMMAND_QUEUE))
+            taken = mesh.serve(command, messages.Command, self._on_command, depth=2 * COMMAND_QUEUE, tally=self.tally)
+            self._served.append(taken)
             self._served.append(self._confirmations.serve(self.name, self._on_command))
 
     def _on_instance_state(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,10 @@ from zscout.types import VERSION, Ns, Term
 
 QUEUE_DEPTH = 1_024
 """Items of one declaration that may wait for the event loop."""
+MAX_CODES: Final = 32
+"""Codes of refusals that a tally tells apart: some are of a driver's choice, or another host's."""
+OTHER: Final = "other"
+CODE: Final = re.compile("[a-z_]{1,32}")
 NOT_UNDERSTOOD: Final = frozenset({"malformed", "bad_name", "bad_request"})
 """How an operation, a form of a name or a value is refused that only another version knows."""
 
@@ -68,6 +73,26 @@ def refuse(query: TransportQuery, problem: Problem) -> None:
 
 
 @dataclass(slots=True, eq=False)
+class Tally:
+    """How queries of one purpose were ended. Answers are counted in the event loop, refusals on any thread."""
+
+    answered: int = 0
+    _refused: dict[str, int] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def refused(self) -> dict[str, int]:
+        """By code."""
+        with self._lock:
+            return dict(self._refused)
+
+    def refuse(self, code: str) -> None:
+        with self._lock:
+            known = code in self._refused or (CODE.fullmatch(code) and len(self._refused) < MAX_CODES)
+            code = code if known else OTHER
+            self._refused[code] = self._refused.get(code, 0) + 1
+
+
+@dataclass(slots=True, eq=False)
 class Answered:
     """How a question was answered, for arrivals of it that come later."""
 
@@ -99,6 +124,8 @@ class IncomingQuery(Generic[R]):
     """When it came out of the network, by `Mesh.now`."""
     outcome: Answered | None = None
     """Where to keep the answer, if it is to be kept."""
+    tally: Tally | None = None
+    """Where to count how it ended, if that is counted."""
 
     def answer(self, message: msgspec.Struct) -> None:
         self.end(message)
@@ -117,6 +144,11 @@ class IncomingQuery(Generic[R]):
             query.reply(self._reply_key, messages.encode(said), type(said))
         if self.outcome is not None:
             self.outcome.tell(said)
+        if self.tally is not None:
+            if isinstance(said, Problem):
+                self.tally.refuse(said.code)
+            else:
+                self.tally.answered += 1
 
 
 class Publisher:

@@ -28,6 +28,7 @@ from zscout.mesh.exchange import (
     Publisher,
     Refused,
     Reply,
+    Tally,
     refuse,
 )
 from zscout.mesh.frames import FramePublisher, FrameWatch
@@ -270,8 +271,9 @@ class Mesh:
         *,
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_PAYLOAD,
+        tally: Tally | None = None,
     ) -> Declaration:
-        """Calls `handler` for queries on `key` whose message is of `kind`.
+        """Calls `handler` for queries on `key` whose message is of `kind`. `tally` counts how they end.
 
         A payload that is not one is refused before the handler sees it, with code `malformed`; a query whose
         own key holds a wildcard is answered on `key` itself where that is concrete, and refused otherwise;
@@ -281,17 +283,22 @@ class Mesh:
         wild, names_sender = "*" in key, key.endswith("/*/*")
         shares = HostShares(depth // 2)
 
+        def turn_away(query: TransportQuery, code: str, message: str) -> None:
+            if tally is not None:
+                tally.refuse(code)
+            refuse(query, Problem(code, message))
+
         def on_query(query: TransportQuery) -> None:
             asked = query.key
             host = asked.rsplit("/", 2)[-2] if names_sender else ""
             if state.closed:
                 query.drop()
             elif host and not shares.enter(host):
-                _refuse(query, "busy", f"too many requests of {host[:MAX_NAME]} are waiting here; ask again")
+                turn_away(query, "busy", f"too many requests of {host[:MAX_NAME]} are waiting here; ask again")
             elif not self._inbox.offer(state, handle, query, asked, self.now(), host):
                 if host:
                     shares.leave(host)
-                _refuse(query, "busy", "too many requests are waiting here; ask again")
+                turn_away(query, "busy", "too many requests are waiting here; ask again")
 
         def handle(query: TransportQuery, asked: str, arrived: Ns, host: str) -> None:
             if host:
@@ -301,15 +308,17 @@ class Mesh:
                 query.drop()
                 return
             if wild and "*" in asked:
-                _refuse(query, "bad_key", f"name yourself in the key {key}: no wildcards")
+                turn_away(query, "bad_key", f"name yourself in the key {key}: no wildcards")
                 return
             payload = query.payload
             try:
                 message = messages.decode(b"{}" if payload is None else payload, kind, limit)
             except Malformed as error:
-                _refuse(query, "malformed", str(error))
+                turn_away(query, "malformed", str(error))
                 return
-            incoming: IncomingQuery[Any] = IncomingQuery(query, asked, asked if wild else key, message, arrived)
+            incoming: IncomingQuery[Any] = IncomingQuery(
+                query, asked, asked if wild else key, message, arrived, tally=tally
+            )
             try:
                 handler(incoming)
             except Refused as refused:
@@ -487,7 +496,3 @@ class _Collector(Collector):
         if self._open:
             self._open = False
             self._over()
-
-
-def _refuse(query: TransportQuery, code: str, message: str) -> None:
-    refuse(query, Problem(code, message))

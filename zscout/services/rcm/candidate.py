@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TypeVar
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_instance
-from zscout.mesh import Mesh, Reply
+from zscout.mesh import Mesh, Reply, Tally
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
 from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd, disbelieved
@@ -23,6 +23,7 @@ from zscout.services.authority import Authority
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
+from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.places import Places
@@ -53,9 +54,10 @@ class Candidate:
         folder: Path | None = None,
         authority: Authority | None = None,
         places_key: bytes | None = None,
+        listeners: Sequence[HoldListener] = (),
     ) -> None:
         """`folder`: where it keeps what it must know after a restart; None: it does not. `places_key`: that by which
-        the managers of a fleet seal places."""
+        the managers of a fleet seal places. `listeners` are told of holds while it leads."""
         self._places_key = places_key
         self._authority = authority or Authority(fleet)
         self.mesh, self.fleet = mesh, fleet
@@ -64,6 +66,12 @@ class Candidate:
         self._goes_above = False
         """Whether an RC or a client obeys a term so far above that others must be told why this one goes there."""
         self.rcm: Rcm | None = None
+        self.balancer: LoadBalancer | None = None
+        """Beside the RCM, while this node leads."""
+        self.listeners = listeners
+        self.terms_led = 0
+        self.tally = Tally()
+        """How operations ended that its RCMs were asked for."""
         self._leader: str | None = None
         """The host of the leader that was seen last."""
         self.ledger = PlacementLedger(mesh)
@@ -134,7 +142,7 @@ class Candidate:
             self._stop_leading()
 
     def _stop_leading(self) -> None:
-        self.rcm = None
+        self.rcm = self.balancer = None
         self._leading.close()
 
     # What is seen
@@ -298,12 +306,22 @@ class Candidate:
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
         rcm = self.rcm = Rcm(
-            self.mesh, self.fleet, term, self._see, self._failed, self.inventory, self._authority, places
+            self.mesh,
+            self.fleet,
+            term,
+            self._see,
+            self._failed,
+            self.inventory,
+            self._authority,
+            places,
+            self.listeners,
+            self.tally,
         )
+        self.terms_led += 1
         rcm.membership.on_disbelieved = self._disbelieved
         self._leading.callback(rcm.stop)
         rcm.start(recovered)
-        balancer = LoadBalancer(self.mesh, self._failed)
+        balancer = self.balancer = LoadBalancer(self.mesh, self._failed)
         inherited = self.ledger.inherited()
         placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, inherited, self._failed, self._authority)
         for service in (balancer, placer):

@@ -22,7 +22,7 @@ from msgspec.structs import replace
 from zscout import messages, trace
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
-from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply
+from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply, Tally
 from zscout.mesh.supervision import Supervisor
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -53,6 +53,7 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.authority import Authority
+from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.membership import Membership, discrepancies
 from zscout.services.rcm.places import Places, client_id, request_id
@@ -92,8 +93,11 @@ class Rcm:
         inventory: Inventory | None = None,
         authority: Authority | None = None,
         places: Places | None = None,
+        listeners: Sequence[HoldListener] = (),
+        tally: Tally | None = None,
     ) -> None:
-        """`inventory` and `authority`: those of its candidate, if it has one. `places`: those that it has recovered."""
+        """`inventory` and `authority`: those of its candidate, if it has one. `places`: those that it has recovered.
+        `listeners` are told of holds, and `tally` counts how operations end."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         self._authority = authority or Authority(fleet)
@@ -107,6 +111,10 @@ class Rcm:
         self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer, devices)
         self.membership.on_requests = self._on_requests
         self.registry.hosts_of = self.membership.hosts_of
+        self._digest = HoldDigest(self.core.is_running, listeners) if listeners else None
+        if self._digest is not None:
+            self.registry.on_foretold = self._digest.foretell
+        self._tally = tally
         self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(
             mesh,
@@ -164,7 +172,9 @@ class Rcm:
                 self.places.admit(arc, expecting)
         limit = self.fleet.limits.max_payload
         self._declared = [
-            mesh.serve(keys.schedule_any, messages.Operation, guard(self.requests.on_operation), limit=limit),
+            mesh.serve(
+                keys.schedule_any, messages.Operation, guard(self.requests.on_operation), limit=limit, tally=self._tally
+            ),
             mesh.serve(keys.rcm_state, messages.StateAsk, guard(self._on_state_asked)),
             *self.membership.watch(),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
@@ -173,6 +183,8 @@ class Rcm:
 
     def stop(self) -> None:
         """Stops leading. Nothing is revoked: holds and requests stay for the next RCM."""
+        if self._digest is not None:
+            self._digest.close(self.mesh.now())
         for declared in reversed(self._declared):
             declared.close()
         self.supervisor.cancel()
@@ -250,6 +262,9 @@ class Rcm:
                     self._set_wake(at)
         if line := self.core.strategy.log_line():
             log.info("%s", line)
+        if self._digest is not None:
+            # All who wait for an answer have it by now.
+            self._digest.take(self.mesh.now(), events, effects)
 
     def _note(self, events: Iterable[Event]) -> None:
         """What is remembered of an instant."""

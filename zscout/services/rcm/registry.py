@@ -76,6 +76,8 @@ class RequestRegistry:
         """Whether a queued ARC's client believes in a hold that RCs may yet report: it is not told to wait before."""
         self.hosts_of: Callable[[Iterable[RcName]], dict[RcName, HostName]] = lambda _: {}
         """Where RCs are that are granted."""
+        self.on_foretold: Callable[[ArcId, Ns], None] = lambda _arc, _start: None
+        """Called with what a notice says of when an ARC will start."""
         self._telling = False
         """Whether reasons are told before long."""
         self._changed: dict[ArcId, None] = {}
@@ -295,7 +297,10 @@ class RequestRegistry:
         made = self._foreseen[1] if self._foreseen is not None else None
         recent = made is not None and arc.since < made and now - made < RECENT
         start = (self._starts if recent else self.starts()).get(arc.id)
-        return None if start is None else max(0, start - now) / SECOND
+        if start is None:
+            return None
+        self.on_foretold(arc.id, start)
+        return max(0, start - now) / SECOND
 
     # History
 

@@ -1,0 +1,125 @@
+"""The table [notify] of a node file: who is told of what, and where. Its URLs are secrets: no error, log line or `repr`
+shows one."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Final, Literal, get_args
+
+from msgspec import Meta, Struct
+
+from zscout.config.packages import check_installed
+from zscout.config.strict import Where, key, quoted, read_text, seconds, secret
+from zscout.types import SECOND, Ns
+
+MAX_URLS: Final = 20
+"""In one list."""
+MAX_USERS: Final = 200
+MAX_URL: Final = 2_000
+"""Characters."""
+MAX_NAME: Final = 64
+SPEAKS_OF_URLS: Final = ("apprise", "urllib3", "requests", "requests_oauthlib", "oauthlib")
+"""Loggers of what sends: their lines may hold a URL, or its token."""
+
+NotifyEvent = Literal["yours_now", "preempted", "certificate_ends"]
+EVENTS: Final[tuple[NotifyEvent, ...]] = get_args(NotifyEvent)
+Urls = Annotated[tuple[str, ...], Meta(max_length=MAX_URLS)]
+
+
+class Address(Struct, frozen=True):
+    """A URL, and where it stands: `notify.urls[0]`, which may be shown."""
+
+    at: str
+    url: str
+
+    def __repr__(self) -> str:
+        return f"Address({self.at})"
+
+
+class NotifyTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [notify]. With it this node tells people what happens, while it leads."""
+
+    urls: Annotated[
+        Urls,
+        secret('texts in a list, as in ["mailtos://user:password@example.org"]'),
+        key("Apprise URLs that hear of all `events`; one without `://` is a file of such."),
+    ] = ()
+    events: Annotated[
+        Annotated[tuple[NotifyEvent, ...], Meta(max_length=len(EVENTS))], key("Of which `urls` hear.")
+    ] = EVENTS
+    users: Annotated[
+        Annotated[Mapping[str, Urls], Meta(max_length=MAX_USERS)],
+        secret('a table of lists, as in users = { ada = ["ntfys://ada-lab"] }'),
+        key("By user: who hears of `yours_now` and `preempted` where it is about that user's requests."),
+    ] = {}
+    after: Annotated[Ns, seconds("0", "86400", "`yours_now`: only after a wait of so long.")] = 60 * SECOND
+    per_minute: Annotated[int, key("Sent to one URL at most; the rest is left out.", 1, 600)] = 20
+
+
+class NotifyConfig(Struct, frozen=True):
+    """Who is told of what."""
+
+    urls: tuple[Address, ...]
+    events: tuple[NotifyEvent, ...]
+    users: Mapping[str, tuple[Address, ...]]
+    after: Ns
+    per_minute: int
+
+
+def read_notify(table: NotifyTable, folder: Path, at: Where) -> NotifyConfig:
+    """The table, with what its files hold; `folder` is that of the node file. Raises BadInput."""
+    check_installed("apprise", at)
+    if not table.urls and not table.users:
+        raise at.bad("tells nobody", "name urls or users, or remove the table")
+    for user in table.users:
+        if not user or len(user) > MAX_NAME or not user.isprintable():
+            raise (at / "users").bad(f"{quoted(user)} is no user", f"write 1 to {MAX_NAME} printable characters")
+    urls = tuple(_addresses(table.urls, folder, at / "urls"))
+    users = {user: tuple(_addresses(urls, folder, at / "users" / user)) for user, urls in table.users.items()}
+    return NotifyConfig(urls, table.events, users, table.after, table.per_minute)
+
+
+def apprise() -> ModuleType:
+    """What sends, muted: what it would log may show a URL."""
+    for name in SPEAKS_OF_URLS:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    import apprise
+
+    return apprise
+
+
+def _addresses(urls: tuple[str, ...], folder: Path, at: Where) -> Iterator[Address]:
+    for number, url in enumerate(urls):
+        here = at.item(number)
+        if "://" in url:
+            yield _address(url, here)
+            continue
+        lines = read_text(folder / _file_name(url, here), max_bytes=MAX_URLS * MAX_URL).splitlines()
+        found = [(count, line.strip()) for count, line in enumerate(lines, 1)]
+        found = [(count, line) for count, line in found if line and not line.startswith("#")]
+        if not 0 < len(found) <= MAX_URLS:
+            raise here.bad(f"{quoted(url)} holds {len(found)} URLs", f"write 1 to {MAX_URLS}, each on a line")
+        for count, line in found:
+            yield _address(line, Where(str(folder / url)), f"line {count} ")
+
+
+def _file_name(text: str, at: Where) -> str:
+    if not re.fullmatch(r"[\w./-]{1,255}", text):
+        # It may be a URL with a slip.
+        raise at.bad("is neither a URL nor the name of a file", "write one, as in mailtos://user:password@example.org")
+    return text
+
+
+def _address(url: str, at: Where, line: str = "") -> Address:
+    what = ""
+    if len(url) > MAX_URL or not url.isprintable():
+        what = "is too long, or not printable"
+    elif apprise().Apprise.instantiate(url) is None:
+        what = "is no URL that Apprise can use (not shown: it may hold a secret)"
+    if what:
+        raise at.bad(f"{line}{what}", "see https://appriseit.com for how each service's is written")
+    return Address(at.key or f"{at.source} {line}".strip(), url)

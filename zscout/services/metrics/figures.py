@@ -1,0 +1,162 @@
+"""The figures of one node, and what each means: plain numbers, counted as things happen and read when somebody asks.
+
+`exposition.py` writes them in Prometheus' format. docs/reference/metrics.md has the same table; a test compares them.
+Labels have a bounded number of values: what is beyond is counted under `other`."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
+from typing import Final, Literal, NamedTuple, TypeAlias
+
+from zscout.config.access import AccessPolicy
+from zscout.mesh.exchange import OTHER
+from zscout.scheduling.model import Outcome
+from zscout.services.rcm.digest import Began, Over
+from zscout.types import SECOND, ArcId, Ns, RcName
+
+MAX_WAITERS: Final = 100
+"""Pairs of a priority and a group."""
+MAX_RCS: Final = 1_000
+MAX_WAIT: Final[Ns] = 90 * 86_400 * SECOND
+"""A longer wait counts as one of this: what was waited under another RCM is a client's word."""
+WAITS: Final = (0.01, 0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 900.0, 3_600.0, 14_400.0, 86_400.0)
+"""Seconds: bounds of the buckets."""
+ERRORS: Final = (-3_600.0, -900.0, -300.0, -60.0, -15.0, -1.0, 0.0, 1.0, 15.0, 60.0, 300.0, 900.0, 3_600.0)
+
+
+class Family(NamedTuple):
+    """One metric. A node without what it is about does not show it."""
+
+    kind: Literal["gauge", "counter", "histogram"]
+    labels: tuple[str, ...]
+    help: str
+
+
+FAMILIES: Final[Mapping[str, Family]] = {
+    "zscout_info": Family("gauge", ("fleet", "host", "version"), "Always 1; its labels say which node this is."),
+    "zscout_links": Family("gauge", (), "Peers that this node is linked to."),
+    "zscout_leading": Family("gauge", (), "1 while this node leads, else 0."),
+    "zscout_term": Family("gauge", (), "Number of the highest term that this node has seen."),
+    "zscout_terms_led_total": Family("counter", (), "Times that this node took the lead."),
+    "zscout_queue_length": Family("gauge", (), "ARCs that wait."),
+    "zscout_wait_seconds": Family(
+        "histogram", ("priority", "group"), "From when an ARC was queued to its grant; not of holds that went on."
+    ),
+    "zscout_forecast_error_seconds": Family(
+        "histogram", (), "Of grants that were foretold to their client: start less what was foretold first."
+    ),
+    "zscout_preemptions_total": Family(
+        "counter", ("priority", "group"), "Holds taken away for another ARC, by whose they were."
+    ),
+    "zscout_holds": Family("gauge", ("rc",), "Holders that the RC has."),
+    "zscout_held_seconds_total": Family("counter", ("rc",), "Time for which the RC was held, summed over its holders."),
+    "zscout_refusals_total": Family("counter", ("code",), "Requests and releases that the RCM refused, by why."),
+    "zscout_commands_total": Family("counter", ("rc",), "Commands that the RC has answered."),
+    "zscout_commands_refused_total": Family("counter", ("rc", "code"), "Commands that it refused, by why."),
+}
+
+
+class Distribution(NamedTuple):
+    """What a histogram has counted."""
+
+    bounds: tuple[float, ...]
+    counts: tuple[int, ...]
+    """Up to each bound, and in all."""
+    sum: float
+
+
+Value: TypeAlias = float | Distribution
+Samples: TypeAlias = dict[str, dict[tuple[str, ...], Value]]
+"""By metric and values of its labels."""
+
+
+class Histogram:
+    def __init__(self, bounds: tuple[float, ...]) -> None:
+        self._bounds, self._sum = bounds, 0.0
+        self._counts = [0] * (len(bounds) + 1)
+
+    def add(self, value: float) -> None:
+        self._counts[bisect_left(self._bounds, value)] += 1
+        self._sum += value
+
+    def read(self) -> Distribution:
+        return Distribution(self._bounds, tuple(accumulate(self._counts)), self._sum)
+
+
+class Labels:
+    """Values that are told apart, up to so many."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._known: set[tuple[str, ...]] = set()
+
+    def of(self, *values: str) -> tuple[str, ...]:
+        if values not in self._known:
+            if len(self._known) >= self._most:
+                return (OTHER,) * len(values)
+            self._known.add(values)
+        return values
+
+
+class HoldFigures:
+    """What this node's RCMs have counted of waits and holds. A HoldListener."""
+
+    def __init__(self, access: AccessPolicy) -> None:
+        self.take(access)
+        self._waiters, self._rcs = Labels(MAX_WAITERS), Labels(MAX_RCS)
+        self._waits: dict[tuple[str, ...], Histogram] = {}
+        self._errors = Histogram(ERRORS)
+        self._preemptions: dict[tuple[str, ...], int] = {}
+        self._held: dict[tuple[str, ...], Ns] = {}
+        """Of what is over."""
+        self._holds: dict[ArcId, Began] = {}
+
+    def take(self, access: AccessPolicy) -> None:
+        """The groups may be others from now on. Of several that a name is in, the first counts."""
+        self._groups: dict[str, str] = {}
+        for group, members in access.groups.items():
+            for member in members:
+                self._groups.setdefault(member, group)
+
+    def on_began(self, began: Began) -> None:
+        self._holds[began.request.arc] = began
+        if began.waited is not None:
+            who = self._who(began)
+            if who not in self._waits:
+                self._waits[who] = Histogram(WAITS)
+            self._waits[who].add(min(began.waited, MAX_WAIT) / SECOND)
+        if began.late is not None:
+            self._errors.add(began.late / SECOND)
+
+    def on_over(self, over: Over) -> None:
+        self._holds.pop(over.began.request.arc, None)
+        self._add(over.began.rcs, over.at - over.began.at, self._held)
+        if over.outcome is Outcome.PREEMPTED:
+            who = self._who(over.began)
+            self._preemptions[who] = self._preemptions.get(who, 0) + 1
+
+    def _who(self, began: Began) -> tuple[str, ...]:
+        owner = began.request.client.partition("/")[0]
+        return self._waiters.of(str(began.request.priority), self._groups.get(owner, ""))
+
+    def _add(self, rcs: Sequence[RcName], amount: int, to: dict[tuple[str, ...], int]) -> None:
+        for rc in rcs:
+            label = self._rcs.of(rc)
+            to[label] = to.get(label, 0) + amount
+
+    def samples(self, now: Ns, *, leading: bool) -> Samples:
+        held, holds = dict(self._held), dict.fromkeys(self._held, 0)
+        for began in self._holds.values():
+            self._add(began.rcs, now - began.at, held)
+            self._add(began.rcs, 1, holds)
+        found: Samples = {
+            "zscout_wait_seconds": {who: histogram.read() for who, histogram in self._waits.items()},
+            "zscout_forecast_error_seconds": {(): self._errors.read()},
+            "zscout_preemptions_total": dict(self._preemptions),
+            "zscout_held_seconds_total": {rc: amount / SECOND for rc, amount in held.items()},
+        }
+        if leading:
+            found["zscout_holds"] = dict(holds)
+        return found

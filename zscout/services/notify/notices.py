@@ -1,0 +1,96 @@
+"""What people are told of, and in which words. Pure. A new event is a value of `NotifyEvent` and a function here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Final, NamedTuple
+
+from zscout.config.notify import NotifyEvent
+from zscout.messages import LoadReport
+from zscout.scheduling.model import ArcRequest, Outcome
+from zscout.scheduling.reason import named
+from zscout.services.rcm.digest import Began, Over
+from zscout.types import SECOND, HostName, Ns, RcName, clean
+
+MAX_TITLE: Final = 120
+MAX_BODY: Final = 1_000
+"""Characters; what is longer is cut: much of it is others' words."""
+DAY: Final = 86_400
+
+
+class Notification(NamedTuple):
+    """`user` is whom it concerns; empty: nobody in particular."""
+
+    event: NotifyEvent
+    user: str
+    title: str
+    body: str
+
+
+class HoldNotices:
+    """A HoldListener that tells of grants after a wait of at least `after`, and of holds that were taken away."""
+
+    def __init__(self, fleet: str, after: Ns, tell: Callable[[Notification], object]) -> None:
+        self._fleet, self._after, self._tell = fleet, after, tell
+
+    def on_began(self, began: Began) -> None:
+        if not began.waited or began.waited < self._after:
+            return
+        request = began.request
+        title = f"zscout {self._fleet}: {request.name} is yours now"
+        body = f"{_whose(request)} holds {_listed(began.rcs)} after a wait of {_span(began.waited)}"
+        self._tell(notification("yours_now", _user(request), title, body))
+
+    def on_over(self, over: Over) -> None:
+        if over.outcome is not Outcome.PREEMPTED:
+            return
+        request, held = over.began.request, over.at - over.began.at
+        title = f"zscout {self._fleet}: {request.name} was preempted"
+        waits = "; it waits again" if over.requeued else ""
+        body = f"{_whose(request)} held {_listed(over.began.rcs)} for {_span(held)}: {over.reason}{waits}"
+        self._tell(notification("preempted", _user(request), title, body))
+
+
+class CertificateNotices:
+    """Tells once of each host whose certificate ends soon, for as long as it does."""
+
+    def __init__(self, fleet: str) -> None:
+        self._fleet = fleet
+        self._told: set[HostName] = set()
+
+    def look(self, reports: Iterable[LoadReport]) -> list[Notification]:
+        found = []
+        for report in reports:
+            left = report.certificate_ends_in
+            if left is None or not report.renew:
+                self._told.discard(report.host)
+            elif report.host not in self._told:
+                self._told.add(report.host)
+                end = f"ends in {left / DAY:.1f} days" if left > 0 else "has ended"
+                title = f"zscout {self._fleet}: the certificate of {report.host} {end}"
+                found.append(notification("certificate_ends", "", title, "renew it: zscout cert renew"))
+        return found
+
+
+def notification(event: NotifyEvent, user: str, title: str, body: str) -> Notification:
+    return Notification(event, user, clean(title)[:MAX_TITLE], clean(body)[:MAX_BODY])
+
+
+def _user(request: ArcRequest) -> str:
+    """By its certificate in a secured fleet; else by its own word."""
+    return (request.who.user if request.who is not None else "") or request.client.partition("/")[0]
+
+
+def _whose(request: ArcRequest) -> str:
+    return named(request.who, request.client, request.name)
+
+
+def _listed(rcs: Iterable[RcName]) -> str:
+    return ", ".join(rcs)
+
+
+def _span(time: Ns) -> str:
+    seconds = time // SECOND
+    return (
+        f"{seconds} s" if seconds < 120 else f"{seconds // 60} min" if seconds < 7_200 else f"{seconds / 3_600:.1f} h"
+    )

@@ -1,0 +1,124 @@
+"""Tells people what happens, by Apprise, while this node leads. It sends in a thread of its own: a service that hangs
+holds up nobody but others that are to be told. What can't be sent is logged sparsely, and without its URL."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
+
+from zscout.config.notify import Address, NotifyConfig, apprise
+from zscout.mesh.sparse_log import SparseLog
+from zscout.mesh.supervision import Supervisor, clock
+from zscout.messages import LoadReport
+from zscout.services.notify.notices import CertificateNotices, HoldNotices, Notification
+from zscout.services.notify.rate_limit import RateLimit
+from zscout.types import SECOND, Ns
+
+log = logging.getLogger(__name__)
+
+QUEUE: Final = 100
+"""Notifications that wait; more are left out."""
+PAUSES: Final = (1.0, 5.0)
+"""Seconds before each further attempt. One attempt takes Apprise's 4 s to connect and 4 s for each answer at most,
+where the URL does not say otherwise (`cto`, `rto`)."""
+REST: Final[Ns] = 60 * SECOND
+"""After its last attempt has failed a URL is sent nothing for so long, so that it does not hold up others."""
+LOOK: Final = 60.0
+"""Seconds between two looks at certificates."""
+
+
+class Notifier:
+    """`holds` is to be told of holds; `reports` gives all hosts' newest load reports while this node leads, else
+    none."""
+
+    def __init__(
+        self,
+        fleet: str,
+        config: NotifyConfig,
+        reports: Callable[[], Iterable[LoadReport]],
+        *,
+        pauses: Sequence[float] = PAUSES,
+        look: float = LOOK,
+    ) -> None:
+        self.holds = HoldNotices(fleet, config.after, self.tell)
+        self._config, self._reports, self._pauses, self._look_every = config, reports, pauses, look
+        self._certificates = CertificateNotices(fleet)
+        self._waiting: queue.Queue[Notification] = queue.Queue(QUEUE)
+        self._stopping = threading.Event()
+        self._strange = SparseLog(log, clock.now)
+        self._supervisor = Supervisor("the notifier", lambda _error: None)
+        self._limits: dict[Address, RateLimit] = {}
+        self._resting: dict[Address, Ns] = {}
+        """Until when."""
+
+    def start(self) -> None:
+        # A daemon: a node that ends does not wait for a service that hangs.
+        threading.Thread(target=self._run, name="notifies", daemon=True).start()
+        self._supervisor.call_later(self._look_every, self._look)
+
+    def stop(self) -> None:
+        """What is not sent yet is left out."""
+        self._stopping.set()
+        self._supervisor.cancel()
+
+    def tell(self, notification: Notification) -> None:
+        """Never blocks."""
+        if not self._addresses(notification):
+            return
+        try:
+            self._waiting.put_nowait(notification)
+        except queue.Full:
+            self._strange.warning("", "%d notifications wait to be sent: one is left out", QUEUE)
+
+    def _addresses(self, about: Notification) -> tuple[Address, ...]:
+        heard = self._config.urls if about.event in self._config.events else ()
+        # Nobody is told twice.
+        return tuple({one.url: one for one in (*heard, *self._config.users.get(about.user, ()))}.values())
+
+    def _look(self) -> None:
+        for one in self._certificates.look(self._reports()):
+            self.tell(one)
+        self._supervisor.call_later(self._look_every, self._look)
+
+    # In the thread
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                notification = self._waiting.get(timeout=1.0)
+            except queue.Empty:
+                continue
+            for address in self._addresses(notification):
+                self._send(address, notification)
+
+    def _send(self, address: Address, notification: Notification) -> None:
+        if clock.now() < self._resting.get(address, 0):
+            self._strange.warning(address.at, "%s can't be reached: a notification is left out", address.at)
+            return
+        limit = self._limits.setdefault(address, RateLimit(self._config.per_minute))
+        if not limit.allows(clock.now()):
+            many = self._config.per_minute
+            self._strange.warning(address.at, "%s: more than %d a minute, the rest is left out", address.at, many)
+            return
+        why = self._attempt(address, notification)
+        for pause in self._pauses:
+            if not why or self._stopping.wait(pause):
+                break
+            why = self._attempt(address, notification)
+        if why and not self._stopping.is_set():
+            self._resting[address] = clock.now() + REST
+            times = 1 + len(self._pauses)
+            self._strange.warning(address.at, "%s was not told, in %d attempts: %s", address.at, times, why)
+
+    def _attempt(self, address: Address, notification: Notification) -> str:
+        """Why it failed; empty: it did not."""
+        try:
+            sender = apprise().Apprise(asset=apprise().AppriseAsset(async_mode=False))
+            sender.add(address.url)
+            sent = sender.notify(body=notification.body, title=notification.title, body_format="text")
+        except Exception as error:  # noqa: BLE001 - its text may show the URL
+            return type(error).__name__
+        return "" if sent else "it did not take it"
