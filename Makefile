@@ -82,7 +82,7 @@ LOCK := uv pip compile --quiet --universal --python-version 3.11 --generate-hash
 lock:
 	$(LOCK) --group dev pyproject.toml -o requirements/dev.txt
 	$(LOCK) --constraints requirements/dev.txt --group light -o requirements/light.txt
-	$(LOCK) --constraints requirements/dev.txt pyproject.toml -o requirements/full.txt
+	$(LOCK) --constraints requirements/dev.txt --extra metrics --extra notify pyproject.toml -o requirements/full.txt
 	$(LOCK) --group installers -o requirements/installers.txt
 
 clean:

@@ -194,8 +194,8 @@ def test_refusals_are_counted_by_code() -> None:
         for number in range(3):
             with pytest.raises(Exception, match="needs is empty"):
                 await client.ask(f"arc{number}")
+        await client.ask("first", "robot/a", wait_for_device=True)
         with pytest.raises(Exception, match="unknown_client"):
-            await client.ask("first", "robot/a", wait_for_device=True)
             await client.do(HandOver("first", "desk/nobody"))
         assert candidate.tally.refused() == {"bad_request": 3, "unknown_client": 1}
         await candidate.stop()
