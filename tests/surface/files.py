@@ -125,12 +125,28 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
         "frames": _number("2.0", "0", "30", "-1", "31"),
         "limit": _number("5000", "300", "1_000_000", "299", "1_000_001"),
     },
+    "metrics": {
+        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
+        "port": _number("9464", "1", "65_535", "0", "65_536"),
+        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
+    },
+    "notify": {
+        "urls": Key("[]", ('["json://localhost"]',), ('"json://localhost"', '["none://a:secret@b"]', '["a:secret@b"]')),
+        "events": Key(
+            '["yours_now", "preempted", "certificate_ends"]', ('["preempted"]',), ('["ended"]', '"preempted"')
+        ),
+        "users": Key(None, ('{ ada = ["json://localhost"] }',), ('{ ada = "json://localhost" }', '["ada"]')),
+        "after": _number("60.0", "0", "86_400", "-1", "86_401"),
+        "per_minute": _number("20", "1", "600", "0", "601"),
+    },
     "components": {
         "allow": Key("true", ("false",), TRUTH),
         "kinds": Key(None, ("[]", '["counter"]'), ('["a/b"]', '"counter"')),
         "max": _number("64", "1", "256", "0", "257"),
     },
 }
+LEAST: Final[Mapping[str, tuple[str, ...]]] = {"notify": ('users = { bob = ["json://localhost/bob"] }',)}
+"""What a table can't be without, but where that is tried."""
 CHANNELS: Final = '{ "video/ch1" = 1 }'
 SOURCES: Final = '{ "video/ch1" = "/dev/video0" }'
 SETTLE: Final = _number("5.0", "0.5", "60", "0.4", "61")
@@ -237,9 +253,9 @@ class _Loader:
 def _tables(loader: _Loader, tables: Mapping[str, Mapping[str, Key]]) -> Iterator[tuple[str, Any]]:
     yield "tables", sorted(loader.known(""))
     for table, keys in tables.items():
-        head = f"[{table}]"
-        assert loader.known(head) == sorted(keys), f"{head} has {loader.known(head)}; write them all here"
-        yield head, {key: _tried(loader, head, key, about) for key, about in keys.items()}
+        head = "\n".join((f"[{table}]", *LEAST.get(table, ())))
+        assert loader.known(head) == sorted(keys), f"[{table}] has {loader.known(head)}; write them all here"
+        yield f"[{table}]", {key: _tried(loader, _without(head, key), key, about) for key, about in keys.items()}
 
 
 def _rc(loader: _Loader, driver: str) -> dict[str, Any]:

@@ -1,0 +1,143 @@
+"""The server of figures over real sockets: what Prometheus gets, and what others do to it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from zscout.services.metrics import server as server_module
+from zscout.services.metrics.figures import FAMILIES, Histogram, Samples
+from zscout.services.metrics.server import MAX_CONNECTIONS, MAX_HEAD, MetricsServer
+
+
+def everything() -> Samples:
+    """Each metric once."""
+    found: Samples = {}
+    for name, family in FAMILIES.items():
+        labels = tuple(f'a "{label}"\n' for label in family.labels)
+        histogram = Histogram((-1.0, 0.0, 2.5))
+        histogram.add(1.0)
+        found[name] = {labels: histogram.read() if family.kind == "histogram" else 3.5}
+    return found
+
+
+@asynccontextmanager
+async def served(read: Callable[[], Samples] = everything) -> AsyncIterator[MetricsServer]:
+    server = MetricsServer(read, "127.0.0.1", 0)
+    await server.start()
+    try:
+        yield server
+    finally:
+        await server.stop()
+
+
+async def say(server: MetricsServer, request: bytes) -> bytes:
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    writer.write(request)
+    try:
+        return await reader.read()
+    except ConnectionResetError:
+        return b"reset"
+    finally:
+        writer.close()
+
+
+def test_each_metric_is_written_as_its_family_says() -> None:
+    async def story() -> None:
+        async with served() as server:
+            head, _, text = (await say(server, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")).partition(b"\r\n\r\n")
+        assert head.splitlines()[0] == b"HTTP/1.1 200 OK"
+        assert f"Content-Length: {len(text)}".encode() in head
+        found = {family.name: family for family in text_string_to_metric_families(text.decode())}
+        assert "process_cpu_seconds" in found
+        for name, family in FAMILIES.items():
+            written = found[name.removesuffix("_total")]
+            assert (written.type, written.documentation) == (family.kind, family.help)
+            for sample in written.samples:
+                assert {*sample.labels} - {"le"} == {*family.labels}
+                assert all(sample.labels[label] == f'a "{label}"\n' for label in family.labels)
+        buckets = [(one.labels["le"], one.value) for one in found["zscout_forecast_error_seconds"].samples]
+        assert buckets == [("-1.0", 0), ("0.0", 0), ("2.5", 1), ("+Inf", 1)]
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize(
+    ("request_", "answer"),
+    [
+        (b"HEAD /metrics HTTP/1.0\r\n\r\n", b"HTTP/1.1 200 OK\r\n"),
+        (b"GET /metrics?x=1 HTTP/1.1\r\n\r\n", b"HTTP/1.1 200 OK\r\n"),
+        (b"POST /metrics HTTP/1.1\r\n\r\n", b"HTTP/1.1 405 Method Not Allowed\r\n"),
+        (b"GET / HTTP/1.1\r\n\r\n", b"HTTP/1.1 404 Not Found\r\n"),
+        (b"\x16\x03\x01\r\n\r\n", b"HTTP/1.1 404 Not Found\r\n"),
+    ],
+)
+def test_other_requests_are_answered_in_a_line(request_: bytes, answer: bytes) -> None:
+    async def story() -> None:
+        async with served() as server:
+            assert (await say(server, request_)).startswith(answer)
+
+    asyncio.run(story())
+
+
+def test_who_sends_too_much_or_nothing_is_shut_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "TIMEOUT", 0.2)
+
+    async def story() -> None:
+        async with served() as server:
+            assert await say(server, b"x" * 10 * MAX_HEAD) in (b"", b"reset")
+            assert await say(server, b"GET /metrics HTTP/1.1\r\n") in (b"", b"reset")
+
+    asyncio.run(story())
+
+
+def test_so_many_are_served_at_one_time_and_then_there_is_room_again() -> None:
+    async def story() -> None:
+        async with served() as server:
+            waiting = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(MAX_CONNECTIONS)]
+            # The last one that was let in has been seen once one more is turned away.
+            assert await say(server, b"") in (b"", b"reset")
+            for _, writer in waiting:
+                writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
+            answers = await asyncio.gather(*(reader.read() for reader, _ in waiting))
+            assert all(b" 200 OK" in answer for answer in answers)
+            for _, writer in waiting:
+                writer.close()
+            assert b" 200 OK" in await say(server, b"GET /metrics HTTP/1.1\r\n\r\n")
+
+    asyncio.run(story())
+
+
+def test_figures_are_read_once_a_second_however_many_ask() -> None:
+    read = 0
+
+    def samples() -> Samples:
+        nonlocal read
+        read += 1
+        return everything()
+
+    async def story() -> None:
+        async with served(samples) as server:
+            asks = (say(server, b"GET /metrics HTTP/1.1\r\n\r\n") for _ in range(MAX_CONNECTIONS))
+            answers = {*await asyncio.gather(*asks)}
+            assert len(answers) == 1
+        assert read == 1
+
+    asyncio.run(story())
+
+
+def test_a_fault_of_the_figures_is_logged_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    def samples() -> Samples:
+        raise KeyError("a fault")
+
+    async def story() -> None:
+        async with served(samples) as server:
+            for _ in range(3):
+                assert await say(server, b"GET /metrics HTTP/1.1\r\n\r\n") in (b"", b"reset")
+
+    asyncio.run(story())
+    assert [record.message for record in caplog.records] == ["a scrape of the figures failed: KeyError('a fault')"]
