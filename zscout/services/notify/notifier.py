@@ -48,7 +48,8 @@ class Notifier:
         self._certificates = CertificateNotices(fleet)
         self._waiting: queue.Queue[Notification] = queue.Queue(QUEUE)
         self._stopping = threading.Event()
-        self._strange = SparseLog(log, clock.now)
+        # One is written by the event loop, the other by the thread.
+        self._full, self._unsent = SparseLog(log, clock.now), SparseLog(log, clock.now)
         self._supervisor = Supervisor("the notifier", lambda _error: None)
         self._limits: dict[Address, RateLimit] = {}
         self._resting: dict[Address, Ns] = {}
@@ -71,7 +72,7 @@ class Notifier:
         try:
             self._waiting.put_nowait(notification)
         except queue.Full:
-            self._strange.warning("", "%d notifications wait to be sent: one is left out", QUEUE)
+            self._full.warning("", "%d notifications wait to be sent: one is left out", QUEUE)
 
     def _addresses(self, about: Notification) -> tuple[Address, ...]:
         heard = self._config.urls if about.event in self._config.events else ()
@@ -93,15 +94,16 @@ class Notifier:
                 continue
             for address in self._addresses(notification):
                 self._send(address, notification)
+            self._waiting.task_done()
 
     def _send(self, address: Address, notification: Notification) -> None:
         if clock.now() < self._resting.get(address, 0):
-            self._strange.warning(address.at, "%s can't be reached: a notification is left out", address.at)
+            self._unsent.warning(address.at, "%s can't be reached: a notification is left out", address.at)
             return
         limit = self._limits.setdefault(address, RateLimit(self._config.per_minute))
         if not limit.allows(clock.now()):
             many = self._config.per_minute
-            self._strange.warning(address.at, "%s: more than %d a minute, the rest is left out", address.at, many)
+            self._unsent.warning(address.at, "%s: more than %d a minute, the rest is left out", address.at, many)
             return
         why = self._attempt(address, notification)
         for pause in self._pauses:
@@ -111,7 +113,7 @@ class Notifier:
         if why and not self._stopping.is_set():
             self._resting[address] = clock.now() + REST
             times = 1 + len(self._pauses)
-            self._strange.warning(address.at, "%s was not told, in %d attempts: %s", address.at, times, why)
+            self._unsent.warning(address.at, "%s was not told, in %d attempts: %s", address.at, times, why)
 
     def _attempt(self, address: Address, notification: Notification) -> str:
         """Why it failed; empty: it did not."""
