@@ -1,6 +1,6 @@
-"""`python -m benchmarks.metrics`: what figures cost a node. A scrape over a real socket, its client's part included, of a
-small node and of a leader whose labels have all the values they may have; and what counting adds to a grant and its
-release, after all answers are sent."""
+"""`python -m benchmarks.metrics`: what figures cost a node. A scrape over a real socket, its client's part included, of
+a small node and of one with 64 RCs that leads the largest fleet whose labels all have values of their own; and what
+counting adds to a grant and its release, after all answers are sent."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ from zscout.mesh.supervision import clock
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, Event, LeadTaken, RcJoined, Released, Requested
 from zscout.services.metrics import server as server_module
-from zscout.services.metrics.figures import MAX_RCS, MAX_WAITERS, HoldFigures
+from zscout.services.metrics.figures import MAX_RCS, MAX_WAITERS, HoldFigures, Value
 from zscout.services.metrics.figures import Samples as Figures
 from zscout.services.metrics.server import MetricsServer
 from zscout.services.rcm.digest import Began, HoldDigest, HoldListener
-from zscout.types import SECOND, Term
+from zscout.types import SECOND, Params, RcName, Term
 
 EVERY = 15.0
 """Seconds from one scrape to the next."""
 AIM = 0.2
 """Percent of a core."""
+OWN = 64
+"""RCs of one node."""
 ASK = b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n"
 
 
@@ -42,8 +44,8 @@ def figures(rcs: int, waiters: int) -> HoldFigures:
 async def scrapes(rcs: int, waiters: int, rounds: int) -> tuple[Samples, Samples, int]:
     """Seconds of this process's processor for each, seconds for which the event loop stood still, and bytes."""
     holds, spent, stood = figures(rcs, waiters), Samples(), Samples()
-    commands = {(f"robot/scout{number}",): 5.0 for number in range(rcs)}
-    refused = {(rc, f"code_{code}"): 1.0 for (rc,) in commands for code in range(4)}
+    commands: dict[tuple[str, ...], Value] = {(f"robot/scout{number}",): 5.0 for number in range(min(rcs, OWN))}
+    refused: dict[tuple[str, ...], Value] = {(*rc, f"code_{code}"): 1.0 for rc in commands for code in range(4)}
 
     def read() -> Figures:
         began = time.perf_counter()
@@ -70,7 +72,7 @@ def instants(listeners: Sequence[HoldListener], rounds: int) -> Samples:
     """Seconds for an ARC of five RCs that is asked for, granted and released."""
     core, samples = Core(), Samples()
     digest = HoldDigest(core.is_running, listeners) if listeners else None
-    needs = {f"robot/r{number}": {} for number in range(5)}
+    needs: dict[RcName, Params] = {f"robot/r{number}": {} for number in range(5)}
     core.handle(0, *(RcJoined(rc, sharable=False) for rc in needs), LeadTaken(Term(1, "bench")))
     for number in range(rounds):
         arc, began = f"h/c/{number}", time.perf_counter()

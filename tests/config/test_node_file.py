@@ -17,6 +17,7 @@ from zscout.config.node import Node, RecorderConfig, default_node, load_node
 from zscout.config.strict import BadInput, Where
 
 ROBOT = '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
+UNSHOWN = "is of the wrong form, and not shown, as it may hold a secret"
 RADIO = '[[rc]]\nname = "radio/r"\ndriver = "capacity"\n'
 
 BAD_NODES = {
@@ -25,6 +26,20 @@ BAD_NODES = {
     '[node]\nhost = ""': f'node.host: "" is not a name; {NAME_RULE}',
     '[node]\nload = "yes"': 'node.load: is the text "yes"; write true, false or "tree"',
     "[node]\nload = 1": 'node.load: is 1; write true, false or "tree"',
+    '[metrics]\nbind = "0.0.0.0"': 'metrics.bind: "0.0.0.0" shows the figures to other hosts; '
+    'write "127.0.0.1", or add allow_remote = true if that is meant',
+    "[notify]": "notify: tells nobody; name urls or users, or remove the table",
+    '[node]\ncandidate = false\n[notify]\nurls = ["json://a"]': "notify: this host never leads, "
+    "and only who leads tells anybody; move it to one that does",
+    # No secret is shown.
+    '[notify]\nurls = "json://user:secret@a"': f"notify.urls: {UNSHOWN}; "
+    'write texts in a list, as in ["mailtos://user:password@example.org"]',
+    '[notify]\nusers = { ada = "json://user:secret@a" }': f"notify.users: {UNSHOWN}; "
+    'write a table of lists, as in users = { ada = ["ntfys://ada-lab"] }',
+    '[notify]\nurls = ["none://user:secret@a"]': "notify.urls[0]: is no URL that Apprise can use "
+    "(not shown: it may hold a secret); see https://appriseit.com for how each service's is written",
+    '[notify]\nusers = { ada = ["json:/user:secret@a"] }': "notify.users.ada[0]: is neither a URL nor the name of "
+    "a file; write one, as in mailtos://user:password@example.org",
     '[components]\nkinds = ["a b"]': f'components.kinds[0]: "a b" is not a name; {NAME_RULE}',
     "[components]\nmax = 0": "components.max: is 0; write a whole number from 1 to 256",
     "[node]\nfleet = 1": "node.fleet: is 1; write a text in quotes",

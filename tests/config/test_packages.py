@@ -45,6 +45,8 @@ def test_its_versions_are_those_that_are_tested() -> None:
         ("numpy.typing", "'numpy>=2'"),
         ("rerun.blueprint", "'rerun-sdk==0.41.*'"),
         ("cryptography.x509", "'cryptography>=46'"),
+        ("prometheus_client", "'prometheus-client>=0.26'"),
+        ("apprise", "'apprise<3,>=2.3'"),
     ],
 )
 def test_what_is_missing_is_named_with_the_command_that_brings_it(module: str, requirement: str) -> None:

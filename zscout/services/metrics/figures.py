@@ -26,7 +26,7 @@ WAITS: Final = (0.01, 0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 900.0, 3_600.0, 14_400.0
 ERRORS: Final = (-3_600.0, -900.0, -300.0, -60.0, -15.0, -1.0, 0.0, 1.0, 15.0, 60.0, 300.0, 900.0, 3_600.0)
 
 
-class Family(NamedTuple):
+class MetricFamily(NamedTuple):
     """One metric. A node without what it is about does not show it."""
 
     kind: Literal["gauge", "counter", "histogram"]
@@ -34,27 +34,29 @@ class Family(NamedTuple):
     help: str
 
 
-FAMILIES: Final[Mapping[str, Family]] = {
-    "zscout_info": Family("gauge", ("fleet", "host", "version"), "Always 1; its labels say which node this is."),
-    "zscout_links": Family("gauge", (), "Peers that this node is linked to."),
-    "zscout_leading": Family("gauge", (), "1 while this node leads, else 0."),
-    "zscout_term": Family("gauge", (), "Number of the highest term that this node has seen."),
-    "zscout_terms_led_total": Family("counter", (), "Times that this node took the lead."),
-    "zscout_queue_length": Family("gauge", (), "ARCs that wait."),
-    "zscout_wait_seconds": Family(
+FAMILIES: Final[Mapping[str, MetricFamily]] = {
+    "zscout_info": MetricFamily("gauge", ("fleet", "host", "version"), "Always 1; its labels say which node this is."),
+    "zscout_links": MetricFamily("gauge", (), "Peers that this node is linked to."),
+    "zscout_leading": MetricFamily("gauge", (), "1 while this node leads, else 0."),
+    "zscout_term": MetricFamily("gauge", (), "Number of the highest term that this node has seen."),
+    "zscout_terms_led_total": MetricFamily("counter", (), "Times that this node took the lead."),
+    "zscout_queue_length": MetricFamily("gauge", (), "ARCs that wait."),
+    "zscout_wait_seconds": MetricFamily(
         "histogram", ("priority", "group"), "From when an ARC was queued to its grant; not of holds that went on."
     ),
-    "zscout_forecast_error_seconds": Family(
+    "zscout_forecast_error_seconds": MetricFamily(
         "histogram", (), "Of grants that were foretold to their client: start less what was foretold first."
     ),
-    "zscout_preemptions_total": Family(
+    "zscout_preemptions_total": MetricFamily(
         "counter", ("priority", "group"), "Holds taken away for another ARC, by whose they were."
     ),
-    "zscout_holds": Family("gauge", ("rc",), "Holders that the RC has."),
-    "zscout_held_seconds_total": Family("counter", ("rc",), "Time for which the RC was held, summed over its holders."),
-    "zscout_refusals_total": Family("counter", ("code",), "Requests and releases that the RCM refused, by why."),
-    "zscout_commands_total": Family("counter", ("rc",), "Commands that the RC has answered."),
-    "zscout_commands_refused_total": Family("counter", ("rc", "code"), "Commands that it refused, by why."),
+    "zscout_holds": MetricFamily("gauge", ("rc",), "Holders that the RC has."),
+    "zscout_held_seconds_total": MetricFamily(
+        "counter", ("rc",), "Time for which the RC was held, summed over its holders."
+    ),
+    "zscout_refusals_total": MetricFamily("counter", ("code",), "Requests and releases that the RCM refused, by why."),
+    "zscout_commands_total": MetricFamily("counter", ("rc",), "Commands that the RC has answered."),
+    "zscout_commands_refused_total": MetricFamily("counter", ("rc", "code"), "Commands that it refused, by why."),
 }
 
 
