@@ -20,6 +20,7 @@ import pytest
 from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import CommandRefused
 
 pytestmark = pytest.mark.live
 
@@ -108,8 +109,12 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
         client = await lab.client("worker")
         await lab.ready(client, "robot/a")
         first, second = [await client.request(name, {"robot/a": {}}, min_runtime=60) for name in ("first", "second")]
-        assert await client.granted(first, confirmed=True) is not None
+        grant = await client.granted(first, confirmed=True)
+        assert grant is not None
+        await client.command("robot/a", grant, {"name": "echo", "value": 1})
         await client.end(first)
+        with pytest.raises(CommandRefused):
+            await client.command("robot/a", grant, {"name": "echo", "value": 2})
         assert await client.granted(second, confirmed=True) is not None
         await client.end(second)
         yield lab, client, port
@@ -128,7 +133,8 @@ def test_a_node_shows_what_it_knows(tmp_path: Path) -> None:
             r'zscout_wait_seconds_count\{group="arms",priority="0"\} 2\.0',
             r'zscout_holds\{rc="robot/a"\} 0\.0',
             r'zscout_held_seconds_total\{rc="robot/a"\} [\d.e-]+',
-            r'zscout_commands_total\{rc="robot/a"\} \d+\.0',
+            r'zscout_commands_total\{rc="robot/a"\} 1\.0',
+            r'zscout_commands_refused_total\{code="\w+",rc="robot/a"\} 1\.0',
         ):
             assert re.search(f"^{line}$", text, re.MULTILINE), f"{line}\n{text}"
 

@@ -10,7 +10,7 @@ from tests.mesh.both_meshes import ASK, LONG, SHORT, Ping, Play, Pong, Replies, 
 from tests.mesh.kit import until
 from zscout import messages
 from zscout.keyexpr import BadName
-from zscout.mesh import IncomingQuery, MeshError, Refused
+from zscout.mesh import IncomingQuery, MeshError, Refused, Tally
 
 
 def test_all_who_serve_a_key_reply(play: Play) -> None:
@@ -203,7 +203,8 @@ def test_a_wildcard_is_answered_where_the_served_key_has_none_and_refused_elsewh
 def test_queries_beyond_a_full_queue_are_refused_as_busy(play: Play) -> None:
     async def story(world: World) -> None:
         a, b = await world.open("a", "b")
-        b.serve(ASK, Ping, pong(b), depth=2)
+        tally = Tally()
+        b.serve(ASK, Ping, pong(b), depth=2, tally=tally)
         await world.declared()
         outcomes: list[object] = []
         for number in range(10):
@@ -214,6 +215,7 @@ def test_queries_beyond_a_full_queue_are_refused_as_busy(play: Play) -> None:
         assert codes == ["busy"] * 8
         reply = await a.ask_one(ASK, Ping(), Pong, timeout=LONG)
         assert reply is not None
+        assert (tally.answered, tally.refused()) == (3, {"busy": 8})
         assert reply.message is not None
 
     play(story)
